@@ -21,8 +21,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mstfilter.scene import BASELINE, Camera, Frame, fit_support_plane
-from mstfilter.segmentation.boundary import SENSOR_FOCAL, TABLE_TOLERANCE, fill_from_nearest
+from mstfilter.scene import BASELINE, Camera, Frame
+from mstfilter.segmentation.boundary import SENSOR_FOCAL, TABLE_TOLERANCE, fill_from_nearest, posed_camera
 from mstfilter.segmentation.regions import SeenBorders
 from mstfilter.trained import TrainedModel, calibrated_network, open_model
 
@@ -161,9 +161,7 @@ class BorderNetwork:
 
 def reduced(frame: Frame) -> Frame:
     """The frame with `RASTER` pixels per row and a camera pose; depth is that of the nearest pixel."""
-    camera = frame.camera
-    if camera.T_world_camera is None:
-        camera = camera.at(fit_support_plane(frame).T_world_camera)
+    camera = posed_camera(frame)
     w = camera.width
     if w == RASTER:
         return Frame(frame.rgb, frame.depth, camera, frame.robot_mask)

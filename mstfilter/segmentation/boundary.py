@@ -15,10 +15,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from mstfilter.results import Checked, check_array, check_type, returns
-from mstfilter.scene import BASELINE, Clip, Frame, fit_support_plane, scaled_length, table_residual
+from mstfilter.scene import BASELINE, Camera, Clip, Frame, fit_support_plane, scaled_length, table_residual
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
@@ -36,6 +38,12 @@ def above_table(frame: Frame) -> np.ndarray:
     most readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
+
+
+def posed_camera(frame: Frame) -> Camera:
+    """The camera of a frame; without a pose, with that relative to the fitted table (`fit_support_plane`)."""
+    camera = frame.camera
+    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
 
 
 def pixels_above_table(frame: Frame) -> np.ndarray:
@@ -80,8 +88,6 @@ class ColourDepthBoundary(BoundaryModel):
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """Boundary strength (H, W). Robot pixels are 1 at their rim and 0 inside, so that they separate regions."""
-        import cv2
-
         resize = scaled_length(1, frame.camera.width)
         edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
@@ -111,15 +117,11 @@ class ColourDepthBoundary(BoundaryModel):
 
 def _share_beside(valid: np.ndarray) -> float:
     """Mean share of readings in the 3 x 3 pixels around a reading; `valid` (H, W) bool."""
-    import cv2
-
     return float(cv2.blur(valid.astype(np.float32), (3, 3))[valid].mean())
 
 
 def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
     """e / (1 + e) with e the strength of the Lab structure tensor, averaged over three scales."""
-    import cv2
-
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab /= np.array([_LIGHTNESS_UNIT, _CHROMA_UNIT, _CHROMA_UNIT], np.float32)
     xx = np.zeros(rgb.shape[:2], np.float32)
@@ -149,8 +151,6 @@ def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndar
     Concave curvature is the largest eigenvalue of the Hessian, convex curvature minus the smallest. `resize` is the
     image width / 640.
     """
-    import cv2
-
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)
     factor = s * s / 4
@@ -176,7 +176,5 @@ def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
     """Depth (H, W) with the pixels of `holes` set to the nearest reading."""
     if not holes.any():
         return depth
-    from scipy.ndimage import distance_transform_edt
-
     rows, columns = distance_transform_edt(holes, return_distances=False, return_indices=True)
     return depth[rows, columns]

@@ -29,6 +29,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from math import exp, inf, log
 from typing import Any, Literal, NamedTuple
 
@@ -316,41 +317,22 @@ class MetropolisHastingsCuts(CutSampler):
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         w = check_values(tree, w)
         optimal = optimal_cut(tree, w)
-        best = float(w[optimal].sum())
-        s2 = max(self.sigma2 * best**2, 1e-300)
-
-        def log_p(value: float) -> float:
-            """Log probability of a cut relative to the optimal cut."""
-            return (value - best) / self.temperature if self.temperature > 0 else -((best - value) ** 2) / s2
-
-        local = LOCAL_MOVES[self.moves]()
-        redraw = None
-        if self.redraw_share > 0 and self.temperature > 0:
-            redraw = SubtreeRedraw(gibbs(tree, w, 1 / self.temperature))
-        random = _uniforms(rng).__next__
-
+        log_p = self._law(float(w[optimal].sum()))
         chain = CutChain(tree, w, log_p, optimal)
+        values = self._values(rng, chain, w)
         trace: list[float] = []
-
-        def advance(n_steps: int) -> None:
-            for _ in range(n_steps):
-                if redraw is not None and random() < self.redraw_share:
-                    chain.step(random, redraw)
-                else:
-                    chain.step(random, local)
-                trace.append(chain.value)
 
         def draw() -> np.ndarray:
             if self.restart:
                 chain.restart(optimal)
-                advance(self.burn_in)
-            advance(self.thinning)
+                trace.extend(islice(values, self.burn_in))
+            trace.extend(islice(values, self.thinning))
             return chain.cut()
 
         cuts: list[np.ndarray] = [optimal] if self.include_optimal and n > 0 else []
         seen = {cut.tobytes() for cut in cuts}
         if not self.restart:
-            advance(self.burn_in)
+            trace.extend(islice(values, self.burn_in))
         while len(cuts) < n:
             cut = draw()
             if self.redraw_repeated and cut.tobytes() in seen:
@@ -366,6 +348,24 @@ class MetropolisHastingsCuts(CutSampler):
         if not self.restart:
             diagnostics["autocorrelation_steps"] = _autocorrelation(np.array(trace[self.burn_in :]))
         return CutSample(tuple(cuts), np.array([log_p(float(w[cut].sum())) for cut in cuts]), diagnostics)
+
+    def _law(self, best: float) -> Callable[[float], float]:
+        """Log probability of a cut relative to the optimal cut, from its value; `best` is v(c*)."""
+        if self.temperature > 0:
+            return lambda value: (value - best) / self.temperature
+        s2 = max(self.sigma2 * best**2, 1e-300)
+        return lambda value: -((best - value) ** 2) / s2
+
+    def _values(self, rng: np.random.Generator, chain: CutChain, w: np.ndarray) -> Iterator[float]:
+        """Make steps of a chain without end; yields the value of its cut after each step."""
+        random = _uniforms(rng).__next__
+        local = LOCAL_MOVES[self.moves]()
+        redraw = None
+        if self.redraw_share > 0 and self.temperature > 0:
+            redraw = SubtreeRedraw(gibbs(chain.tree, w, 1 / self.temperature))
+        while True:
+            chain.step(random, local if redraw is None or random() >= self.redraw_share else redraw)
+            yield chain.value
 
 
 def _uniforms(rng: np.random.Generator) -> Iterator[float]:

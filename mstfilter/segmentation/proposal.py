@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
+import cv2
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
@@ -106,8 +107,6 @@ def _core(tree: Tree, pixels: np.ndarray, radius: int) -> np.ndarray:
     over the pixels is sufficient. The lowest node is the one that contains the first and the last leaf of the
     neighbourhood in depth-first order.
     """
-    import cv2
-
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     # First fill single missing readings inside an object.
     closed = cv2.morphologyEx(pixels.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))

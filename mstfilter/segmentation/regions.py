@@ -11,15 +11,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from mstfilter.scene import Frame, fit_support_plane, scaled_length
+from mstfilter.scene import Frame, scaled_length
 from mstfilter.segmentation.boundary import (
     TABLE_TOLERANCE,
     above_table,
     curvature,
     filled_disparity,
     pixels_above_table,
+    posed_camera,
 )
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
@@ -96,55 +98,13 @@ def measure_regions(
 
     A leaf belongs to the table if most of its pixels do.
     """
-    height, width = leaves.shape
-    n_leaves = int(leaves.max()) + 1
-    flat = leaves.ravel()
-    above = above_table(frame)
-    raised = pixels_above_table(frame)
-    areas = np.bincount(flat, minlength=n_leaves)
-    # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
-    # disparity above it) make a leaf an object only if they are the majority.
-    meets = raised & (above < np.inf)
-    of_leaf = np.where(_raised(flat, above, meets, areas, _MIXED) | _raised(flat, above, raised, areas, 0.5), 1, 0)
-    of_leaf[of_leaf > 0] = 1 + np.arange(int(of_leaf.sum()))
+    width = leaves.shape[1]
+    of_leaf = _region_of_leaf(leaves, frame)
     region = of_leaf[leaves]
     n = int(of_leaf.max()) + 1
-
     D = filled_disparity(frame)
     hollow, convex = curvature(D, scaled_length(1, width))
-    sums = np.zeros((n, sum(_WIDTHS.values())))
-    at = np.nonzero(raised & (region > 0))
-    which = region[at]
-
-    def put(name: str, *values: np.ndarray) -> None:
-        for k, value in enumerate(values, start=REGION[name].start):
-            sums[:, k] = np.bincount(which, weights=value, minlength=n)
-
-    import cv2
-
-    lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[at]
-    put("pixels", np.ones(len(which)))
-    put("lab", *lab.T)
-    put("lab2", *(lab.T**2))
-    u, v = (at[1] - width / 2) / (width / 4), (at[0] - height / 2) / (width / 4)
-    terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
-    # Relative to the table the numbers are smaller; the table is affine, so the residuals are the same.
-    d = np.minimum(above[at], 1e3)
-    put("gram", *(a * b for a in terms for b in terms))
-    put("moment", *(terms * d))
-    put("square", d * d)
-    camera = frame.camera
-    if camera.T_world_camera is None:
-        camera = camera.at(fit_support_plane(frame).T_world_camera)
-    points = camera.unproject(frame.depth)[at]
-    put("ground", points[:, 0], points[:, 1])
-    put("spread", points[:, 0] ** 2 + points[:, 1] ** 2)
-    put("bend", (hollow - convex)[at])
-    if seen is not None:
-        put("centre", *seen.centre[at].T)
-    bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
-    sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
-
+    sums = _region_sums(region, n, frame, hollow - convex, seen)
     smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, scaled_length(1.5, width)))
     # The border that the network sees can be beside that of the leaves: the largest log odds in the surroundings.
     reach = 2 * max(1, round(scaled_length(2, width))) + 1
@@ -153,6 +113,53 @@ def measure_regions(
     borders = _borders(region, n, np.stack([boundary, hollow, convex, odds], axis=-1), smooth)
     sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
     return Regions(of_leaf, sums, borders)
+
+
+def _region_of_leaf(leaves: np.ndarray, frame: Frame) -> np.ndarray:
+    """Region (n_leaves,) of every leaf; 0 is the table, the others are numbered in order of their leaves."""
+    flat, above, raised = leaves.ravel(), above_table(frame), pixels_above_table(frame)
+    areas = np.bincount(flat)
+    # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
+    # disparity above it) make a leaf an object only if they are the majority.
+    meets = raised & (above < np.inf)
+    is_object = _raised(flat, above, meets, areas, _MIXED) | _raised(flat, above, raised, areas, 0.5)
+    return np.where(is_object, np.cumsum(is_object), 0)
+
+
+def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, seen: SeenBorders | None) -> np.ndarray:
+    """Sums (n, C), columns `REGION`, over the raised pixels of each region (H, W); the perimeter is missing.
+
+    `bend` (H, W) is the concave minus the convex curvature.
+    """
+    height, width = region.shape
+    sums = np.zeros((n, sum(_WIDTHS.values())))
+    at = np.nonzero(pixels_above_table(frame) & (region > 0))
+    which = region[at]
+
+    def put(name: str, *values: np.ndarray) -> None:
+        for k, value in enumerate(values, start=REGION[name].start):
+            sums[:, k] = np.bincount(which, weights=value, minlength=n)
+
+    lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[at]
+    put("pixels", np.ones(len(which)))
+    put("lab", *lab.T)
+    put("lab2", *(lab.T**2))
+    u, v = (at[1] - width / 2) / (width / 4), (at[0] - height / 2) / (width / 4)
+    terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
+    # Relative to the table the numbers are smaller; the table is affine, so the residuals are the same.
+    d = np.minimum(above_table(frame)[at], 1e3)
+    put("gram", *(a * b for a in terms for b in terms))
+    put("moment", *(terms * d))
+    put("square", d * d)
+    points = posed_camera(frame).unproject(frame.depth)[at]
+    put("ground", points[:, 0], points[:, 1])
+    put("spread", points[:, 0] ** 2 + points[:, 1] ** 2)
+    put("bend", bend[at])
+    if seen is not None:
+        put("centre", *seen.centre[at].T)
+    bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
+    sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
+    return sums
 
 
 def _raised(flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.ndarray, fraction: float) -> np.ndarray:

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mstfilter.scene import Frame, depth_sigma, memo
+from mstfilter.scene import Camera, Frame, depth_sigma, memo
 from mstfilter.tracking.rigid import move_points
 from mstfilter.tracking.segments import Track
 
@@ -122,55 +122,78 @@ def _gradients(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def refine_motion(track: Track, T: np.ndarray) -> np.ndarray:
     """Improve a motion (4, 4) of a segment; it is returned unchanged if too few points can be compared."""
     points, colours = track.sample(_N_REFINED)
-    after = track.clip.after
-    surface_normals, (grey, across, down) = normals(after), _gradients(track)
-    before_grey = colours.mean(axis=1)
-    height, width = after.depth.shape
-    K, world_to_camera = after.camera.K, after.camera.pose.as_matrix()[:3, :3].T
+    grey = colours.mean(axis=1)
     for gate in _GATES:
-        x = move_points(T, points)
-        uv, z = after.camera.project(x)
-        ok = (np.isfinite(uv) & (uv >= 0.5) & (uv <= [width - 1.5, height - 1.5])).all(axis=1)
-        u, v = np.rint(uv[ok]).astype(np.int64).T
-        normal = surface_normals[v, u].astype(np.float64)
-        offset = x[ok] - after.points[v, u]
-        with np.errstate(invalid="ignore"):
-            distance = np.einsum("ni,ni->n", normal, offset)
-            near = after.valid[v, u] & np.isfinite(distance) & (np.linalg.norm(offset, axis=1) < gate)
-        if near.sum() < 12:
-            return T
-        rows = np.flatnonzero(ok)[near]
-        u, v, x, z = u[near], v[near], x[rows], z[rows]
-        centre = x.mean(axis=0)
-        radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)
-        unit = _DEPTH_SCALE * np.sqrt(2.0) * depth_sigma(z)
-        r_depth = distance[near] / unit
-        j_depth = normal[near] / unit[:, None]
-        # Grey value at the projected point, to first order around the pixel.
-        du, dv = uv[rows, 0] - u, uv[rows, 1] - v
-        gx, gy = across[v, u].astype(np.float64), down[v, u].astype(np.float64)
-        r_colour = (grey[v, u] + gx * du + gy * dv - before_grey[rows]) / _COLOUR_SCALE
-        camera_x = (x - after.camera.position) @ world_to_camera.T
-        per_pixel = np.stack(
-            [
-                gx * K[0, 0],
-                gx * K[0, 1] + gy * K[1, 1],
-                -(gx * K[0, 0] * camera_x[:, 0] + gy * K[1, 1] * camera_x[:, 1]) / z,
-            ],
-            axis=1,
-        )
-        j_colour = per_pixel @ world_to_camera / (z * _COLOUR_SCALE)[:, None]
-        H, b = np.zeros((6, 6)), np.zeros(6)
-        for residual, slope in ((r_depth, j_depth), (r_colour, j_colour)):
-            J = np.hstack([np.cross((x - centre) / radius, slope), slope])
-            weight = (1.0 + residual**2 / 4.0) ** -2
-            H += (J * weight[:, None]).T @ J
-            b += J.T @ (weight * residual)
-        step = -np.linalg.solve(H + _DAMPING * np.linalg.eigvalsh(H)[-1] * np.eye(6), b)
-        change = np.eye(4)
-        change[:3, :3] = Rotation.from_rotvec(step[:3] / radius).as_matrix()
-        change[:3, 3] = centre + step[3:] - change[:3, :3] @ centre
-        if not np.isfinite(change).all():
+        change = _improvement(track, move_points(T, points), grey, gate)
+        if change is None:
             return T
         T = change @ T
     return T
+
+
+def _improvement(track: Track, x: np.ndarray, before_grey: np.ndarray, gate: float) -> np.ndarray | None:
+    """The motion (4, 4) of one Gauss-Newton step; None if fewer than 12 points can be compared.
+
+    `x` (N, 3) are the moved points, `before_grey` (N,) their grey values in the first frame, `gate` the largest
+    distance in metres between a point and the measurement at its pixel.
+    """
+    after = track.clip.after
+    height, width = after.depth.shape
+    surface_normals, (grey, across, down) = normals(after), _gradients(track)
+    uv, z = after.camera.project(x)
+    ok = (np.isfinite(uv) & (uv >= 0.5) & (uv <= [width - 1.5, height - 1.5])).all(axis=1)
+    u, v = np.rint(uv[ok]).astype(np.int64).T
+    normal = surface_normals[v, u].astype(np.float64)
+    offset = x[ok] - after.points[v, u]
+    with np.errstate(invalid="ignore"):
+        distance = np.einsum("ni,ni->n", normal, offset)
+        near = after.valid[v, u] & np.isfinite(distance) & (np.linalg.norm(offset, axis=1) < gate)
+    if near.sum() < 12:
+        return None
+    rows = np.flatnonzero(ok)[near]
+    u, v, x, z = u[near], v[near], x[rows], z[rows]
+    unit = _DEPTH_SCALE * np.sqrt(2.0) * depth_sigma(z)
+    # Grey value at the projected point, to first order around the pixel.
+    du, dv = uv[rows, 0] - u, uv[rows, 1] - v
+    gx, gy = across[v, u].astype(np.float64), down[v, u].astype(np.float64)
+    r_colour = (grey[v, u] + gx * du + gy * dv - before_grey[rows]) / _COLOUR_SCALE
+    slope_colour = _grey_slope(after.camera, x, z, gx, gy) / (z * _COLOUR_SCALE)[:, None]
+    return _gauss_newton(x, (distance[near] / unit, normal[near] / unit[:, None]), (r_colour, slope_colour))
+
+
+def _grey_slope(camera: Camera, x: np.ndarray, z: np.ndarray, gx: np.ndarray, gy: np.ndarray) -> np.ndarray:
+    """Derivative (N, 3) of the grey value by the position of a point, times its depth `z` (N,).
+
+    `gx` and `gy` (N,) are the derivatives of the image along columns and rows.
+    """
+    K, world_to_camera = camera.K, camera.pose.as_matrix()[:3, :3].T
+    camera_x = (x - camera.position) @ world_to_camera.T
+    per_pixel = np.stack(
+        [
+            gx * K[0, 0],
+            gx * K[0, 1] + gy * K[1, 1],
+            -(gx * K[0, 0] * camera_x[:, 0] + gy * K[1, 1] * camera_x[:, 1]) / z,
+        ],
+        axis=1,
+    )
+    return per_pixel @ world_to_camera
+
+
+def _gauss_newton(x: np.ndarray, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray | None:
+    """The motion (4, 4) that reduces robust residuals of points x (N, 3); None if it is not finite.
+
+    A term has the residuals (N,) and their derivatives (N, 3) by the position of the points.
+    """
+    centre = x.mean(axis=0)
+    radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)
+    H, b = np.zeros((6, 6)), np.zeros(6)
+    for residual, slope in terms:
+        J = np.hstack([np.cross((x - centre) / radius, slope), slope])
+        weight = (1.0 + residual**2 / 4.0) ** -2
+        H += (J * weight[:, None]).T @ J
+        b += J.T @ (weight * residual)
+    step = -np.linalg.solve(H + _DAMPING * np.linalg.eigvalsh(H)[-1] * np.eye(6), b)
+    change = np.eye(4)
+    change[:3, :3] = Rotation.from_rotvec(step[:3] / radius).as_matrix()
+    change[:3, 3] = centre + step[3:] - change[:3, :3] @ centre
+    return change if np.isfinite(change).all() else None

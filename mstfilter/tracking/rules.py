@@ -92,17 +92,16 @@ def _check_candidate(one: Candidate) -> None:
     check_type(one, Candidate, "a Candidate", *_HOW_TO_MOVE)
     if isinstance(one.T, RigidTransform) and not one.T.single:
         raise InputError(f"returns a candidate with {len(one.T)} motions, expected one", "make a candidate for each")
-    if not isinstance(one.T, RigidTransform):
-        raise InputError(
-            f"returns a candidate whose T is {describe_value(one.T)}, expected one RigidTransform", *_HOW_TO_MOVE
-        )
+    for name, valid, expected in (
+        ("T", isinstance(one.T, RigidTransform), "one RigidTransform"),
+        ("kind", isinstance(one.kind, str), "a str"),
+        ("support", isinstance(one.support, Integral) and one.support >= 0, "an int >= 0"),
+        ("score", isinstance(one.score, Real) and not np.isnan(one.score), "a number"),
+    ):
+        if not valid:
+            found = describe_value(getattr(one, name))
+            raise InputError(f"returns a candidate whose {name} is {found}, expected {expected}", *_HOW_TO_MOVE)
     check_rigid(one.T.as_matrix(), f"a candidate {one.kind!r} with a motion")
-    if not isinstance(one.kind, str):
-        raise InputError(f"returns a candidate whose kind is {describe_value(one.kind)}, expected a str")
-    if not isinstance(one.support, Integral) or one.support < 0:
-        raise InputError(f"returns a candidate whose support is {describe_value(one.support)}, expected an int >= 0")
-    if not isinstance(one.score, Real) or np.isnan(one.score):
-        raise InputError(f"returns a candidate whose score is {describe_value(one.score)}, expected a number")
 
 
 def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | None:
