@@ -21,11 +21,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mst_training.completion_data import MASK_KINDS, CompletionSamples
-from mst_training.loop import Training, calibration_error, fit_calibration
+from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
 from mst_training.shapes import HELD_OUT
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, ShapePosterior
+from mstfilter.forecasts import ForecastTable
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,7 @@ def measure(
         "iou": float(iou["network"].mean()),
         "iou_extrude": float(iou["extrude"].mean()),
         "log_loss": float(_log_loss(p, truth, question).mean()),
-        "calibration_error": calibration_error(p[question], truth[question]),
+        "calibration_error": ForecastTable.of(np.round(p[question], 3), truth[question]).reliability(20).error,
     }
     return figures, rows
 

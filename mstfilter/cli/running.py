@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +23,7 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, check_output, locked, other_files
+from mstfilter.files import atomic_folder, check_output, locked, other_files, write_csv
 from mstfilter.report.progress import progress_bar
 
 _DEMO = "occlusion"  # the family of the demo
@@ -247,14 +248,14 @@ def quality(
     if csv is not None:
         check_output(csv)
     from mstfilter.runs import RunFolder
-    from mstfilter.scoring import read_estimates, read_truth, score_pauses, write_scores
+    from mstfilter.scoring import read_estimates, read_truth, score_pauses
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
     known = truth if volumes else read_source(truth, format, option, "")
     estimates = RunFolder.open(run).estimates() if run.is_dir() else read_estimates(run)
     rows = score_pauses(estimates, read_truth(known))
     if csv is not None:
-        write_scores(csv, rows)
+        write_csv(csv, [asdict(row) for row in rows], float_format=".6f")
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")
     print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
     for row in rows:

@@ -98,11 +98,10 @@ def test_the_same_hypothesis_gives_the_same_file(o3d, tmp_path, ending):
     assert export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes() == first
 
 
-@pytest.mark.parametrize("ending", MESH_FORMATS)
-def test_a_smooth_ball_is_rounder_than_a_blocky_one(o3d, tmp_path, ending):
+def test_a_smooth_ball_is_rounder_than_a_blocky_one(o3d, tmp_path):
     deviation = {}
     for style in ("blocky", "smooth"):
-        path = export_mesh(ball(), tmp_path / f"{style}.{ending}", style=style)
+        path = export_mesh(ball(), tmp_path / f"{style}.ply", style=style)
         (mesh,) = objects_of(o3d, path).values()
         assert mesh.is_watertight()
         centre = np.array([-0.1, 0.2, 0.0]) + 8 * 0.01

@@ -13,7 +13,7 @@ import torch
 from mst_training import completion_data
 from mst_training.completion import CompletionTraining
 from mst_training.completion_data import CompletionSamples
-from mst_training.loop import calibration_error, run_training
+from mst_training.loop import run_training
 from mst_training.scenes import draw_camera, draw_scene
 from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from mstfilter.completion import NetworkCompleter
@@ -161,10 +161,3 @@ def test_settings():
             CompletionTraining.recipe("cpu", [text])
     with pytest.raises(InputError, match="recipe"):
         CompletionTraining.recipe("fast")
-
-
-def test_calibration_error():
-    rng = np.random.default_rng(0)
-    p = rng.random(200_000)
-    assert calibration_error(p, rng.random(len(p)) < p) < 0.01
-    assert calibration_error(np.full(1000, 0.9), np.arange(1000) < 500) == pytest.approx(0.4)
