@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, check_choice, check_integer, check_number, naming
+from mstfilter.errors import InputError, check_choice, check_integer, check_number, missing_library, naming
 from mstfilter.files import weights_file
 from mstfilter.frontends.caffe import read_caffemodel
 from mstfilter.scene import Frame, Recording, UsesFiles, memo, scaled_length
@@ -118,7 +118,7 @@ def _load(digest: str, path: str, kind: str) -> CobNetwork:
     try:
         from mstfilter.frontends.cob_network import CobNetwork
     except ImportError as error:
-        raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
+        raise missing_library(error, "COB", library="torch") from error
     network = CobNetwork(3 if kind == "rgb" else 6)
     with naming(path):
         network.load_caffe(read_caffemodel(path))

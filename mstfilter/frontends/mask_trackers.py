@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mstfilter.errors import MissingLibraryError, check_integer, check_number, naming
+from mstfilter.errors import check_integer, check_number, missing_library, naming
 from mstfilter.files import weights_file
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.tracking import MaskTracker
@@ -106,7 +106,7 @@ def _load(path: str, digest: str) -> SiamMaskNetwork:
     try:
         from mstfilter.frontends.siammask_network import SiamMaskNetwork, read_checkpoint
     except ImportError as error:
-        raise MissingLibraryError(f"torch cannot be imported: {error}", "pip install torch") from error
+        raise missing_library(error, "SiamMask", library="torch") from error
     network = SiamMaskNetwork()
     with naming(path):
         network.load_state(read_checkpoint(Path(path)))
