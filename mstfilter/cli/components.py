@@ -79,7 +79,7 @@ def _check_folder(path: Path) -> None:
     if not runs and noted:
         damaged = [f"{path}: {wrong}" for wrong in damaged_files(path)]
     if not runs and not damaged:
-        open_recording(path).check()
+        open_recording(path, "recording").check()
     note = "" if noted else f"; {SUMS} is missing, so changes are not noticed"
     print("\n".join(f"damaged     {line}" for line in damaged) or f"sound       {path}{note}")
     if damaged:

@@ -112,19 +112,14 @@ def demo(
 def _check_earlier_demo(out: Path) -> None:
     """Raise InputError unless a folder is missing, empty, or of a demo and contains nothing else."""
     from mstfilter.formats import RECORDING_FILES, open_recording
-    from mstfilter.runs import RUN_FILES, RunFolder
+    from mstfilter.runs import RUN_FILES
 
     own = re.compile(rf"recording/({RECORDING_FILES.pattern})|run/({RUN_FILES.pattern})|report\.html")
     others = other_files(out, own)
     if not others and out.exists() and any(out.iterdir()):
-        source = open_recording(out / "recording").manifest
-        generators = (source.get("generator"), RunFolder.open(out / "run").description["recording"]["generator"])
-        if generators != (_SIMULATOR, _SIMULATOR) or dict(source.get("family", {})).get("name") != _DEMO:
+        source = open_recording(out / "recording", "recording").manifest
+        if source.get("generator") != _SIMULATOR or dict(source.get("family", {})).get("name") != _DEMO:
             others.append("recording")
-        elif (page := out / "report.html").exists() and "mstfilter" not in page.read_text(
-            encoding="utf-8", errors="replace"
-        ):
-            others.append("report.html")
     if others:
         raise InputError(
             f"{out} holds something that is not of a demo: {others[0]}", "choose another folder with --out"
@@ -166,12 +161,11 @@ def report(
             raise InputError(f"{run} is a study, only runs can be exported", f"export one of {run / 'runs'}")
         print(f"report      {write_study_report(run, out)}")
         return
-    _report(run, out)
-    if export is not None:
-        from mstfilter.report import export_run
-        from mstfilter.runs import RunFolder
+    from mstfilter.report import export_run, write_report
 
-        export_run(RunFolder.open(run), export, mesh_format, mesh_style)
+    print(f"report      {write_report(run, out)}")
+    if export is not None:
+        export_run(run, export, mesh_format, mesh_style)
         print(f"hypotheses  {export}")
 
 
@@ -292,32 +286,21 @@ def _execute_all(
     recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int, replace: bool = False
 ) -> None:
     """Run the filter without a name in `folder`, those that it is compared with in its folder ``compare``."""
+    from mstfilter.runs import filter_recording
+
     for name, config in configs.items():
-        _execute(recording, config, _compared(folder, name), seed, replace and not name)
+        with progress_bar("filter") as advance:
+            filter_recording(
+                recording,
+                config,
+                _compared(folder, name),
+                seed,
+                replace=replace and not name,
+                allow_files=True,
+                progress=lambda p, advance=advance: advance(p.done, p.total),  # type: ignore[misc]
+            )
 
 
 def _compared(folder: Path, name: str) -> Path:
     """The folder of a run that the run in `folder` is compared with; `folder` itself for no name."""
     return folder / "compare" / name.replace(" ", "-") if name else folder
-
-
-def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int, replace: bool = False) -> None:
-    from mstfilter.runs import filter_recording
-
-    with progress_bar("filter") as advance:
-        filter_recording(
-            recording,
-            config,
-            folder,
-            seed,
-            replace=replace,
-            allow_files=True,
-            progress=lambda p: advance(p.done, p.total),
-        )
-
-
-def _report(run: Path, out: Path | None) -> None:
-    from mstfilter.report import write_report
-    from mstfilter.runs import RunFolder
-
-    print(f"report      {write_report(RunFolder.open(run), out)}")

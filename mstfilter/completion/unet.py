@@ -30,7 +30,7 @@ from torch.nn import functional
 
 from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels
 from mstfilter.completion.observed import ObservedBox, encode_box
-from mstfilter.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.errors import InputError, describe_error, missing_library
 from mstfilter.reading import MAX_WEIGHTS, read_bytes
 from mstfilter.trained import calibrated_network, open_model
 
@@ -264,9 +264,7 @@ def _open_onnx(path: Path) -> TrainedNetwork:
     try:
         import onnxruntime
     except ImportError as error:
-        raise MissingLibraryError(
-            f"a network in ONNX needs onnxruntime, which cannot be imported: {error}", "pip install 'mstfilter[onnx]'"
-        ) from error
+        raise missing_library(error, "a network in ONNX", library="onnxruntime") from error
     if not path.is_file():
         raise InputError(f"file of a network does not exist: {path}")
     data = read_bytes(path, "a network", limit=MAX_WEIGHTS)

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
@@ -58,9 +58,7 @@ class BagFile:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise MissingLibraryError(
-                "bags and MCAP need rosbags, which is not installed", "pip install 'mstfilter[bags]'"
-            ) from error
+            raise missing_library(error, "a bag", library="rosbags") from error
         self.path = path
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")

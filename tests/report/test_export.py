@@ -161,6 +161,6 @@ def test_without_open3d_the_report_is_written_and_an_export_is_one_clear_error(t
     run = make_run(tmp_path / "run", pauses=1)
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert write_report(run).is_file()
-    with pytest.raises(MissingLibraryError, match="open3d cannot be imported"):
+    with pytest.raises(MissingLibraryError, match="needs open3d, which cannot be imported"):
         export_run(run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
