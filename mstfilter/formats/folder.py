@@ -30,7 +30,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -172,14 +172,8 @@ class RecordingWriter:
     def close(self) -> Path:
         """Write the remaining files and rename the folder to its final name."""
         camera, grid = self._camera, self._grid
-        described: dict[str, Any] = {
-            "K": camera.K.tolist(),
-            "width": camera.width,
-            "height": camera.height,
-            "depth_scale": self._scale,
-            "T_world_camera": None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist(),
-            "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
-        }
+        workspace = None if grid is None else _Workspace.of(grid)
+        described = _CameraFile.of(camera, depth_scale=self._scale, workspace=workspace).model_dump()
         manifest = {**self._manifest, "frames": self._frames}
         with self._writing(), self._open:
             (self._folder / "camera.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
@@ -265,12 +259,31 @@ def save_recording(
     return writer.path
 
 
-class _CameraFile(BaseModel):
-    K: Any  # checked by Camera, as the poses are by rigid_from_matrix
+class CameraFile(BaseModel):
+    """A camera in JSON, in recordings and runs."""
+
+    K: Any  # checked by Camera, as the pose is by rigid_from_matrix
     width: int
     height: int
-    depth_scale: float
     T_world_camera: Any = None
+
+    @classmethod
+    def of(cls, camera: Camera, **more: Any) -> Self:
+        """The entries of a camera; `more` are those of a subclass."""
+        pose = None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist()
+        size = {"width": camera.width, "height": camera.height}
+        return cls(K=camera.K.tolist(), T_world_camera=pose, **size, **more)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera. Raises InputError if its matrix or its pose cannot be used."""
+        matrix = self.T_world_camera
+        pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
+        return Camera(self.K, self.width, self.height, pose)
+
+
+class _CameraFile(CameraFile):
+    depth_scale: float
     workspace: _Workspace | None = None
 
 
@@ -337,9 +350,7 @@ def _open(path: Path, pauses: PauseRule | None) -> Recording:
         raise InputError(f"{path / 'manifest.json'}: there are no frames")
 
     with reading(path / "camera.json", "a recording"):
-        matrix = camera_file.T_world_camera
-        pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
-        camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
+        camera = camera_file.camera
         w = camera_file.workspace
         grid = None if w is None else VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
     times = tuple(e.time_s for e in entries)

@@ -47,6 +47,7 @@ from mstfilter.files import (
     write_sums,
     write_text,
 )
+from mstfilter.formats.folder import CameraFile
 from mstfilter.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.scene import (
     Camera,
@@ -55,9 +56,9 @@ from mstfilter.scene import (
     as_labels,
     decode_hypotheses,
     encode_hypotheses,
+    memo,
     read_labels,
     read_rgb,
-    rigid_from_matrix,
     write_image,
 )
 from mstfilter.scoring import FORMS, Questions, weighted_coverage
@@ -146,13 +147,6 @@ class _InfoFile(BaseModel):
         if any(not k >= -1 for parents in self.parents.values() for k in parents):
             raise ValueError("a parent is below -1")
         return self
-
-
-class _CameraFile(BaseModel):
-    K: Any
-    width: int
-    height: int
-    T_world_camera: Any
 
 
 class _SecondsFile(RootModel[dict[str, float]]):
@@ -281,15 +275,7 @@ class RunFolder:
             write_image(folder / "rgb.png", clip.after.rgb)
             if instance is not None:
                 write_image(folder / "instance.png", instance)
-            write_json(
-                folder / "camera.json",
-                {
-                    "K": camera.K,
-                    "width": camera.width,
-                    "height": camera.height,
-                    "T_world_camera": camera.pose.as_matrix(),
-                },
-            )
+            write_json(folder / "camera.json", CameraFile.of(camera.at(camera.pose)).model_dump())
             save_state(folder / "state.npz", state, HypothesisCodec(), compress=True, run=self.key)
             quality: dict[str, list[float]] | None = None
             if truth is not None:
@@ -386,10 +372,8 @@ class RunFolder:
     def camera(self, t: int) -> Camera:
         """Camera at a pause."""
         path = self.pause(t) / "camera.json"
-        data = self._read(path, _CameraFile)
         with reading(path, "a run folder"):
-            pose = rigid_from_matrix(data["T_world_camera"])
-            return Camera(data["K"], data["width"], data["height"], pose)
+            return CameraFile.model_validate(self._read(path, CameraFile)).camera
 
     def truth(self, t: int) -> np.ndarray | None:
         """True labels (X, Y, Z) at a pause; None if unknown."""
@@ -419,8 +403,15 @@ class RunFolder:
         return tuple(population.particles)
 
     def state(self, t: int) -> State:
-        """The state after pause `t`, from which the run is resumed."""
-        return load_state(self.pause(t) / "state.npz", HypothesisCodec(), limit=MAX_FILE)[0]
+        """The state after pause `t`, from which the run is resumed.
+
+        It is kept in `scene_cache`: a report asks for it many times.
+        """
+        path = self.pause(t) / "state.npz"
+        with reading(path, "a pause of a run"):
+            now = path.stat()
+        version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
+        return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE)[0])
 
     def write_metrics(self) -> None:
         """Write metrics.csv from the pauses."""

@@ -28,6 +28,7 @@ from mstfilter.scene.geometry import SupportPlane, fit_support_plane
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
+_ASPECTS, _ANY = (0.8, 1.25), (-np.inf, np.inf)  # ratio of the focal lengths; warning
 _OFF_CENTRE = (0.2, 0.4)  # of the image size: principal point from the middle; warning and stop
 _VOXELS, _POSSIBLE_VOXELS = (0.001, 0.05), (0.0002, 0.3)  # metres; warning and stop
 _DISTANCES = (0.25, 2.0)  # metres from the camera to the table; warning
@@ -40,11 +41,8 @@ _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the 
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
 _TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
-_DRIFT = (
-    2.0,
-    0.02,
-    0.015,
-)  # degrees, metres, metres: tilt, height and shift of the camera between pauses; twice: stop
+# Tilt in degrees, height and shift in metres of the camera between pauses: warning; twice: stop.
+_DRIFT = (2.0, 0.02, 0.015)
 _MIN_MOVED = 15  # matched corners that agree with a moved camera
 _PEAK, _EXCESS, _ORDER = 0.15, 0.2, 0.015  # of the rank of colour edges below depth edges: see `_registration`
 _SHIFTS = 16  # pixels of an image of 320 columns
@@ -171,8 +169,13 @@ def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
     return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
 
 
-def _outside(value: float, limits: tuple[float, float]) -> bool:
-    return not limits[0] <= value <= limits[1]
+_Limits = tuple[float, float]
+
+
+def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
+    """A finding if a value is outside of its usual limits; it stops the run if the value is not possible."""
+    if not usual[0] <= value <= usual[1]:
+        yield Finding(not possible[0] <= value <= possible[1], text, hints)
 
 
 def _intrinsics(camera: Camera) -> Iterator[Finding]:
@@ -181,15 +184,10 @@ def _intrinsics(camera: Camera) -> Iterator[Finding]:
     width, height = camera.width, camera.height
     hint = "check K: it is in pixels of these images; scale it if they were resized"
     angle = float(np.degrees(2 * np.arctan(width / (2 * fx))))
-    if _outside(angle, _FIELDS):
-        text = (
-            f"a focal length of {fx:.4g} pixels gives images of {width} pixels a field of view of {angle:.3g} degrees"
-        )
-        yield Finding(_outside(angle, _POSSIBLE_FIELDS), text, (hint,))
-    elif _outside(fx / fy, (0.8, 1.25)):
-        yield Finding(
-            False, f"the focal lengths are {fx:.4g} and {fy:.4g} pixels, expected nearly equal ones", (hint,)
-        )
+    text = f"a focal length of {fx:.4g} pixels gives images of {width} pixels a field of view of {angle:.3g} degrees"
+    yield from _limited(angle, _FIELDS, _POSSIBLE_FIELDS, text, hint)
+    text = f"the focal lengths are {fx:.4g} and {fy:.4g} pixels, expected nearly equal ones"
+    yield from _limited(fx / fy, _ASPECTS, _ANY, text, hint)
     x, y = cx / width - 0.5, cy / height - 0.5
     off = max(abs(x), abs(y))
     if off > _OFF_CENTRE[0]:
@@ -201,10 +199,9 @@ def _intrinsics(camera: Camera) -> Iterator[Finding]:
 
 def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
     size = grid.voxel_size
-    if _outside(size, _VOXELS):
-        text = f"the voxels have edges of {size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m"
-        hint = "check the workspace: its bounds and its voxel size are in metres"
-        yield Finding(_outside(size, _POSSIBLE_VOXELS), text, (hint,))
+    text = f"the voxels have edges of {size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m"
+    hint = "check the workspace: its bounds and its voxel size are in metres"
+    yield from _limited(size, _VOXELS, _POSSIBLE_VOXELS, text, hint)
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
@@ -277,11 +274,11 @@ def _scale(first: Look) -> Iterator[Finding]:
     """Distances that are not those of a camera over a table."""
     z, size = first.distance, first.grid.voxel_size
     hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002, RealSense L515 0.00025"
-    if _outside(z, _DISTANCES):
-        near, far = z < _VOXELS_IN_DISTANCE * size, depth_sigma(z) > _NOISE_IN_VOXELS * size
-        text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
-        right = f"if the distance is right, give a workspace with {'larger' if far else 'smaller'} voxels"
-        yield Finding(bool(near or far), text, (hint, right))
+    possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
+    text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
+    voxels = "larger" if z > possible[1] else "smaller"
+    right = f"if the distance is right, give a workspace with {voxels} voxels"
+    yield from _limited(z, _DISTANCES, possible, text, hint, right)
     raised = first.in_columns & (first.points[:, 2] > _MIN_HEIGHT)
     above = first.points[raised, 2] > first.grid.upper[2]
     if raised.sum() >= _MIN_READINGS and above.mean() > 0.5:

@@ -47,7 +47,7 @@ class PauseRule(ABC):
         """
 
 
-_rule_of_text = late("mstfilter.formats.pauses:pause_rule", "The rule of a text.")
+_rule_of_text = late("mstfilter.formats.sources:pause_rule", "The rule of a text.")
 
 
 class LazyFrames(Sequence[Frame]):
