@@ -117,6 +117,10 @@ class _RunFile(BaseModel):
     machine: dict[str, str | int]
 
 
+# Fields of `Info` that info.json holds.
+_COPIED = ("t", "n", "n_candidates", "ess", "resampled", "unique_ancestors", "ancestors", "parents", "log_weights")
+
+
 class _InfoFile(BaseModel):
     """What readers use of info.json."""
 
@@ -282,21 +286,9 @@ class RunFolder:
                 pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
                 np.savez_compressed(folder / "truth.npz", labels=truth, questions=pairs.astype(np.int32))
                 quality = {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
-            record = {
-                "t": info.t,
-                "n": info.n,
-                "n_frames": len(clip),
-                "n_candidates": info.n_candidates,
-                "ess": info.ess,
-                "resampled": info.resampled,
-                "unique_ancestors": info.unique_ancestors,
-                "ancestors": info.ancestors,
-                "parents": info.parents,
-                "log_weights": info.log_weights,
-                "weights": state.population.weights,
-                "quality": quality,
-                "notes": info.notes,
-            }
+            record = {name: getattr(info, name) for name in _COPIED}
+            weights = state.population.weights
+            record |= {"n_frames": len(clip), "weights": weights, "quality": quality, "notes": info.notes}
             write_json(folder / "info.json", record)
             write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)
