@@ -10,15 +10,20 @@ first; the modules of the caller are found, because `multiprocessing` and joblib
 
 from __future__ import annotations
 
+import ast
 import functools
 import os
 import platform
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
+
+from mstfilter.errors import InputError
 
 
 @contextmanager
@@ -35,6 +40,28 @@ def environment(**variables: str) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+def check_main_guard(what: str) -> None:
+    """Raise InputError if new processes would repeat the call of `what` that a script makes.
+
+    `multiprocessing` imports the script in each new process, except for what is below ``if __name__ == "__main__":``.
+    """
+    main = sys.modules["__main__"]
+    path, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and (frame.f_code.co_name != "<module>" or frame.f_globals is not vars(main)):
+        frame = frame.f_back
+    if frame is None or path is None or (spec is not None and spec.name.endswith("__main__")):
+        return  # called in another thread, in a notebook, or by `python -m PACKAGE`
+    with suppress(OSError, SyntaxError):
+        for statement in ast.parse(Path(path).read_text(encoding="utf-8")).body:
+            here = statement.lineno <= frame.f_lineno <= (statement.end_lineno or statement.lineno)
+            if here and not (isinstance(statement, ast.If) and "__name__" in ast.unparse(statement.test)):
+                raise InputError(
+                    f"{path}, line {frame.f_lineno}: {what} starts processes, and each of them runs the script again",
+                    'put the call below `if __name__ == "__main__":`',
+                )
 
 
 @functools.cache

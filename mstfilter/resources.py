@@ -1,4 +1,4 @@
-"""Files that come with the package: presets and weights (`models/`), example components (`docs/examples/`).
+"""Files that come with the package: presets, weights and their training (`models/`), example components.
 
 >>> models_folder() / "mst.toml"
 >>> examples_folder() / "resampler.py"
@@ -8,7 +8,10 @@ A wheel holds both inside the package; in a checkout or an editable install they
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 from mstfilter.errors import InputError, suggestion
 
@@ -23,6 +26,17 @@ def models_folder() -> Path:
 def examples_folder() -> Path:
     """The folder that holds the example components of the documentation, and their tests."""
     return _folder_with("resampler.py", "_examples", "docs/examples")
+
+
+def training_program(name: str) -> ModuleType:
+    """A module of `models/mst_training`, the programs that trained the weights.
+
+    The folder stays in `sys.path`, so that processes which a training starts find the module.
+    """
+    folder = str(models_folder())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return import_module(f"mst_training.{name}")
 
 
 def _folder_with(file: str, installed: str, in_checkout: str) -> Path:

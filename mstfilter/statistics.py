@@ -51,7 +51,7 @@ class Difference:
     p_holm : float
         `p_claim` adjusted for all comparisons of the table; equals `p_claim` for a single comparison.
     p_bootstrap : float
-        Two-sided p value of the studentised bootstrap, see `bootstrap_p`; NaN for fewer than five units.
+        Two-sided p value of the studentised bootstrap, see `studentised_bootstrap`; NaN for fewer than five units.
     skewness : float
         Sample skewness of the differences; 0 if they are equal.
     """
@@ -115,9 +115,10 @@ def compare(first: Values, second: Values) -> Difference:
     if len(d) == 0:
         nan = float("nan")
         return Difference(nan, nan, nan, nan, nan, nan, 0)
-    ratios = _resampled_ratios(d, N_BOOTSTRAP)
-    found = Difference(float(d.mean()), *interval(d), *_limits(d, ratios), sign_flip(d), len(d))
-    found = replace(found, p_bootstrap=_p_of(d, ratios), skewness=_skewness(d))
+    low, high, p = studentised_bootstrap(d)
+    found = Difference(
+        float(d.mean()), *interval(d), low, high, sign_flip(d), len(d), p_bootstrap=p, skewness=_skewness(d)
+    )
     return replace(found, p_holm=found.p_claim)
 
 
@@ -132,62 +133,39 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean() - half), float(values.mean() + half)
 
 
-def studentised(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float]:
-    """Studentised bootstrap interval of the mean (Efron, Tibshirani 1993, section 12.5); NaN for fewer
-    than five values.
+def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
+    """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
-    The random generator is fixed, so the same values give the same interval. A resample of equal values has an
-    infinite t ratio, so a limit is infinite if most values are equal.
+    NaN for fewer than five values. The random generator is fixed, so the same values give the same result. A resample
+    of equal values has an infinite t ratio, so a limit is infinite if most values are equal.
+
+    The p value is the larger of two: the equal-tailed one, which follows the skew like the interval (Efron,
+    Tibshirani 1993, section 12.5), and that of the absolute t ratio, which is larger for symmetric values with heavy
+    tails (Hall 1992, section 3.6).
     """
-    return _limits(values, _resampled_ratios(values, n_resamples))
-
-
-def bootstrap_p(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> float:
-    """Two-sided p value of a zero mean by the studentised bootstrap; NaN for fewer than five values.
-
-    The larger of two p values: the equal-tailed one, which follows the skew like the interval of `studentised`, and
-    that of the absolute t ratio, which is larger for symmetric values with heavy tails (Hall 1992, section 3.6).
-    """
-    return _p_of(values, _resampled_ratios(values, n_resamples))
+    n, mean = len(values), float(values.mean())
+    if n < 5:
+        return float("nan"), float("nan"), float("nan")
+    if _all_equal(values):
+        return mean, mean, 1.0 if mean == 0 else 1 / (1 + n_resamples)
+    ratios, scale = _resampled_ratios(values, n_resamples), values.std(ddof=1)
+    found = np.quantile(ratios, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
+    low, high = np.where(np.abs(found) > 1e100, np.copysign(np.inf, found), found) * scale
+    tails = (ratios >= mean / scale).sum(), (ratios <= mean / scale).sum()
+    count = 1 + np.array([2 * min(tails) + 1, (np.abs(ratios) >= abs(mean / scale)).sum()])
+    return mean - float(high), mean - float(low), min(1.0, float(count.max()) / (1 + n_resamples))
 
 
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
-    """(mean of a resample - mean) / standard deviation of the resample; none for fewer than five values.
+    """(mean of a resample - mean) / standard deviation of the resample.
 
     The ratios of resamples of equal values are infinite, given as +-1e200 since quantiles interpolate.
     """
-    n = len(values)
-    if n < 5:
-        return np.zeros(0)
     rng = np.random.default_rng(20210)
-    drawn = values[rng.integers(0, n, (n_resamples, n))]
+    drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]
     scale = drawn.std(axis=1, ddof=1)
     away = drawn.mean(axis=1) - values.mean()
     return np.divide(away, scale, out=np.copysign(1e200, away), where=scale > 1e-9 * values.std(ddof=1))
-
-
-def _limits(values: np.ndarray, ratios: np.ndarray) -> tuple[float, float]:
-    """Limits of the studentised bootstrap interval."""
-    mean = float(values.mean())
-    if len(ratios) == 0:
-        return float("nan"), float("nan")
-    if _all_equal(values):
-        return mean, mean
-    found = np.quantile(ratios, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
-    low, high = np.where(np.abs(found) > 1e100, np.copysign(np.inf, found), found) * values.std(ddof=1)
-    return mean - float(high), mean - float(low)
-
-
-def _p_of(values: np.ndarray, ratios: np.ndarray) -> float:
-    """The p value of `bootstrap_p`."""
-    if len(ratios) == 0:
-        return float("nan")
-    if _all_equal(values):
-        return 1.0 if values.mean() == 0 else 1 / (1 + len(ratios))
-    observed = values.mean() / values.std(ddof=1)
-    tails = (ratios >= observed).sum(), (ratios <= observed).sum()
-    count = 1 + np.array([2 * min(tails) + 1, (np.abs(ratios) >= abs(observed)).sum()])
-    return min(1.0, float(count.max()) / (1 + len(ratios)))
 
 
 def _all_equal(values: np.ndarray) -> bool:
@@ -265,11 +243,7 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
 
 def slope(times: np.ndarray, values: np.ndarray) -> float:
     """Least-squares slope of values over times; NaN for fewer than two."""
-    times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
-    if len(times) < 2:
-        return float("nan")
-    centred = times - times.mean()
-    return float(centred @ values / (centred @ centred))
+    return float(np.polyfit(times, values, 1)[0]) if len(times) > 1 else float("nan")
 
 
 def conclusion(difference: Difference, first: str, second: str, where: str = "", unit: str = "scene") -> str:

@@ -110,9 +110,9 @@ def _write_run(path: Path) -> None:
 
 
 def _read_run(path: Path) -> None:
-    from mstfilter.runs import read_estimate
+    from mstfilter.runs import RunFolder
 
-    read_estimate(path)
+    RunFolder.open(path).estimates()
 
 
 def _draw_run(path: Path) -> None:
@@ -262,7 +262,7 @@ def _write_volumes(path: Path) -> None:
 
 
 def _read_volumes(path: Path) -> None:
-    from mstfilter.runs import read_truth
+    from mstfilter.scoring import read_truth
 
     read_truth(path / "voxels.npz")
 

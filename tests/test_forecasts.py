@@ -90,7 +90,7 @@ def test_recalibration_is_the_best_monotone_map(pairs):
 
 
 def test_recalibration_of_a_monotone_transform_is_the_same():
-    """Information does not depend on how sure the forecasts are, only on what they tell apart."""
+    """The recalibrated log loss does not depend on how sure the forecasts are, only on what they tell apart."""
     rng = np.random.default_rng(2)
     p = rng.integers(1, 20, 5000) / 20
     y = rng.random(len(p)) < p

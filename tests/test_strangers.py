@@ -113,7 +113,7 @@ def test_an_image_is_not_decoded_if_its_header_announces_too_much(tmp_path):
 
 @pytest.mark.parametrize("way", ["announced", "unpacked"])
 def test_an_array_is_not_unpacked_if_it_is_too_large(tmp_path, monkeypatch, way):
-    from mstfilter.runs import read_truth
+    from mstfilter.scoring import read_truth
 
     monkeypatch.setattr("mstfilter.reading.MAX_FILE", 2**20)
     data = hostile.bomb((10**6, 10**6)) if way == "announced" else hostile.bomb((2**23,), gigabytes=1 / 64)

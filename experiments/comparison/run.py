@@ -47,7 +47,7 @@ CASES: dict[str, Draw] = {
 def p_values(x: np.ndarray) -> dict[str, np.ndarray]:
     """p values of the columns of (n, k) differences, by test: as in `compare`, by matrix products.
 
-    The limits of both intervals are those of the tests `t` and `bootstrap`, so p values below .05 exclude 0.
+    The limits of both intervals are those of the tests `t` and `studentised_bootstrap`: p values below .05 exclude 0.
     """
     n = len(x)
     mean, sd = x.mean(axis=0), x.std(axis=0, ddof=1)
@@ -65,7 +65,7 @@ def _by_flips(x: np.ndarray) -> np.ndarray:
 
 
 def _by_bootstrap(x: np.ndarray) -> np.ndarray:
-    """`bootstrap_p` of each column, with the same resamples."""
+    """The p value of `studentised_bootstrap` of each column, with the same resamples."""
     n, mean, sd = len(x), x.mean(axis=0), x.std(axis=0, ddof=1)
     drawn = np.random.default_rng(20210).integers(0, n, (N_BOOTSTRAP, n))
     counts = np.stack([(drawn == k).sum(axis=1) for k in range(n)], axis=1) / n

@@ -18,11 +18,14 @@ from hilbert_map import HilbertMap
 
 from mstfilter.completion import Completer, Extrude, Hull, NetworkCompleter, SurfaceOnly
 from mstfilter.files import write_csv
+from mstfilter.resources import training_program
 from mstfilter.statistics import interval
-from mstfilter.training import HELD_OUT, Samples, read_samples
+
+HELD_OUT = training_program("shapes").HELD_OUT
+CompletionSamples = training_program("completion_data").CompletionSamples
 
 
-def complete(completer: Completer, samples: Samples) -> np.ndarray:
+def complete(completer: Completer, samples: CompletionSamples) -> np.ndarray:
     """Filled voxels (n, 32, 32, 32) bool, after the veto."""
     filled = np.zeros(samples.truth.shape, bool)
     rngs = [np.random.default_rng([0, k]) for k in range(len(samples))]
@@ -40,7 +43,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--most", type=int, default=0, help="at most so many samples; 0 for all")
     chosen = parser.parse_args()
-    samples = read_samples(sorted((chosen.trained / "samples/test").glob("*.npz")))
+    samples = CompletionSamples.read(sorted((chosen.trained / "samples/test").glob("*.npz")))
     samples = samples.take(np.arange(len(samples))[: chosen.most or None])
     completers = {
         "surface": SurfaceOnly(),

@@ -8,7 +8,8 @@ their true identity; objects that have left the workspace count as not found.
 
 Columns of runs.csv, one row per scene, policy and number of pushes k:
 coverage: IoU of each object of the first scene with the best object of a hypothesis, weighted by the volume at the
-start, 0 for lost objects, mean over the hypotheses. quality: `objects` quality of what is on the table. information:
+start, 0 for lost objects, mean over the hypotheses. quality: `objects` quality of what is on the table.
+recalibrated_log_loss:
 log loss of "do these two voxels belong to one object?" at the present pause, in nats, after recalibration on the
 other scenes of the family; one recalibration for all policies. brier and log_loss: of the same questions, forecasts
 as they come. lost: objects that have left. entropy: of the segmentation, in nats, as the filter believes.
@@ -35,7 +36,7 @@ from policies import POLICIES
 
 from mstfilter import Belief, ParticleFilter, preset
 from mstfilter.files import write_csv, write_text
-from mstfilter.scoring import ask, leave_one_out, overlap, pause_metrics, score_belief
+from mstfilter.scoring import LOG_LOSS, ask, leave_one_out, overlap, pause_metrics, score_belief
 from mstfilter.scoring.metrics import coverage_of
 from mstfilter.simulation import FingerPush, PushLoop, scene_family
 from mstfilter.smc import State
@@ -44,7 +45,7 @@ from mstfilter.statistics import compare_arms, conclusion
 N_PUSHES, N_CANDIDATES = 6, 12
 #: Eight frames a clip instead of fifteen halve the time of the study.
 CHANGES = {"frames_per_clip": 8, "fps": 2.5}
-SCORES = ("coverage", "quality", "information", "brier", "log_loss", "lost")
+SCORES = ("coverage", "quality", LOG_LOSS, "brier", "log_loss", "lost")
 SMALL = {"width": 96, "height": 72, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": 1}
 
 
@@ -127,7 +128,7 @@ def run(arguments: tuple[Any, ...]) -> str:
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of all finished scenes, with the information."""
+    """The rows of all finished scenes, with the recalibrated log loss."""
     rows: list[dict[str, Any]] = []
     counts: dict[str, dict[str, np.ndarray]] = {}
     for path in sorted(folder.glob("*.json")):
@@ -139,7 +140,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
         for scene, one in found.items():
             own = [row for row in rows if row["family"] == family and row["scene"] == scene]
             for row, of_pause in zip(own, one, strict=True):
-                row["information"] = fits[scene].log_loss(of_pause) if scene in fits else float("nan")
+                row[LOG_LOSS] = fits[scene].log_loss(of_pause) if scene in fits else float("nan")
     return rows
 
 
@@ -175,7 +176,7 @@ def _by_scene(rows: list[dict[str, Any]], policy: str, score: str, pushes: Seque
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Coverage, information and quality against the number of pushes, means over all scenes."""
+    """Coverage, log loss and quality against the number of pushes, means over all scenes."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -184,7 +185,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     plt.style.use("mstfilter.report.figures")
     titles = {
         "coverage": "coverage of the first objects (higher is better)",
-        "information": "information, nats (lower is better)",
+        LOG_LOSS: "log loss (recalibrated), nats (lower is better)",
         "quality": "quality (higher is better)",
     }
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.2))

@@ -8,7 +8,7 @@ are the alternatives of a mask folder, with equal weights.
 
 Arms: `mst` and its `samples` (no past) over the three alternatives; each alternative alone, without past (`split`,
 `merged`, `displaced`) and filtered (`mst split`, ...). Columns of runs.csv, means over the pauses t >= 1 of a scene:
-quality (form `objects`) of the estimate of least expected loss, mean quality by weight, and information, the log loss
+quality (form `objects`) of the estimate of least expected loss, mean quality by weight, and the log loss
 of "do these two voxels belong to one object?" in nats after recalibration on the other scenes (lower is better).
 
 Finished scenes are not run again. summary.csv has `mst` minus each other arm, paired by scene; `best alternative` is
@@ -32,14 +32,14 @@ from mstfilter.files import write_csv, write_text
 from mstfilter.frontends import write_masks
 from mstfilter.oracles import TrueMasks, bind_truth, degrade
 from mstfilter.scene import Recording, scene_cache
-from mstfilter.scoring import ask, leave_one_out, pause_metrics, score_belief
+from mstfilter.scoring import LOG_LOSS, ask, leave_one_out, pause_metrics, score_belief
 from mstfilter.simulation import scene_family, simulate_recording
 from mstfilter.smc import Key
 from mstfilter.statistics import compare_arms, conclusion
 
 WAYS = {"split": (1.0, 0.0), "merged": (0.0, 1.0), "displaced": (0.0, 0.0)}  # shares of splits and merges
 SMALL = {"width": 96, "height": 72, "frames_per_clip": 6, "voxel_size": 0.02, "supersample": False, "n_actions": 1}
-SCORES = ("quality", "mean_quality", "information")
+SCORES = ("quality", "mean_quality", LOG_LOSS)
 
 
 def alternatives(recording: Recording, seed: int, quality: float) -> dict[str, list[np.ndarray]]:
@@ -99,7 +99,7 @@ def run_scene(name: str, seed: int, quality: float, small: bool) -> tuple[list[d
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of all finished scenes, with the information."""
+    """The rows of all finished scenes, with the recalibrated log loss."""
     rows: list[dict[str, Any]] = []
     counts: dict[str, dict[str, np.ndarray]] = {}
     for path in sorted(folder.glob("*.json")):
@@ -110,27 +110,27 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     fits = {arm: leave_one_out(by_scene) for arm, by_scene in counts.items()}
     for row in rows:
         fit = fits[row["arm"]].get(row["scene"])
-        row["information"] = float("nan") if fit is None else fit.log_loss(counts[row["arm"]][row["scene"]])
+        row[LOG_LOSS] = float("nan") if fit is None else fit.log_loss(counts[row["arm"]][row["scene"]])
     return rows
 
 
 def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """`mst` minus each arm, for each score."""
+    """Each arm minus `mst`, for each score."""
     summary = []
     for score in SCORES:
         table: dict[str, dict[str, float]] = {}
         for row in rows:
             table.setdefault(row["arm"], {})[row["scene"]] = row[score]
-        sign = -1 if score == "information" else 1
+        sign = -1 if score == LOG_LOSS else 1
         best = max(WAYS, key=lambda way: sign * np.mean(list(table[way].values())))
         table["best alternative"] = table[best]
         for arm, d in compare_arms(table, reference="mst").items():
             line = {"score": score, "arm": arm, "mst": np.mean(list(table["mst"].values()))}
             line |= {
                 "value": np.mean(list(table[arm].values())),
-                "mst_minus": -d.mean,
-                "low": -d.high,
-                "high": -d.low,
+                "minus_mst": d.mean,
+                "low": d.low,
+                "high": d.high,
             }
             summary.append({**line, "n": d.n, "p_holm": d.p_holm, "conclusion": conclusion(d, arm, "mst", score)})
     return summary

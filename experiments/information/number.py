@@ -2,10 +2,10 @@
 
     python experiments/information/number.py STUDY [--out experiments/information/results]
 
-number.csv has one row per number of hypotheses, means over the scenes that all numbers have: information (nats, lower
-is better) and how much it improves on the next smaller number, paired by scene with a 95 % interval; the calibration
-error of the forecasts as they come; the quality of the estimate (`Belief.estimate`) and the mean quality; the energy
-score and its floor, the same hypotheses with noise at the border; processor seconds of a step.
+number.csv has one row per number of hypotheses, means over the scenes that all numbers have: recalibrated log loss
+(nats, lower is better) and its difference from that of the next smaller number, paired by scene with a 95 % interval;
+the calibration error of the forecasts as they come; the quality of the estimate (`Belief.estimate`) and the mean
+quality; the energy score and its floor, the same hypotheses with noise at the border; processor seconds of a step.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.files import read_csv, write_csv
+from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import compare_arms
 
 COLUMNS = (
-    *("information", "calibration_error", "quality_estimate", "quality"),
+    *(LOG_LOSS, "calibration_error", "quality_estimate", "quality"),
     *("energy", "energy_floor", "core_seconds"),
 )
 
@@ -40,14 +41,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     chosen = parser.parse_args()
     values = {column: by_scene(chosen.study / "runs.csv", column) for column in COLUMNS}
-    numbers = list(values["information"])
-    scenes = set.intersection(*(set(values["information"][n]) for n in numbers))
+    numbers = list(values[LOG_LOSS])
+    scenes = set.intersection(*(set(values[LOG_LOSS][n]) for n in numbers))
     rows = []
     for k, n in enumerate(numbers):
         row = {"n": n, "scenes": len(scenes)}
         row |= {c: float(np.mean([v for s, v in values[c].get(n, {}).items() if s in scenes])) for c in COLUMNS}
         if k:
-            pair = {str(m): {s: values["information"][m][s] for s in scenes} for m in (n, numbers[k - 1])}
+            pair = {str(m): {s: values[LOG_LOSS][m][s] for s in scenes} for m in (n, numbers[k - 1])}
             d = compare_arms(pair, str(numbers[k - 1]))[str(n)]
             row |= {"minus_smaller": d.mean, "low": d.low, "high": d.high}
         rows.append(row)
@@ -58,7 +59,7 @@ def main() -> None:
 
 
 def draw(rows: list[dict[str, float]], path: Path) -> None:
-    """Information and energy score against the number of hypotheses."""
+    """Log loss and energy score against the number of hypotheses."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -67,8 +68,12 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
     plt.style.use("mstfilter.report.figures")
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.2))
     n = [row["n"] for row in rows]
-    panels = (("information",), ("energy", "energy_floor"), ("quality_estimate", "quality"))
-    titles = ("information, nats (lower is better)", "energy score (lower is better)", "quality (higher is better)")
+    panels = ((LOG_LOSS,), ("energy", "energy_floor"), ("quality_estimate", "quality"))
+    titles = (
+        "log loss (recalibrated), nats (lower is better)",
+        "energy score (lower is better)",
+        "quality (higher is better)",
+    )
     for axis, names, title in zip(axes, panels, titles, strict=True):
         for name in names:
             axis.plot(n, [row[name] for row in rows], "o-", label=name.replace("_", " "))

@@ -3,7 +3,7 @@
     python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"] [--pooled]
 
 Files are named after the study: NAME.csv (one row per family and arm: means over scenes of pauses t >= 1),
-NAME_scenes.csv (the primary endpoints of each scene) and NAME_differences.csv (reference minus arm in the primary
+NAME_scenes.csv (the primary endpoints of each scene) and NAME_differences.csv (arm minus reference in the primary
 endpoints; unadjusted t interval, studentised bootstrap, sign-flip p, p after Holm over endpoints, families and arms),
 which are also printed as tables for the README. NAME_cases.csv has the quality of visible, hidden and never seen
 objects; a case is one object at one pause t >= 1 (mean over cases, not over scenes). NAME_time.csv has core seconds
@@ -53,13 +53,13 @@ METRICS = (
     "quality_estimate",
     "volume_missed",
     "volume_invented",
-    "information",
-    "information_slope",
-    "information_same",
-    "information_different",
-    "information_free",
-    "information_visible",
-    "information_hidden",
+    "recalibrated_log_loss",
+    "recalibrated_log_loss_slope",
+    "recalibrated_log_loss_same",
+    "recalibrated_log_loss_different",
+    "recalibrated_log_loss_free",
+    "recalibrated_log_loss_visible",
+    "recalibrated_log_loss_hidden",
     "brier",
     "log_loss",
     "calibration_error",
@@ -101,8 +101,8 @@ def differences(found: Summary, metrics: Iterable[str] = ENDPOINTS) -> list[dict
             row = {
                 "endpoint": c.metric,
                 "family": c.family,
-                "reference": c.first,
-                "arm": c.second,
+                "arm": c.arm,
+                "reference": c.reference,
                 "n": str(d.n),
                 "mean": f"{d.mean:.4f}",
             }

@@ -1,7 +1,7 @@
 """Figure `quality_over_time`: both endpoints over pauses, by family and method, from a study folder.
 
 The quality of all hypotheses is the figure of the study report as a file, in the report's light colours; the same
-figure of the information of the runs is `information_over_time`.
+figure of their log loss is `recalibrated_log_loss_over_time`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from pathlib import Path
 import mstfilter.report
 from mstfilter.errors import InputError
 from mstfilter.report import SERIES, colour, figure_groups, hexadecimal, time_figure
-from mstfilter.study import StudyFolder
+from mstfilter.scoring import LOG_LOSS
+from mstfilter.study import StudyFolder, title_of
 
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
 
@@ -30,11 +31,11 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
     arms = list(chosen) or [name for name in known if name not in folder.reported_only]
     rows = [row for row in folder.records() if row["arm"] in arms]
     paths = []
-    for measure in ("quality", "information"):
+    for measure in ("quality", LOG_LOSS):
         values: dict[str, dict[str, dict[int, list[float]]]] = {}
         scenes: dict[str, set[str]] = {}
         for row in rows:
-            found = row.get("qualities") if measure == "quality" else row.get("information")
+            found = row.get("qualities") if measure == "quality" else row.get(LOG_LOSS)
             if found:
                 by_pause = values.setdefault(row["family"], {}).setdefault(row["arm"], {})
                 by_pause.setdefault(row["pause"], []).extend(found if measure == "quality" else [found])
@@ -45,7 +46,7 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
         titled = {f"{family}, n = {len(scenes[family])} scenes": of_arms for family, of_arms in values.items()}
         for k, group in enumerate(figure_groups(arms, folder.description["reference"])):
             paths.append(out / f"{measure}_over_time{f'_{k + 1}' if k else ''}.svg")
-            paths[-1].write_text(standalone(time_figure(titled, group, measure)))
+            paths[-1].write_text(standalone(time_figure(titled, group, title_of(measure))))
     return paths
 
 

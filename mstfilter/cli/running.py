@@ -246,11 +246,13 @@ def quality(
 
     if csv is not None:
         check_output(csv)
-    from mstfilter.runs import read_estimate, read_truth, score_pauses, write_scores
+    from mstfilter.runs import RunFolder
+    from mstfilter.scoring import read_estimates, read_truth, score_pauses, write_scores
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
     known = truth if volumes else read_source(truth, format, option, "")
-    rows = score_pauses(read_estimate(run), read_truth(known))
+    estimates = RunFolder.open(run).estimates() if run.is_dir() else read_estimates(run)
+    rows = score_pauses(estimates, read_truth(known))
     if csv is not None:
         write_scores(csv, rows)
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")

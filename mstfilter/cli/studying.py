@@ -58,20 +58,22 @@ def study(
 
 
 def _print_summary(summary: Any) -> None:
-    """Print the primary endpoints by family and arm, and the differences to the reference."""
+    """Print the primary endpoints by family and arm, and arm minus reference."""
     from rich.console import Console
     from rich.table import Table
 
-    from mstfilter.study import ENDPOINTS
+    from mstfilter.study import ENDPOINTS, title_of
 
     if not summary.metrics or "quality" not in summary.names:
         return
     endpoints = [name for name in ENDPOINTS if name in summary.names]
     columns = [
-        text for name in endpoints for text in (f"{name}, t >= 1", "95 %", f"{summary.reference} - arm", "95 %")
+        text
+        for name in endpoints
+        for text in (f"{title_of(name)}, t >= 1", "95 %", f"arm - {summary.reference}", "95 %")
     ]
     table = Table("family", "arm", "n", *columns, "s a step")
-    compared = {(one.metric, one.family, one.second): one.difference for one in summary.differences}
+    compared = {(one.metric, one.family, one.arm): one.difference for one in summary.differences}
     for family in summary.families:
         for arm in summary.arms:
             main, seconds = summary.metric(family, arm), summary.metric(family, arm, "core_seconds")

@@ -26,9 +26,9 @@ def train(
     from mstfilter.files import check_output
 
     check_choice("part", part, ("completion", "border"))
-    from mstfilter.training import BorderTraining, CompletionTraining, run_training
+    from mstfilter.resources import training_program
 
-    trained = CompletionTraining if part == "completion" else BorderTraining
+    trained = getattr(training_program(part), f"{part.capitalize()}Training")
     settings = trained.recipe(recipe, overrides or ())
     folder = out or Path("trained") / part
     check_output(folder, folder=True, empty=False)
@@ -36,7 +36,7 @@ def train(
     def report(done: int, total: int, text: str) -> None:
         print(f"{done:7d} of {total}  {text}", flush=True)
 
-    figures = run_training(settings, folder, workers, report, device or None)
+    figures = training_program("loop").run_training(settings, folder, workers, report, device or None)
     use = {
         "completion": f"use it with update.completer=network update.completer.weights={folder}",
         "border": f"next: python experiments/segmentation_fit/run.py --border {folder}, then use it with "

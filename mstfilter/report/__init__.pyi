@@ -22,11 +22,8 @@ from mstfilter.report.pictures import (
     viewpoint as viewpoint,
     voxel_picture as voxel_picture,
 )
-from mstfilter.report.run_report import (
-    RunNumbers as RunNumbers,
-    read_numbers as read_numbers,
-    write_report as write_report,
-)
+from mstfilter.report.run_numbers import RunNumbers as RunNumbers, read_numbers as read_numbers
+from mstfilter.report.run_report import write_report as write_report
 from mstfilter.report.study_report import write_study_report as write_study_report
 from mstfilter.report.viewer import (
     recording_page as recording_page,

@@ -21,7 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mstfilter.fusion import Belief
-from mstfilter.report.identities import match_objects
+from mstfilter.report.identities import match_objects, weigh_distinct
 from mstfilter.report.pictures import (
     Colour,
     colour,
@@ -119,18 +119,13 @@ def _plot_hypotheses(population: Population) -> Drawing:
 
 def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
     """Pictures of the heaviest hypotheses, equal ones once, from one viewpoint; and texts with weight and objects."""
-    hypotheses, weights = population.particles, population.weights
-    mass: dict[bytes, float] = {}
-    example: dict[bytes, Hypothesis] = {}
-    for hypothesis, weight in zip(hypotheses, weights, strict=True):
-        mass[hypothesis.key] = mass.get(hypothesis.key, 0.0) + float(weight)
-        example.setdefault(hypothesis.key, hypothesis)
-    heaviest = sorted(mass, key=lambda key: -mass[key])[:_MOST_PICTURES]
-    shown = [example[key] for key in heaviest]
-    view, colours = viewpoint(shown, width=420, height=315), match_objects(shown, [mass[key] for key in heaviest])
+    particles, groups = population.particles, weigh_distinct(population.particles, population.weights.tolist())
+    weights = [weight for _, weight in groups[:_MOST_PICTURES]]
+    shown = [particles[members[0]] for members, _ in groups[:_MOST_PICTURES]]
+    view = viewpoint(shown, width=420, height=315)
     return [
-        (voxel_picture(h.labels, h.grid, view, c), f"weight {mass[h.key]:.2f}, {h.n_objects} objects")
-        for h, c in zip(shown, colours, strict=True)
+        (voxel_picture(h.labels, h.grid, view, colours), f"weight {weight:.2f}, {h.n_objects} objects")
+        for h, weight, colours in zip(shown, weights, match_objects(shown, weights), strict=True)
     ]
 
 

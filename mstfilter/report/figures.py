@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mstfilter.forecasts import ForecastTable
-from mstfilter.study import ENDPOINTS, Compared
+from mstfilter.statistics import Difference
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -299,7 +299,7 @@ def time_figure(
             drawn = np.concatenate([np.asarray(q) for by_pause in of_arms.values() for q in by_pause.values()])
             axes.set_ylim(max(-0.02, drawn.min() - 0.05), min(1.02, drawn.max() + 0.05))
             axes.set_title(family)
-            axes.set_ylabel("information, nats" if measure == "information" else measure)
+            axes.set_ylabel(measure)
         panels[-1].set_xlabel("pause")
         handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label() in arms}
         named = [arm for arm in arms if arm in handles]
@@ -364,24 +364,23 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
         return _svg_text(figure, "Reliability diagram")
 
 
-def differences_figure(compared: Sequence[Compared], arms: Sequence[str], metric: str = "quality") -> str:
-    """Paired differences of a metric with their t intervals, by family."""
-    known = [one for one in compared if one.difference.n]
+def differences_figure(
+    differences: Sequence[tuple[str, str, Difference]], arms: Sequence[str], reference: str, measure: str, side: str
+) -> str:
+    """Differences of arms from the reference in a measure with their t intervals, by family.
+
+    `differences` are (family, arm, arm minus reference). `arms` sets the colours. `side` says where the reference is
+    better, "left" or "right".
+    """
     colours = _arm_colours(arms)
-    rows = [
-        (one.family, one.second, (d.mean, d.low, d.high), colours[one.second])
-        for one in known
-        for d in [one.difference]
-    ]
+    rows = [(family, arm, (d.mean, d.low, d.high), colours[arm]) for family, arm, d in differences]
     with _style("study differences"):
         figure, (axes,) = _new_figure(6.6, 1.0 + 0.26 * forest_height(rows))
         draw_forest(axes, rows)
-        reference = known[0].first if known else ""
-        side = "right" if ENDPOINTS.get(metric, 1) > 0 else "left"
-        parts = f"{metric} of {reference} minus that of the method;", f"{reference} is better on the {side}"
+        parts = f"{measure} of the method minus that of {reference};", f"{reference} is better on the {side}"
         label = "\n".join(line for part in parts for line in textwrap.wrap(part, 76))
         figure.supxlabel(label, fontsize=10, color=_MUTED)
-        return _svg_text(figure, f"Paired differences of {metric} with 95 % intervals")
+        return _svg_text(figure, f"Paired differences of {measure} with 95 % intervals")
 
 
 #: Group, name, (mean, low, high), colour.

@@ -1,4 +1,4 @@
-"""Identities of objects over hypotheses and pauses, so that an object keeps its colour, and the cards of a pause.
+"""Identities of objects over hypotheses and pauses, so that an object keeps its colour.
 
 >>> identities = assign_identities(run)
 >>> identities.of(t, k)                             # {label: identity 0, 1, 2, ...} of hypothesis k at pause t
@@ -8,9 +8,6 @@ Each hypothesis numbers its objects independently. Within a pause, objects are m
 From pause to pause, an object is followed by its stable id through the hypothesis it descends from, otherwise by the
 overlap with the last pause. The ground truth, if there is one, is matched first; its labels persist.
 Identities are used for colours only and change no number.
-
->>> cards, hidden = cards_of_pause(run, t, identities, view)
->>> cards[0].overlay, cards[0].voxels               # data URIs of RGBA pictures
 """
 
 from __future__ import annotations
@@ -20,9 +17,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mstfilter.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
+from mstfilter.report.pictures import Colour, colour
 from mstfilter.runs import RunFolder
-from mstfilter.scene import Camera, Hypothesis, project
+from mstfilter.scene import Hypothesis
 from mstfilter.scoring import overlap
 
 TRUTH = -1  #: Index of the ground truth in place of a hypothesis
@@ -33,7 +30,6 @@ _EARLIER_SCORE = 0.4  # score of an overlap of 1 with the last pause
 _LEAST_SCORE = 0.2  # below, an object gets a new identity
 _TRUTH_SCORE = 2.0  # score of the same label of the truth, more than any overlap
 _REFERENCES = 6  # hypotheses of a pause that others are compared with
-_MOST_CARDS = 12
 
 
 @dataclass(frozen=True)
@@ -176,29 +172,6 @@ def order_by_weight(weights: Sequence[float]) -> list[int]:
     return sorted(range(len(weights)), key=lambda k: -weights[k])
 
 
-@dataclass(frozen=True)
-class Tag:
-    """The number of an object and its position in the image; x, y in pixels."""
-
-    text: str
-    x: float
-    y: float
-
-
-@dataclass(frozen=True)
-class Card:
-    """Pictures and numbers of equal hypotheses, of the ground truth, or of another run, at one pause."""
-
-    name: str  #: ``#0`` or ``#0, #3``; ``Truth``; ``without past``
-    weight: float | None  #: None for the truth and other runs
-    n_objects: int
-    voxels_occupied: int
-    quality: float | None
-    overlay: str
-    voxels: str
-    tags: tuple[Tag, ...]
-
-
 def names_of(indices: Sequence[int]) -> str:
     """``#0`` or ``#0, #3``, for hypotheses that are equal; at most four are named."""
     more = len(indices) - 4
@@ -212,76 +185,3 @@ def weigh_distinct(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -
         groups.setdefault(h.key, []).append(k)
     found = [(tuple(members), float(sum(weights[k] for k in members))) for members in groups.values()]
     return [found[g] for g in order_by_weight([weight for _, weight in found])]
-
-
-def cards_of_pause(run: RunFolder, t: int, identities: Identities, view: Camera) -> tuple[list[Card], float]:
-    """Cards of the distinct hypotheses of a pause, heaviest first, and the weight of those without a card."""
-    info, hypotheses = run.info(t), run.hypotheses(t)
-    groups, quality = weigh_distinct(hypotheses, info["weights"]), info["quality"]
-    cards = []
-    for members, weight in groups[:_MOST_CARDS]:
-        k = members[0]
-        q = None if quality is None else quality["objects"][k]
-        of_card = names_of(members), weight, q, identities.of(t, k)
-        cards.append(_make_card(hypotheses[k], run.camera(t), view, *of_card))
-    return cards, float(sum(weight for _, weight in groups[_MOST_CARDS:]))
-
-
-def further_cards(run: RunFolder, t: int, identities: Identities, view: Camera) -> list[Card]:
-    """Cards of the ground truth, if it is known, and of the heaviest hypothesis of each compared run."""
-    truth, cards = run.truth(t), []
-    if truth is not None:
-        known = Hypothesis.from_labels(truth, run.hypotheses(t)[0].grid)
-        cards.append(_make_card(known, run.camera(t), view, "Truth", None, None, identities.of(t, TRUTH)))
-    for name, other in run.compared().items():
-        if t < other.n_pauses:
-            q = other.info(t)["quality"]
-            best = None if q is None else q["objects"][int(np.argmax(other.info(t)["weights"]))]
-            of_card = name.capitalize(), None, best, identities.of(t, name)
-            cards.append(_make_card(heaviest(other, t), run.camera(t), view, *of_card))
-    return cards
-
-
-def _make_card(
-    hypothesis: Hypothesis,
-    camera: Camera,
-    view: Camera,
-    name: str,
-    weight: float | None,
-    quality: float | None,
-    identity: Mapping[int, int],
-) -> Card:
-    colours = {label: colour(i) for label, i in identity.items()}
-    image = project(hypothesis, camera)
-    # Small images are enlarged, so that contours are about as fine as on large ones.
-    scale = max(1, round(960 / camera.width))
-    line = max(2, round(scale * camera.width / 340))
-    return Card(
-        name,
-        weight,
-        hypothesis.n_objects,
-        sum(hypothesis.volumes().values()),
-        quality,
-        data_uri(png_bytes(overlay_layer(image, colours, scale=scale, line=line))),
-        data_uri(png_bytes(voxel_picture(hypothesis.labels, hypothesis.grid, view, colours))),
-        tuple(_place_tags(image, identity)),
-    )
-
-
-def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[Tag]:
-    """Numbers at the widest place of each object that is large enough in the image; larger objects come first."""
-    from scipy.ndimage import distance_transform_edt, find_objects
-
-    min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
-    places = []
-    for label, box in enumerate(find_objects(image.astype(np.int32)), 1):
-        if box is None or label not in identity:
-            continue
-        inside = distance_transform_edt(np.pad(image[box] == label, 1))[1:-1, 1:-1]
-        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
-        places.append((float(inside[row, column]), label, float(column + box[1].start), float(row + box[0].start)))
-    tags: list[Tag] = []
-    for radius, label, x, y in sorted(places, reverse=True):
-        if radius >= min_radius and all(np.hypot(tag.x - x, tag.y - y) > min_distance for tag in tags):
-            tags.append(Tag(str(identity[label] + 1), x + 0.5, y + 0.5))
-    return tags

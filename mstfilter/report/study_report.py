@@ -9,19 +9,20 @@ Conclusions are sentences that claim no more than the intervals show.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mstfilter.report.figures import differences_figure, figure_groups, reliability_figure, time_figure
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
+from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import CLAIM
-from mstfilter.study import ENDPOINT, ENDPOINTS, SLOPES, StudyFolder, Summary
+from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, title_of
 
 # Columns of the tables of results: name in the study, heading.
 _TABLES = {
     "Quality": (
-        (ENDPOINT, "quality"),
+        ("quality", "quality"),
         (SLOPES["quality"], "slope"),
         ("quality_top", "heaviest"),
         ("quality_best", "best of n"),
@@ -32,10 +33,10 @@ _TABLES = {
         ("quality_one_blob", "baseline: one blob"),
         ("quality_components", "baseline: components"),
     ),
-    "Information": (
-        ("information", "information"),
-        (SLOPES["information"], "slope"),
-        ("log_loss", "log loss"),
+    "Log loss": (
+        (LOG_LOSS, "recalibrated"),
+        (SLOPES[LOG_LOSS], "slope"),
+        ("log_loss", "as it comes"),
         ("calibration_error", "calibration error"),
         ("brier", "Brier"),
         ("energy", "energy score"),
@@ -68,7 +69,13 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
 
 
 def _page(study: StudyFolder) -> str:
-    filters = dict(seconds=seconds_text, number=_number, signed=lambda x: _number(x, "+"), range=_range)
+    filters: dict[str, Callable[..., str]] = {
+        "metric_title": title_of,
+        "seconds": seconds_text,
+        "number": _number,
+        "signed": lambda x: _number(x, "+"),
+        "range": _range,
+    }
     records, failures = study.records(), study.failures()
     summary = study.summary_of(records)
     scenes: dict[str, list[str]] = defaultdict(list)
@@ -130,35 +137,37 @@ def _range(ends: tuple[float, float], sign: str = "") -> str:
     return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
 
 
-def _drawn(records: Sequence[Mapping[str, Any]], summary: Summary, reported_only: Sequence[str]) -> dict[str, Any]:
-    """Inline SVG by name."""
+def _drawn(
+    records: Sequence[Mapping[str, Any]], summary: Summary, reported_only: Sequence[str]
+) -> dict[str, list[Any]]:
+    """Inline SVG by section of the page."""
     from markupsafe import Markup
 
-    found: dict[str, Any] = {}
-    arms = [arm for arm in summary.arms if arm not in reported_only]
+    drawn: dict[str, list[Any]] = defaultdict(list)
+    compared = [arm for arm in summary.arms if arm not in reported_only]
     ends = [summary.reference, *(arm for arm in summary.arms if arm in reported_only)]
-    for name in ENDPOINTS:
-        values: dict[str, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-        for row in records:
-            of_row = row.get("qualities") if name == "quality" else row.get(name)
-            if of_row:
-                values[row["family"]][row["arm"]][row["pause"]] += of_row if name == "quality" else [of_row]
-        if not values:
-            continue
-        groups = figure_groups(arms, summary.reference)
-        found.setdefault("time", []).extend(
-            Markup(time_figure(values, group, name, summary.arms)) for group in groups
-        )
-        if len(ends) > 1:
-            groups = figure_groups(ends, summary.reference)
-            found.setdefault("ends", []).extend(
-                Markup(time_figure(values, group, name, summary.arms)) for group in groups
-            )
-    for name in ENDPOINTS:
-        compared = [one for one in summary.compared(name) if one.difference.n]
-        if compared:
-            found.setdefault("differences", []).append(Markup(differences_figure(compared, summary.arms, name)))
-    return found
+    for name, sign in ENDPOINTS.items():
+        values = _over_time(records, name)
+        for section, arms in (("time", compared), ("ends", ends)):
+            if values and (section == "time" or len(ends) > 1):
+                for group in figure_groups(arms, summary.reference):
+                    drawn[section].append(Markup(time_figure(values, group, title_of(name), summary.arms)))
+        differences = [(one.family, one.arm, one.difference) for one in summary.compared(name) if one.difference.n]
+        if differences:
+            side = "left" if sign > 0 else "right"
+            figure = differences_figure(differences, summary.arms, summary.reference, title_of(name), side)
+            drawn["differences"].append(Markup(figure))
+    return dict(drawn)
+
+
+def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str, Any]:
+    """Family -> arm -> pause -> values: quality of every hypothesis, or one value for each run."""
+    values: dict[str, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for row in records:
+        of_row = row.get("qualities") if endpoint == "quality" else [row.get(endpoint)]
+        if of_row and of_row[0] is not None:
+            values[row["family"]][row["arm"]][row["pause"]] += of_row
+    return values
 
 
 def _costs(summary: Summary) -> dict[str, Any]:

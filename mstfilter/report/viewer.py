@@ -16,8 +16,8 @@ import subprocess
 import sys
 import uuid
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -26,20 +26,10 @@ import numpy as np
 
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.files import atomic_path, check_output, write_text
-from mstfilter.report.identities import TRUTH, assign_identities, names_of, weigh_distinct
-from mstfilter.report.pictures import (
-    Colour,
-    colour,
-    data_uri,
-    hexadecimal,
-    jpeg_bytes,
-    overlay_layer,
-    png_bytes,
-)
+from mstfilter.report.pictures import colour, data_uri, hexadecimal, jpeg_bytes
+from mstfilter.report.scenes import ShownHypothesis, ShownPause, scenes_of_recording, scenes_of_run
 from mstfilter.runs import RunFolder
-from mstfilter.scene import Camera, Frame, Hypothesis, Recording, VoxelGrid, occupied_box, project
-
-_MOST_VIEWS = 12  # hypotheses of a pause
+from mstfilter.scene import Camera, Hypothesis, Recording, occupied_box, project
 
 
 @dataclass(frozen=True)
@@ -67,35 +57,6 @@ class ScenePage:
         return Path(path)
 
 
-@dataclass(frozen=True)
-class ShownHypothesis:
-    """A hypothesis, or the truth, at a pause."""
-
-    name: str
-    text: str
-    hypothesis: Hypothesis
-    identity: Mapping[int, int]  #: label -> identity, which sets the colour
-    weight: float | None = None  #: None for the truth
-    colours: Mapping[int, Colour] = field(default_factory=dict)  #: in place of those of the identities
-    quality: float | None = None
-
-    def colour(self, label: int) -> Colour:
-        """Colour of an object."""
-        return self.colours.get(label) or colour(self.identity.get(label, -1))
-
-
-@dataclass(frozen=True)
-class ShownPause:
-    """What is shown at a pause."""
-
-    name: str
-    views: Sequence[ShownHypothesis]
-    time: float = 0.0
-    image: np.ndarray | None = None
-    camera: Camera | None = None
-    links: Sequence[tuple[int, int]] = ()  #: (view of the last pause, view) where one descends from the other
-
-
 def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
     """The voxels of a hypothesis as a page: drag to rotate, click and scroll to zoom, click an object to hide it."""
     order = {record.label: k for k, record in enumerate(hypothesis.objects)}
@@ -117,58 +78,6 @@ def recording_page(recording: Recording) -> ScenePage:
     counts = {"frame": len(recording), "pause": len(recording.pauses)}
     note = ", ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in counts.items())
     return _page(scenes_of_recording(recording), recording.name, note)
-
-
-def scenes_of_run(run: RunFolder) -> list[ShownPause]:
-    """The pauses of a run: distinct hypotheses from heavy to light (at most twelve), then the truth."""
-    identities, times = assign_identities(run), run.description["recording"]["times"]
-    scenes: list[ShownPause] = []
-    view_of: dict[int, int] = {}
-    for t in range(run.n_pauses):
-        info, hypotheses, earlier = run.info(t), run.hypotheses(t), view_of
-        views, view_of = [], {}
-        for v, (members, weight) in enumerate(weigh_distinct(hypotheses, info["weights"])[:_MOST_VIEWS]):
-            k = members[0]
-            quality = None if info["quality"] is None else info["quality"]["objects"][k]
-            text = f"weight {weight:.2f}" + ("" if quality is None else f", quality {quality:.2f}")
-            identity = identities.of(t, k)
-            views.append(ShownHypothesis(names_of(members), text, hypotheses[k], identity, weight, quality=quality))
-            view_of |= dict.fromkeys(members, v)
-        parents = enumerate(info["parents"].get("previous") or ())
-        links = {(earlier[p], view_of[k]) for k, p in parents if p in earlier and k in view_of}
-        truth = run.truth(t)
-        if truth is not None:
-            known = Hypothesis.from_labels(truth, hypotheses[0].grid)
-            views.append(ShownHypothesis("truth", "", known, identities.of(t, TRUTH)))
-        scenes.append(ShownPause(f"pause {t}", views, float(times[t]), run.rgb(t), run.camera(t), sorted(links)))
-    return scenes
-
-
-def scenes_of_recording(recording: Recording) -> list[ShownPause]:
-    """The pauses of a recording with the truth; without it with the surface that the camera sees."""
-    scenes = []
-    for t, clip in enumerate(recording.clips()):
-        truth, frame = recording.truth(t), clip.after
-        if truth is None:
-            view = _surface(frame, clip.grid)
-        else:
-            known = Hypothesis.from_labels(truth, clip.grid)
-            view = ShownHypothesis("truth", "", known, {k: k - 1 for k in known.volumes()})
-        scenes.append(ShownPause(f"pause {t}", [view], recording.times[recording.pauses[t]], frame.rgb, frame.camera))
-    return scenes
-
-
-def _surface(frame: Frame, grid: VoxelGrid) -> ShownHypothesis:
-    """Voxels that contain a measured point, in its colour, rounded to six levels a channel."""
-    points, rgb = frame.points[frame.valid], frame.rgb[frame.valid]
-    index = grid.index_of(points)
-    inside = grid.contains(index)
-    level = (rgb[inside] // 43).astype(np.uint16)
-    labels = np.zeros(grid.shape, np.uint16)
-    labels[tuple(index[inside].T)] = 1 + level @ np.array([36, 6, 1], np.uint16)
-    hypothesis = Hypothesis.from_labels(labels, grid)
-    colours = {k: tuple(21 + 43 * ((k - 1) // d % 6) for d in (36, 6, 1)) for k in hypothesis.volumes()}
-    return ShownHypothesis("surface", "voxels that contain a measured point", hypothesis, {}, None, colours)  # type: ignore[arg-type]
 
 
 def _page(
@@ -205,8 +114,7 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
         inside, overlay = hypothesis.labels[box], None
         volumes = hypothesis.volumes()
         if photos and scene.image is not None and scene.camera is not None and not view.colours:
-            image, colours = project(hypothesis, scene.camera), {label: view.colour(label) for label in volumes}
-            overlay = data_uri(png_bytes(overlay_layer(image, colours, line=max(1, scene.camera.width // 340))))
+            overlay = view.overlay(scene.camera, 1, max(1, scene.camera.width // 340))
         views.append(
             {
                 "name": view.name,

@@ -1,14 +1,15 @@
-"""One run: a recording is opened, filtered, kept in a folder and scored.
+"""One run: a recording is opened, filtered, and kept in a folder.
 
 >>> from mstfilter.presets import load_config
->>> from mstfilter.runs import filter_recording, read_estimate, read_truth, score_pauses
+>>> from mstfilter.runs import filter_recording
+>>> from mstfilter.scoring import read_truth, score_pauses
 >>> recording = mstfilter.open_recording("recordings/mine")                        # any format
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 >>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
->>> rows = score_pauses(read_estimate(run.path), read_truth(recording))
+>>> rows = score_pauses(run.estimates(), read_truth(recording))
 
 The same call resumes a run that was stopped, from ``pauses/NNN/state.npz`` of the last complete pause, with the
-result of an uninterrupted run. Modules: `run` (loop), `run_folder` (files), `scoring`.
+result of an uninterrupted run. Modules: `run` (loop), `run_folder` (files).
 """
 
 from mstfilter.lazy import attach

@@ -14,13 +14,3 @@ from mstfilter.runs.run_folder import (
     as_json as as_json,
     write_json as write_json,
 )
-from mstfilter.runs.scoring import (
-    PauseEstimate as PauseEstimate,
-    PauseScore as PauseScore,
-    PauseTruth as PauseTruth,
-    measure_pause as measure_pause,
-    read_estimate as read_estimate,
-    read_truth as read_truth,
-    score_pauses as score_pauses,
-    write_scores as write_scores,
-)

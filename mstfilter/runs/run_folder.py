@@ -61,7 +61,7 @@ from mstfilter.scene import (
     read_rgb,
     write_image,
 )
-from mstfilter.scoring import FORMS, Questions, weighted_coverage
+from mstfilter.scoring import FORMS, PauseEstimate, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
@@ -404,6 +404,16 @@ class RunFolder:
             now = path.stat()
         version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
         return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE)[0])
+
+    def estimates(self) -> list[PauseEstimate]:
+        """The weighted hypotheses of all pauses, to be scored by `mstfilter.scoring.score_pauses`."""
+        run, found = self.check(), []
+        if run.n_pauses == 0:
+            raise InputError(f"{self.path}: the run has no complete pause yet")
+        for t, frame in zip(range(run.n_pauses), run.description["recording"]["pauses"], strict=False):
+            hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
+            found.append(PauseEstimate(hypotheses, weights, frame, hypotheses[0].grid))
+        return found
 
     def write_metrics(self) -> None:
         """Write metrics.csv from the pauses."""

@@ -1,5 +1,6 @@
-from mstfilter.scoring.information import (
+from mstfilter.scoring.log_loss import (
     CATEGORIES as CATEGORIES,
+    LOG_LOSS as LOG_LOSS,
     NO_COUNTS as NO_COUNTS,
     SPLITS as SPLITS,
     BeliefScore as BeliefScore,
@@ -15,6 +16,16 @@ from mstfilter.scoring.metrics import (
     pairwise_quality as pairwise_quality,
     pause_metrics as pause_metrics,
 )
+from mstfilter.scoring.pauses import (
+    PauseEstimate as PauseEstimate,
+    PauseScore as PauseScore,
+    PauseTruth as PauseTruth,
+    measure_pause as measure_pause,
+    read_estimates as read_estimates,
+    read_truth as read_truth,
+    score_pauses as score_pauses,
+    write_scores as write_scores,
+)
 from mstfilter.scoring.quality import (
     FORMS as FORMS,
     MIN_PIXELS as MIN_PIXELS,
@@ -27,6 +38,8 @@ from mstfilter.scoring.quality import (
     one_blob as one_blob,
     overlap as overlap,
     quality_of as quality_of,
+    shown_objects as shown_objects,
+    status_of as status_of,
     weighted_coverage as weighted_coverage,
 )
 from mstfilter.scoring.questions import (

@@ -17,7 +17,7 @@ connected components.
 ``occupancy``: intersection over union of the occupied voxels. ``volume_missed``, ``volume_invented``: volume that is
 occupied in the truth only, and in the hypothesis only, divided by the true volume.
 ``object_f``: F score of objects at IoU 0.5.
-``split``, ``merged``, ``missed``, ``invented``: numbers of objects (see `object_errors`).
+``split``, ``merged``, ``missed``, ``invented``: numbers of objects (see `object_metrics`).
 ``diversity``: 1 - mean quality of one hypothesis against another; 0 if all are equal.
 """
 
@@ -85,13 +85,8 @@ def pause_metrics(
         row[f"n_{one}"] = float(len(chosen)) if status else np.nan
     row["quality_one_blob"] = mean([weighted_coverage(one_blob(one), truth) for one in distinct])
     row["quality_components"] = mean([weighted_coverage(connected_components(one), truth) for one in distinct])
-    row["occupancy"] = mean([occupancy_iou(table) for table in tables])
-    wrong = [volume_errors(table) for table in tables]
-    row["volume_missed"], row["volume_invented"] = (mean([pair[k] for pair in wrong]) for k in (0, 1))
-    row["object_f"] = mean([object_f(table) for table in tables])
-    errors = [object_errors(table) for table in tables]
-    for kind in errors[0]:
-        row[kind] = mean([e[kind] for e in errors])
+    of_objects = [object_metrics(table) for table in tables]
+    row |= {name: mean([one[name] for one in of_objects]) for name in of_objects[0]}
     row["true_objects"] = float(np.count_nonzero(tables[0].labels_b))
     # Expected quality of each hypothesis against the others, by weight: the largest is the best single answer.
     between = pairwise_quality(distinct)[np.ix_(which, which)]
@@ -137,42 +132,29 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
     return float((sizes * best)[chosen].sum() / sizes[chosen].sum())
 
 
-def occupancy_iou(table: Overlap) -> float:
-    """Intersection over union of the occupied voxels; 1 if both are empty."""
-    counts, sizes_a, sizes_b, _ = _objects(table)
-    union = sizes_a.sum() + sizes_b.sum() - counts.sum()
-    return float(counts.sum() / union) if union else 1.0
-
-
-def volume_errors(table: Overlap) -> tuple[float, float]:
-    """Volumes that are occupied in the truth only, and in the hypothesis only, over the true volume (at least 1)."""
-    counts, sizes_a, sizes_b, _ = _objects(table)
-    true = max(float(sizes_b.sum()), 1.0)
-    return float(sizes_b.sum() - counts.sum()) / true, float(sizes_a.sum() - counts.sum()) / true
-
-
-def object_f(table: Overlap) -> float:
-    """F score of objects, matched by an intersection over union above 0.5, so that no object matches twice (Kirillov
-    et al. 2019); 1 if both are empty."""
-    _, sizes_a, sizes_b, jaccard = _objects(table)
-    total = len(sizes_a) + len(sizes_b)
-    return float(2 * np.count_nonzero(jaccard > 0.5) / total) if total else 1.0
-
-
-def object_errors(table: Overlap) -> dict[str, float]:
-    """Numbers of split, merged, missed and invented objects (as in Hoover et al. 1996).
+def object_metrics(table: Overlap) -> dict[str, float]:
+    """Metrics of the objects of one hypothesis: columns of the table against the truth, see the module.
 
     *split*: true objects that contain more than half of each of two or more objects of the hypothesis, which have at
     least a tenth of its size. *merged*: objects of the hypothesis that contain more than half of each of two or more
     true objects. *missed*: true objects of which no object of the hypothesis contains more than half, and that
-    contain more than half of none. *invented*: the same with the roles exchanged.
+    contain more than half of none. *invented*: the same with the roles exchanged (as in Hoover et al. 1996).
+
+    For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
+    (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if both are empty.
     """
-    counts, sizes_a, sizes_b, _ = _objects(table)
+    counts, sizes_a, sizes_b, jaccard = _objects(table)
+    found, true, both = float(sizes_a.sum()), float(sizes_b.sum()), float(counts.sum())
+    n = len(sizes_a) + len(sizes_b)
     lies = counts > _MOST * sizes_a[:, None]
     holds = counts > _MOST * sizes_b[None, :]
     fragment = sizes_a[:, None] >= _FRAGMENT * sizes_b[None, :]
     related = lies | holds
     return {
+        "occupancy": both / (found + true - both) if found + true else 1.0,
+        "volume_missed": (true - both) / max(true, 1.0),
+        "volume_invented": (found - both) / max(true, 1.0),
+        "object_f": float(2 * np.count_nonzero(jaccard > 0.5) / n) if n else 1.0,
         "split": float(((lies & fragment).sum(axis=0) >= 2).sum()),
         "merged": float((holds.sum(axis=1) >= 2).sum()),
         "missed": float((~related.any(axis=0)).sum()),

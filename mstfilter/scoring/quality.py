@@ -35,6 +35,7 @@ objects show what tracking contributes.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -180,21 +181,24 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     labels = recording.truth(t)
     if labels is None:
         raise InputError(f"recording {recording.name} has no true voxels at pause {t}")
-    present = [int(k) for k in np.unique(labels) if k > 0]
-    visible = _shown(recording, t, min_pixels)
-    left = set(present) - visible
-    seen: set[int] = set()
-    for earlier in range(t - 1, -1, -1):
-        if not left - seen:
-            break
-        seen |= _shown(recording, earlier, min_pixels)
-    return {k: "visible" if k in visible else "hidden" if k in seen else "unseen" for k in present}
+    shown = [shown_objects(_instance(recording, earlier), min_pixels) for earlier in range(t + 1)]
+    return status_of(labels, shown[t], set().union(*shown[:t]))
 
 
-def _shown(recording: Recording, t: int, min_pixels: float) -> set[int]:
-    """Labels with enough pixels in the instance image of a pause."""
+def status_of(labels: np.ndarray, visible: Set[int], earlier: Set[int]) -> dict[int, Status]:
+    """Status of the objects of true `labels`, of which the image shows `visible`, and earlier ones `earlier`."""
+    present = np.unique(labels[labels > 0]).tolist()
+    return {k: "visible" if k in visible else "hidden" if k in earlier else "unseen" for k in present}
+
+
+def shown_objects(image: np.ndarray, min_pixels: float = MIN_PIXELS) -> set[int]:
+    """Labels with enough pixels in an instance image (H, W); `min_pixels` as for `object_status`."""
+    counts = np.bincount(image.ravel())
+    return set(np.flatnonzero(counts >= max(1.0, scaled_area(min_pixels, image.size))).tolist())
+
+
+def _instance(recording: Recording, t: int) -> np.ndarray:
     image = recording.instance(recording.pauses[t])
     if image is None:
         raise InputError(f"recording {recording.name} has no instance image at pause {t}")
-    counts = np.bincount(image.ravel())
-    return set(np.flatnonzero(counts >= max(1.0, scaled_area(min_pixels, image.size))).tolist())
+    return image

@@ -24,10 +24,10 @@ from mstfilter.study.results import (
 )
 from mstfilter.study.study import StudyProgress as StudyProgress, run_study as run_study
 from mstfilter.study.summary import (
-    ENDPOINT as ENDPOINT,
     ENDPOINTS as ENDPOINTS,
     SLOPES as SLOPES,
     Compared as Compared,
     Summary as Summary,
     summarise as summarise,
+    title_of as title_of,
 )

@@ -119,8 +119,8 @@ class StudyConfig(_Entry):
     timeout_s: Annotated[float, Field(ge=0)] = 0.0
     #: Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
     cache_gb: Annotated[float, Field(ge=0)] = 4.0
-    #: The ``recalibration.json`` of another study, relative to this file: information is scored with what was
-    #: fitted to its scenes. Default: each scene is scored with the other scenes of its family.
+    #: The ``recalibration.json`` of another study, relative to this file: forecasts are recalibrated by
+    #: what was fitted to its scenes. Default: by the other scenes of the family.
     recalibration: str = ""
     smoke: dict[str, Any] = Field(default_factory=dict)  #: replaces fields of the study under ``--smoke``
     folder: Path = Path()  # relative paths start here

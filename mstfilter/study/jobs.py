@@ -26,8 +26,9 @@ from mstfilter.errors import InputError, describe_error, exhausted
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
-from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording, measure_pause
+from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording
 from mstfilter.scene import Recording, scene_cache
+from mstfilter.scoring import measure_pause
 from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
 _StepCallback = Callable[[int, int], None]
@@ -120,7 +121,12 @@ def _run(job: Job, step: _StepCallback) -> None:
 
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
     """The metrics of each pause of a run; the counts of its forecasts are written into its folder."""
-    measured = [measure_pause(run, recording, t) for t in range(run.n_pauses)]
+    measured = [
+        measure_pause(
+            recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)
+        )
+        for t in range(run.n_pauses)
+    ]
     counts = [one for _, one in measured if one is not None]
     if len(counts) == len(measured):
         np.savez_compressed(run.path / FORECASTS, counts=np.stack(counts))

@@ -10,7 +10,7 @@ Layout::
                      its forecasts
     runs.csv         one row per pause and run: metrics first, time and memory last
     summary.csv      one row per family, arm and metric: mean over scenes and its interval
-    differences.csv  the reference against every other arm: paired differences, intervals, p values, conclusions
+    differences.csv  every arm minus the reference: paired differences, intervals, p values, conclusions
     failures.csv     runs that failed, and why
     recalibration.json  of each family and arm, fitted to all its scenes; for studies of other scenes
     logs/            output of the workers
@@ -33,7 +33,7 @@ from mstfilter.forecasts import ForecastTable
 from mstfilter.reading import read_arrays, read_model
 from mstfilter.runs import write_json
 from mstfilter.scoring import NO_COUNTS, forecast_table
-from mstfilter.study.information import add_information, fit_information
+from mstfilter.study.recalibration import add_log_loss, fit_recalibration
 from mstfilter.study.summary import Summary, summarise
 
 STUDY_FORMAT = 2
@@ -41,7 +41,7 @@ RESULT = "result.json"  # in a run's folder
 FORECASTS = "forecasts.npz"  # in a run's folder: counts of its forecasts at each pause
 _SUMMARY_COLUMNS = ("family", "arm", "metric", "n", "mean", "low", "high")
 _DIFFERENCE_COLUMNS = (
-    *("family", "first", "second", "metric", "n", "mean", "low", "high"),
+    *("family", "arm", "reference", "metric", "n", "mean", "low", "high"),
     *("low_bootstrap", "high_bootstrap", "p", "p_bootstrap", "skewness", "p_holm", "conclusion"),
 )
 _FAILURE_COLUMNS = ("run", "error", "hints", "tries", "folder")
@@ -199,7 +199,7 @@ class StudyFolder:
             named = {"family": run["group"], "scene": run["scene"], "arm": run["arm"], "seed": run["seed"]}
             for row, cost in zip(result["rows"], result["costs"], strict=True):
                 rows.append({**named, **row, **cost})
-        add_information(rows, self._counts, self.description.get("recalibration"))
+        add_log_loss(rows, self._counts, self.description.get("recalibration"))
         return rows
 
     def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
@@ -252,7 +252,7 @@ class StudyFolder:
         ):
             write_csv(self.path / f"{name}.csv", table, names, float_format=".6g")
         arms = list(dict.fromkeys((row["family"], row["arm"]) for row in rows))
-        write_json(self.path / "recalibration.json", fit_information(records, self._counts, arms))
+        write_json(self.path / "recalibration.json", fit_recalibration(records, self._counts, arms))
 
 
 def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

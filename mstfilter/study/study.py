@@ -19,6 +19,7 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.files import locked, reading, sweep, writing
 from mstfilter.lazy import progress_of
+from mstfilter.processes import check_main_guard
 from mstfilter.reading import check_private, read_json
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
@@ -85,6 +86,9 @@ def run_study(
     """
     from mstfilter.simulation import cache_folder
 
+    executor = executor or Local(logs=path / "logs")
+    if isinstance(executor, Local):
+        check_main_guard("run_study")
     plan = make_plan(study, overrides, allow_files=allow_files)
     recalibration = _read_recalibration(plan)
     cache = (cache or cache_folder()).absolute()
@@ -93,7 +97,6 @@ def run_study(
             _check_free_space(target)
         for part in ("recordings", "work"):
             check_private(cache / part)
-        executor = executor or Local(logs=path / "logs")
         with writing(f"study folder {path}", "choose another with --out"):
             write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
             for part in ("runs", "logs"):

@@ -1,34 +1,37 @@
-"""The summary of a study: means by family and arm, and paired differences to the reference.
+"""The summary of a study: means by family and arm, and paired differences from the reference.
 
 >>> summary = summarise(folder.rows(), reference="mst")
 >>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
-There are two primary endpoints, both means over pauses t >= 1: *quality*, the unweighted mean ``objects`` quality of
-the hypotheses (higher is better), and *information*, the log loss of their forecasts in nats after recalibration on
-other scenes (lower is better; see `mstfilter.scoring.information`). Other metrics are averaged over the same pauses.
-Values are averaged over filter seeds first, then over scenes. p values of both endpoints are adjusted together.
+There are two primary endpoints, both means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality
+of the hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of their forecasts in nats after
+recalibration on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
+same pauses. Values are averaged over filter seeds first, then over scenes. Differences are arm minus reference. p
+values of both endpoints are adjusted together.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import CLAIM, LEVEL, Difference, compare, conclusion, holm, interval, slope
 
-ENDPOINT = "quality"
-INFORMATION = "information"
-ENDPOINTS = {ENDPOINT: 1, INFORMATION: -1}  # 1: higher is better
+ENDPOINTS = {"quality": 1, LOG_LOSS: -1}  # 1: higher is better
 SLOPES = {name: f"{name}_slope" for name in ENDPOINTS}  # change from pause to pause, t = 0 included
 NOT_WORSE = 0.005  # of the other endpoint, where one filter is claimed to be better
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
-
-
 _SHARES = ("quality", "occupancy", "object_f", "diversity", "brier", "calibration_error")
+
+
+def title_of(metric: str) -> str:
+    """The name of a metric in texts and figures."""
+    return metric.replace(LOG_LOSS, "log loss (recalibrated)").replace("_", " ")
 
 
 def bounds_of(metric: str) -> tuple[float, float]:
@@ -69,20 +72,20 @@ class ArmMetric:
 
 @dataclass(frozen=True)
 class Compared:
-    """The reference minus another arm on a family.
+    """An arm minus the reference on a family.
 
     Parameters
     ----------
-    family, first, second, metric : str
+    family, arm, reference, metric : str
     difference : Difference
         For the primary endpoints, `p_claim` is adjusted over both, all families and arms.
     reported_only : bool
-        The other arm is not part of the adjustment, and no conclusion is drawn.
+        The arm is not part of the adjustment, and no conclusion is drawn.
     """
 
     family: str
-    first: str
-    second: str
+    arm: str
+    reference: str
     metric: str
     difference: Difference
     reported_only: bool = False
@@ -95,10 +98,9 @@ class Compared:
     @property
     def words(self) -> str:
         """The conclusion in words."""
-        where = f"{self.family} in information (nats, lower is better)"
-        return conclusion(
-            self.difference, self.first, self.second, where if self.metric == INFORMATION else self.family
-        )
+        sign = "higher" if ENDPOINTS.get(self.metric, 1) > 0 else "lower"
+        where = f"{self.family} in {title_of(self.metric)} ({sign} is better)"
+        return conclusion(self.difference, self.arm, self.reference, where)
 
 
 @dataclass(frozen=True)
@@ -122,14 +124,14 @@ class Summary:
     metrics: tuple[ArmMetric, ...]
     differences: tuple[Compared, ...]
 
-    def metric(self, family: str, arm: str, name: str = ENDPOINT) -> ArmMetric | None:
+    def metric(self, family: str, arm: str, name: str = "quality") -> ArmMetric | None:
         """A metric; None if the arm has no value on the family."""
         for one in self.metrics:
             if (one.family, one.arm, one.name) == (family, arm, name):
                 return one
         return None
 
-    def compared(self, name: str = ENDPOINT) -> list[Compared]:
+    def compared(self, name: str = "quality") -> list[Compared]:
         """Differences of a metric."""
         return [one for one in self.differences if one.metric == name]
 
@@ -139,13 +141,14 @@ class Summary:
         One endpoint is better after adjustment, the intervals of the other exclude that it is worse by 0.005 or more,
         and both have at least 20 scenes.
         """
-        found = {}
+        found = []
         for one in self.differences:
-            if one.metric in ENDPOINTS and (one.family, one.second) == (family, arm) and one.adjusted:
-                sign, d = ENDPOINTS[one.metric], one.difference
-                low = np.fmin(d.low, d.low_bootstrap) if sign > 0 else -np.fmax(d.high, d.high_bootstrap)
-                found[one.metric] = low > 0 and d.p_holm < 1 - LEVEL, low > -NOT_WORSE and d.n >= CLAIM
-        better, not_worse = zip(*found.values(), strict=True) if found else ((), ())
+            if one.metric in ENDPOINTS and (one.family, one.arm) == (family, arm) and one.adjusted:
+                d = one.difference
+                limits = np.array([d.low, d.low_bootstrap, d.high, d.high_bootstrap])
+                lead = np.nanmin(-ENDPOINTS[one.metric] * limits)  # of the reference, at least
+                found.append((lead > 0 and d.p_holm < 1 - LEVEL, lead > -NOT_WORSE and d.n >= CLAIM))
+        better, not_worse = zip(*found, strict=True) if found else ((), ())
         return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
 
     def metric_rows(self) -> list[dict[str, Any]]:
@@ -162,7 +165,7 @@ class Summary:
         rows = []
         for one in self.differences:
             d = one.difference
-            row = {"family": one.family, "first": one.first, "second": one.second, "metric": one.metric, "n": d.n}
+            row = {"family": one.family, "arm": one.arm, "reference": one.reference, "metric": one.metric, "n": d.n}
             row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p}
             row["p_holm"] = d.p_holm if one.adjusted else None
             row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
@@ -191,7 +194,7 @@ def summarise(
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
     measured = [name for name in named if name not in cost]
-    values = _by_scene(rows, measured, lambda row: row["pause"] >= 1)
+    values = _by_scene([row for row in rows if row["pause"] >= 1], measured)
     spent = [k for k in named if k in cost]
     zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
     seeds: dict[Any, set[Any]] = defaultdict(set)
@@ -199,10 +202,11 @@ def summarise(
         seeds[row["family"], row["arm"]].add(row["seed"])
     filling = {of_arm: min(found) for of_arm, found in seeds.items() if len(found) > 1}
     warm = [{**zero, **row} for row in rows if filling.get((row["family"], row["arm"])) != row["seed"]]
-    values.update(_by_scene(warm, spent, lambda row: True))
+    values.update(_by_scene(warm, spent))
     for endpoint, slope_name in SLOPES.items():
         if endpoint in measured:
-            values.update(_slopes(rows, endpoint, slope_name))
+            slopes = _by_scene(rows, [endpoint], slope)
+            values.update({(family, arm, slope_name): found for (family, arm, _), found in slopes.items()})
             measured.insert(1 + measured.index(endpoint), slope_name)
     names = tuple([*measured, *(k for k in named if k in cost)])
     metrics = tuple(
@@ -218,16 +222,16 @@ def summarise(
     differences = [
         Compared(
             family,
-            reference,
             arm,
+            reference,
             name,
-            compare(values.get((family, reference, name), {}), others),
+            compare(of_arm, values.get((family, reference, name), {})),
             arm in reported_only,
         )
         for name in order
         for family in families
         for arm in arms
-        if arm != reference and (others := values.get((family, arm, name), {}))
+        if arm != reference and (of_arm := values.get((family, arm, name), {}))
     ]
     p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
     differences = [
@@ -240,34 +244,25 @@ def summarise(
 _Values = dict[tuple[str, str, str], dict[str, float]]
 
 
-def _by_scene(rows: Sequence[Mapping[str, Any]], names: Sequence[str], wanted: Any) -> _Values:
-    """(family, arm, metric) -> scene -> mean over seeds of the mean over pauses."""
-    runs: dict[tuple[str, str, str, str], dict[Any, list[float]]] = defaultdict(lambda: defaultdict(list))
+def _by_scene(
+    rows: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    of_run: Callable[[np.ndarray, np.ndarray], float] = lambda pauses, values: float(np.mean(values)),
+) -> _Values:
+    """(family, arm, metric) -> scene -> mean over seeds of ``of_run(pauses, values)``; NaN is left out."""
+    runs: dict[tuple[str, str, str, str, Any], list[tuple[int, float]]] = defaultdict(list)
     for row in rows:
-        if not wanted(row):
-            continue
         for name in names:
             value = row.get(name)
             if value is not None and np.isfinite(value):
-                runs[row["family"], row["arm"], name, row["scene"]][row["seed"]].append(value)
+                run = row["family"], row["arm"], name, row["scene"], row["seed"]
+                runs[run].append((row["pause"], value))
+    seeds: dict[tuple[str, str, str, str], list[float]] = defaultdict(list)
+    for (family, arm, name, scene, _), points in runs.items():
+        found = of_run(*np.array(points, dtype=np.float64).T)
+        if np.isfinite(found):
+            seeds[family, arm, name, scene].append(found)
     values: _Values = defaultdict(dict)
-    for (family, arm, name, scene), seeds in runs.items():
-        values[family, arm, name][scene] = float(np.mean([np.mean(of_pauses) for of_pauses in seeds.values()]))
-    return dict(values)
-
-
-def _slopes(rows: Sequence[Mapping[str, Any]], endpoint: str, name: str) -> _Values:
-    """Slope of an endpoint over the pauses of each run, averaged over seeds."""
-    runs: dict[tuple[str, str, str, Any], list[tuple[float, float]]] = defaultdict(list)
-    for row in rows:
-        value = row.get(endpoint)
-        if value is not None and np.isfinite(value):
-            runs[row["family"], row["arm"], row["scene"], row["seed"]].append((row["pause"], value))
-    seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
-    for (family, arm, scene, _), points in runs.items():
-        if len(points) > 1:
-            seeds[family, arm, scene].append(slope(*np.array(points).T))
-    values: _Values = defaultdict(dict)
-    for (family, arm, scene), slopes in seeds.items():
-        values[family, arm, name][scene] = float(np.mean(slopes))
+    for (family, arm, name, scene), of_seeds in seeds.items():
+        values[family, arm, name][scene] = float(np.mean(of_seeds))
     return dict(values)

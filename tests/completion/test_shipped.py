@@ -5,26 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mst_training.completion import shape_iou
+from mst_training.completion_data import CompletionSamples
+from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
 from mstfilter.resources import models_folder
-from mstfilter.training import Samples, read_samples, write_samples
-from mstfilter.training.completion import shape_iou
-from mstfilter.training.shapes import HELD_OUT, TRAINED
+from mstfilter.scene import Seen
 
 SEED = 99  # of no training
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory) -> Samples:
-    return read_samples(write_samples(tmp_path_factory.mktemp("samples"), SEED, 3, kinds=TRAINED + HELD_OUT))
+def samples(tmp_path_factory) -> CompletionSamples:
+    files = CompletionSamples.write(tmp_path_factory.mktemp("samples"), SEED, 3, kinds=TRAINED + HELD_OUT)
+    return CompletionSamples.read(files)
 
 
 def test_better_than_extrusion_on_new_scenes(samples):
     """About 100 masks of three scenes; on the 50 test scenes of the card the difference is of a similar size."""
     boxes = [samples.box(k) for k in range(len(samples))]
     p = np.stack(NetworkCompleter().fill_many([np.random.default_rng(0)] * len(boxes), boxes))
-    p[(samples.bits & 4) > 0] = 0
+    p[Seen.FREE.among(samples.bits)] = 0
     found, rule = shape_iou(p >= 0.5, samples.truth), shape_iou(extruded(samples.bits), samples.truth)
     assert found.mean() > rule.mean() + 0.02
     # Probabilities come true: of the voxels forecast near p, a share near p is filled.

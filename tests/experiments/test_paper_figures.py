@@ -57,7 +57,7 @@ def test_quality_over_time_is_a_complete_file(tmp_path):
     assert "ours" in text and "&lt;theirs&gt;" in text and "a ceiling" not in text
     (path,) = script("quality_over_time").make(tmp_path / "out", study, ["ours", "a ceiling"])
     assert "a ceiling" in path.read_text() and "theirs" not in path.read_text()
-    assert path.name == "quality_over_time.svg", "this study has no recording, so its runs have no information"
+    assert path.name == "quality_over_time.svg", "this study has no recording, so its runs have no log loss"
     wrong = make(tmp_path, "quality_over_time", "--study", study, "--arms", "ours,mine", expected_exit=2)
     assert "the study has no arm 'mine'" in wrong
 

@@ -69,7 +69,7 @@ def test_calibration_of_the_partition_update(tmp_path):
 def test_front_ends(tmp_path):
     assert "demo-1" in run_script("front_ends/run.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "summary.csv")
-    assert {row["score"] for row in rows} == {"quality", "mean_quality", "information"}
+    assert {row["score"] for row in rows} == {"quality", "mean_quality", "recalibrated_log_loss"}
     assert {row["n"] for row in rows} == {"2"}
 
 

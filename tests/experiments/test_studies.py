@@ -10,6 +10,7 @@ import pytest
 from mstfilter.cli import main
 from mstfilter.errors import InputError
 from mstfilter.files import read_csv
+from mstfilter.scoring import LOG_LOSS
 from mstfilter.simulation import FIRST_REPORTED_SEED
 from mstfilter.study import SceneEntry, load_study, make_plan, run_study
 from tests.experiments.scripts import EXPERIMENTS, run_script
@@ -60,16 +61,16 @@ def test_studies_run_in_their_small_form(tmp_path, name):
         assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
 
 
-def test_information_of_a_study_in_its_small_form(tmp_path):
+def test_log_loss_of_a_study_in_its_small_form(tmp_path):
     """Two scenes: each is scored with what the other one says, and the fit serves a third study."""
     folder = run_small(tmp_path, EXPERIMENTS / "information/study.toml")
     make_plan(load_study(EXPERIMENTS / "information/study.toml"))
     rows = read_csv(folder / "runs.csv")
-    assert all(0 < float(row["information"]) < 1 for row in rows)
+    assert all(0 < float(row[LOG_LOSS]) < 1 for row in rows)
     assert all(float(row["energy_floor"]) > 0 for row in rows)
     found = write_tables(folder, tmp_path / "tables")
     endpoints = [(row["endpoint"], row["arm"]) for row in found["information_differences"]]
-    assert endpoints == [("quality", "single_frame"), ("information", "single_frame")]
+    assert endpoints == [("quality", "single_frame"), (LOG_LOSS, "single_frame")]
     pauses = write_tables(folder, tmp_path / "tables", "--pooled")["information_pooled_pauses"]
     invented = {row["arm"]: row for row in pauses if row["metric"] == "volume_invented"}
     own = [float(row["volume_invented"]) for row in rows if row["pause"] == "1" and row["arm"] == "mst"]
@@ -90,15 +91,15 @@ def test_information_of_a_study_in_its_small_form(tmp_path):
     assert {(r["arm"], r["pause"]) for r in third} == {
         (r["arm"], int(r["pause"])) for r in rows if r["scene"] == "demo-0"
     }
-    assert all(0 < r["information"] < 1 and r["energy_floor"] < r["energy"] for r in third if r["arm"] == "mst")
+    assert all(0 < r[LOG_LOSS] < 1 and r["energy_floor"] < r["energy"] for r in third if r["arm"] == "mst")
 
 
 def test_number_of_hypotheses(tmp_path):
     folder = run_small(tmp_path, EXPERIMENTS / "information/number.toml")
     run_script("information/number.py", folder, "--out", tmp_path / "out")
     rows = read_csv(tmp_path / "out/number.csv")
-    assert [row["n"] for row in rows] == ["1", "5"] and all(0 < float(row["information"]) < 1 for row in rows)
-    difference = float(rows[1]["information"]) - float(rows[0]["information"])
+    assert [row["n"] for row in rows] == ["1", "5"] and all(0 < float(row[LOG_LOSS]) < 1 for row in rows)
+    difference = float(rows[1][LOG_LOSS]) - float(rows[0][LOG_LOSS])
     assert float(rows[1]["minus_smaller"]) == pytest.approx(difference, abs=2e-3)
     assert rows[0]["low"] == "" and float(rows[1]["low"]) <= float(rows[1]["minus_smaller"]) <= float(rows[1]["high"])
     assert (tmp_path / "out/number.png").exists()

@@ -8,17 +8,17 @@ import re
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
-from importlib.resources import files
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.report import run_report, viewpoint
-from mstfilter.report.run_report import read_numbers, write_report
-from mstfilter.runs import HypothesisCodec, RunFolder, read_estimate, read_truth, score_pauses
+from mstfilter.report.run_numbers import read_numbers
+from mstfilter.report.run_report import write_report
+from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scene import Hypothesis, project, render
-from mstfilter.scoring import BeliefScore, weighted_coverage
+from mstfilter.scoring import BeliefScore, read_truth, score_pauses, weighted_coverage
 from mstfilter.smc import Key, Population, State, save_state
 from tests.report.runs import CAMERA, GRID, labels_of, make_run, recording, truth_at
 
@@ -81,10 +81,10 @@ def finished(tmp_path_factory):
 
 
 def test_label_images_without_volumes_give_the_quality_in_the_image(tmp_path):
-    """The numbers are those of `mstfilter.runs.score_pauses`, beside both floors."""
+    """The numbers are those of `mstfilter.scoring.score_pauses`, beside both floors."""
     film = replace(recording(2, truth=False), instance=lambda i: render(truth_at(i), GRID, CAMERA).labels)
     run = make_run(tmp_path / "run", 2, film=film)
-    expected = [row for row in score_pauses(read_estimate(run.path), read_truth(film)) if row.form == "objects"]
+    expected = [row for row in score_pauses(run.estimates(), read_truth(film)) if row.form == "objects"]
     numbers = read_numbers(run)
     found = [step.image_score for step in numbers.steps]
     assert [(s.mean, s.best, s.one_blob, s.components) for s in found] == [
@@ -239,11 +239,6 @@ def test_errors(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write report"):
         write_report(RunFolder.open(run.path), tmp_path / "file" / "report.html")
-
-
-def test_templates_are_part_of_the_package():
-    folder = files("mstfilter.report") / "templates"
-    assert {p.name for p in folder.iterdir()} >= {"report.html", "style.css"}
 
 
 def test_a_run_that_uses_the_ground_truth_is_marked(finished, tmp_path):

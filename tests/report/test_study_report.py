@@ -66,7 +66,10 @@ def make_study(path, n_scenes=4, arms=("ours", "<theirs>"), groups=("s1", "s2"),
 def test_contents_of_the_study_page(tmp_path):
     study = make_study(tmp_path)
     text = write_study_report(study).read_text()
-    assert "ours minus &lt;theirs&gt; on s1: +0.1" in text and "claims need 20 scenes" in text
+    assert (
+        "&lt;theirs&gt; minus ours on s1 in quality (higher is better): -0.1" in text
+        and "claims need 20 scenes" in text
+    )
     assert "31 of 32 runs" in text and "1 failed" in text
     assert "it &lt;broke&gt;" in text and "mend it" in text and "<broke>" not in text
     assert "simulated by mstfilter" in text
@@ -79,7 +82,9 @@ def test_contents_of_the_study_page(tmp_path):
 
 def test_enough_scenes_allow_a_claim(tmp_path):
     text = write_study_report(make_study(tmp_path, n_scenes=20, groups=("s1",), fail=False)).read_text()
-    assert re.search(r"ours is above &lt;theirs&gt; on s1 \(\+0\.(09|10)\d+, 95 % interval", text)
+    assert re.search(
+        r"&lt;theirs&gt; is below ours on s1 in quality \(higher is better\) \(-0\.(09|10)\d+, 95 %", text
+    )
     assert "first look" not in text.lower()
 
 
@@ -124,7 +129,7 @@ def test_conclusions_leave_out_arms_that_are_reported_only(tmp_path):
         make_study(tmp_path, arms=arms, groups=("s1",), fail=False, reported_only=("floor",))
     ).read_text()
     assert "With baselines and oracles" in text and text.count('<svg class="figure"') == 3
-    assert "ours minus theirs" in text and "ours minus floor" not in text
+    assert "theirs minus ours" in text and "floor minus ours" not in text
 
 
 def test_a_study_without_results_has_a_page(tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mstfilter.scoring import diversity, least_loss, overlap, pairwise_quality, pause_metrics, weighted_coverage
-from mstfilter.scoring.metrics import coverage_of, object_errors, object_f, occupancy_iou, volume_errors
+from mstfilter.scoring.metrics import coverage_of, object_metrics
 
 SMALL = hnp.arrays(np.uint16, (3, 3, 2), elements=st.integers(0, 3))
 WORLDS = st.tuples(st.lists(SMALL, min_size=1, max_size=4), SMALL)
@@ -50,9 +50,10 @@ def test_against_sets(world):
     labels, truth = world
     for one in labels:
         table, expected = overlap(one, truth), plain_metrics(one, truth)
-        assert occupancy_iou(table) == pytest.approx(expected["occupancy"])
-        assert object_f(table) == pytest.approx(expected["object_f"])
-        assert object_errors(table) == {k: expected[k] for k in ("split", "merged", "missed", "invented")}
+        found = object_metrics(table)
+        assert {name: found[name] for name in expected if name != "coverage"} == pytest.approx(
+            {name: value for name, value in expected.items() if name != "coverage"}
+        )
         some = [b for b in expected["coverage"] if b != 2]
         if some:
             sizes, best = np.array([expected["coverage"][b] for b in some]).T
@@ -78,11 +79,9 @@ def test_known_errors():
     """A row of cells: one object split in two, two merged into one, one missed, one invented."""
     truth = np.array([1] * 6 + [2] * 3 + [3] * 3 + [4] * 3 + [0] * 3)
     found = np.array([5] * 3 + [6] * 3 + [7] * 6 + [0] * 3 + [8] * 3)
-    table = overlap(found, truth)
-    assert object_errors(table) == {"split": 1, "merged": 1, "missed": 1, "invented": 1}
-    assert object_f(table) == 0.0
-    assert occupancy_iou(table) == 12 / 18
-    assert volume_errors(table) == (3 / 15, 3 / 15)
+    errors = {"split": 1, "merged": 1, "missed": 1, "invented": 1}
+    volumes = {"occupancy": 12 / 18, "volume_missed": 3 / 15, "volume_invented": 3 / 15}
+    assert object_metrics(overlap(found, truth)) == {**errors, **volumes, "object_f": 0.0}
 
 
 def test_metrics_of_a_population():

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from mst_training.border_data import BorderSamples, targets
 from mstfilter.resources import models_folder
 from mstfilter.segmentation import BorderTree, ColourDepthBoundary
 from mstfilter.segmentation.border_network import encode_image, load_border_network, near_objects
-from mstfilter.training.border_data import border_samples, targets
 from tests.segmentation.scenes import TOUCHING, frame_of
 
 SEED = 99  # of no training
@@ -18,7 +18,7 @@ def test_borders_and_centres_on_new_scenes():
     network = load_border_network("border")
     odds, true, off, by_pixel = [], [], [], []
     for scene in (0, 1):
-        samples = border_samples(SEED, scene)
+        samples = BorderSamples.of_scene(SEED, scene)
         for k in range(len(samples)):
             frame = samples.frame(k)
             seen, near = network.look(frame), near_objects(encode_image(frame))

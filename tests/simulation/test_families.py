@@ -10,15 +10,6 @@ from mstfilter.simulation.families import SCENE_FAMILIES, SceneFamily, scene_fam
 from mstfilter.simulation.shapes import ANY, REPORTED, TUNING
 
 
-def test_named_families():
-    demo, table = scene_family("demo"), scene_family("table")
-    assert (demo.width, demo.height, demo.frames_per_clip, demo.n_actions) == (320, 240, 8, 2)
-    assert (table.width, table.height, table.frames_per_clip, table.n_actions) == (640, 480, 15, 3)
-    assert table.grid().shape == (100, 100, 50)
-    assert table.n_frames == 1 + 3 * 14
-    assert table.grid().origin[2] == 0.0
-
-
 def test_the_seed_decides_the_catalogue_of_the_studied_families():
     for name in ("s1", "s2", "s3"):
         family = scene_family(name)

@@ -125,18 +125,6 @@ def test_voxel_truth_has_the_analytic_volume(family):
         assert voxels == pytest.approx(shape.pieces[0].volume, rel=0.02)
 
 
-def test_true_volumes_include_hidden_objects(recording):
-    for t in range(len(recording.pauses)):
-        assert set(np.unique(recording.truth(t))) == {0, 1, 2, 3, 4, 5}
-
-
-def test_objects_outside_the_grid_have_no_voxels():
-    shape = draw_shape(np.random.default_rng(0), "can")
-    pose = np.eye(4)
-    pose[:3, 3] = (5.0, 0, 0)
-    assert label_voxels([shape], pose[None], SMALL.grid()).sum() == 0
-
-
 def test_progress_is_called_once_a_frame_and_failures_leave_nothing(tmp_path):
     calls = []
 
@@ -171,11 +159,6 @@ def test_camera_of_families():
     np.testing.assert_allclose(demo.K[0], [262.5, 0, 159.5], atol=0.3)
     uv, _ = table.project(np.array([0.02, 0.05, 0.04]))
     np.testing.assert_allclose(uv, [319.5, 239.5], atol=1e-6)
-
-
-def test_a_recording_is_read_back(recording):
-    again = open_recording(recording.path)
-    np.testing.assert_array_equal(again.truth(2), recording.truth(2))
 
 
 def test_objects_that_left_the_workspace_are_named_and_the_truth_keeps_its_extent(tmp_path):

@@ -20,6 +20,7 @@ from mstfilter.study.config import load_study, study_of
 from mstfilter.study.executors import Executor, Local
 from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
+from tests.conftest import REPOSITORY
 from tests.study.scenes import InProcess, slide
 
 BROKEN = Path(__file__).parent / "broken.py"
@@ -184,6 +185,24 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
     assert whole.repeated == 0
     assert metrics(out) == metrics(tmp_path / "whole")
     assert not list((out / "runs").glob(".*"))
+
+
+def test_a_script_without_a_guard_is_one_clear_error(tmp_path):
+    """New processes import the script. The call is refused before anything is written."""
+    script = tmp_path / "script.py"
+    lines = (
+        "from mstfilter.study import Local, StudyConfig, run_study",
+        "run_study(StudyConfig(name='a'), 'out', Local(1))",
+    )
+    script.write_text("\n".join(lines))
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, script]
+    found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
+    assert (
+        "script.py, line 2: run_study starts processes" in found.stderr
+        and found.stderr.count("errors.InputError") == 1
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
 
 
 def test_one_process_a_study(folder, tmp_path):

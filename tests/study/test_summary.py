@@ -55,9 +55,9 @@ def test_slope_is_a_pause():
 def test_differences_are_paired_and_adjusted_together():
     found = summarise(list(rows()), "ours", ["core_seconds"])
     primary = found.compared()
-    assert [(d.family, d.first, d.second) for d in primary] == [("f", "ours", "theirs"), ("g", "ours", "theirs")]
+    assert [(d.family, d.arm, d.reference) for d in primary] == [("f", "theirs", "ours"), ("g", "theirs", "ours")]
     for one in primary:
-        expected = compare(found.metric(one.family, "ours").by_scene, found.metric(one.family, "theirs").by_scene)
+        expected = compare(found.metric(one.family, "theirs").by_scene, found.metric(one.family, "ours").by_scene)
         assert one.difference.mean == expected.mean and one.difference.p == expected.p
         assert one.difference.p_holm >= one.difference.p
         assert "n = 3" in one.words
@@ -73,8 +73,8 @@ def test_floors_take_no_part_in_the_adjustment():
         d.difference.p_holm for d in summarise(table, "ours").compared()
     ]
     reported_only = [d for d in with_floor.compared() if d.reported_only]
-    assert [d.second for d in reported_only] == ["floor", "floor"] and np.isnan(reported_only[0].difference.p_holm)
-    assert not [r for r in with_floor.difference_rows() if r["second"] == "floor" and r["conclusion"]]
+    assert [d.arm for d in reported_only] == ["floor", "floor"] and np.isnan(reported_only[0].difference.p_holm)
+    assert not [r for r in with_floor.difference_rows() if r["arm"] == "floor" and r["conclusion"]]
 
 
 def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from mst_training.border import BorderTraining, Tally, encoded
+from mst_training.border_data import BorderSamples, targets
+from mst_training.loop import run_training
 from mstfilter.scene import Camera, Frame
 from mstfilter.segmentation.border_network import (
     CENTRE_UNIT,
@@ -19,9 +22,6 @@ from mstfilter.segmentation.border_network import (
     near_objects,
     reduced,
 )
-from mstfilter.training import BorderSamples, BorderTraining, run_training
-from mstfilter.training.border import Tally, encoded
-from mstfilter.training.border_data import border_samples, read_border_samples, targets, write_border_samples
 from tests.segmentation.scenes import TWO, frame_of
 
 SMALL = BorderTraining(n_scenes=1, n_validation=1, n_test=1, width=8, steps=16, batch=2, rate=6e-3, average=0.8)
@@ -30,17 +30,17 @@ SMALL = BorderTraining(n_scenes=1, n_validation=1, n_test=1, width=8, steps=16, 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("border")
-    write_border_samples(folder / "train", 3, 2, per_file=1)
+    BorderSamples.write(folder / "train", 3, 2, per_file=1)
     return folder
 
 
 @pytest.fixture(scope="module")
 def samples(folder) -> BorderSamples:
-    return read_border_samples(sorted((folder / "train").glob("*.npz")))
+    return BorderSamples.read(sorted((folder / "train").glob("*.npz")))
 
 
 def test_a_sample_depends_on_its_scene_alone(samples):
-    again, first = border_samples(3, 1), int((samples.scene == 0).sum())
+    again, first = BorderSamples.of_scene(3, 1), int((samples.scene == 0).sum())
     for name, values in samples.columns().items():
         assert np.array_equal(values[first:], again.columns()[name]), name
     assert set(samples.scene.tolist()) == {0, 1} and 8 < len(samples) <= 12
@@ -119,7 +119,7 @@ def test_training_learns_resumes_and_is_used(folder, tmp_path):
     model = (tmp_path / "a/model.toml").read_bytes()
     assert run_training(SMALL, tmp_path / "a") == pytest.approx(figures, abs=1e-4)
     assert (tmp_path / "a/model.toml").read_bytes() == model
-    found = read_border_samples(sorted((tmp_path / "a/samples/test").glob("*.npz")))
+    found = BorderSamples.read(sorted((tmp_path / "a/samples/test").glob("*.npz")))
     near = [encoded(found, k) for k in range(len(found))]
     p = np.concatenate([truth[0][inside] for _, inside, truth, _ in near]).mean()
     assert figures["log_loss"] < -(p * np.log(p) + (1 - p) * np.log(1 - p)) - 0.01

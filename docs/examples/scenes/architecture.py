@@ -47,7 +47,7 @@ class Corrected(nn.Module):
 if __name__ == "__main__":
     torch.manual_seed(0)
     net = MyArchitecture().build()
-    # Train it here. `mstfilter train completion` makes samples: see mstfilter.training.completion_data.
+    # Train it here. `mstfilter train completion` makes samples: see models/mst_training.
     description = {
         "architecture": "MyArchitecture",
         "network": {"channels": CHANNELS},

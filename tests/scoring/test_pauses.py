@@ -9,8 +9,8 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
-from mstfilter.runs.scoring import PauseEstimate, PauseTruth, read_estimate, read_truth, score_pauses, write_scores
 from mstfilter.scene import VoxelGrid, render
+from mstfilter.scoring import PauseEstimate, PauseTruth, read_estimates, read_truth, score_pauses, write_scores
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (6, 1, 1))
@@ -63,14 +63,14 @@ def test_volumes_against_a_recording(tmp_path):
     """Pauses are matched by frame, whatever the order and however many there are."""
     path = write_recording(tmp_path / "r")
     truth = read_truth(open_recording(path))
-    whole = read_estimate(path / "voxels.npz")
+    whole = read_estimates(path / "voxels.npz")
     assert [row.mean for row in score_pauses(whole, truth)] == [1.0] * 6
     labels = np.stack([table_scene(4)[2], np.zeros(GRID.shape, np.uint16)])
     np.savez(tmp_path / "e.npz", labels=labels, frame=[2, 1], origin=GRID.origin, voxel_size=GRID.voxel_size)
-    rows = score_pauses(read_estimate(tmp_path / "e.npz"), truth)
+    rows = score_pauses(read_estimates(tmp_path / "e.npz"), truth)
     assert [(row.pause, row.form, row.mean) for row in rows] == [(0, f, 1.0) for f in ("objects", "paper", "authors")]
     np.save(tmp_path / "e.npy", labels)
-    assert score_pauses(read_estimate(tmp_path / "e.npy"), read_truth(path / "voxels.npz"))[3].mean == 0.0
+    assert score_pauses(read_estimates(tmp_path / "e.npy"), read_truth(path / "voxels.npz"))[3].mean == 0.0
 
 
 def test_instance_images_score_visible_parts(tmp_path):
@@ -97,7 +97,7 @@ def test_a_run_scores_as_its_own_metrics_say(tmp_path):
 
     recording = open_recording(write_recording(tmp_path / "r"))
     run = filter_recording(recording, load_config("mst", ["n=3"]), tmp_path / "run", 0)
-    rows = score_pauses(read_estimate(run.path), read_truth(recording))
+    rows = score_pauses(run.estimates(), read_truth(recording))
     written = list(csv.DictReader((run.path / "metrics.csv").open()))
     for row in rows:
         q = np.array([float(m[f"quality_{row.form}"]) for m in written if int(m["pause"]) == row.pause])
@@ -136,4 +136,4 @@ def test_input_that_does_not_match_is_an_error(tmp_path):
         ("none.npz", "does not exist"),
     ):
         with pytest.raises(InputError, match=message):
-            read_estimate(tmp_path / name)
+            read_estimates(tmp_path / name)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,6 +19,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mst_training.border_data import BorderSamples, targets
+from mst_training.loop import Training, calibration_error, fit_calibration
+from mst_training.scenes import Samples
 from mstfilter.segmentation.border_network import (
     BORDER_ARCHITECTURE,
     CENTRE_UNIT,
@@ -29,8 +31,6 @@ from mstfilter.segmentation.border_network import (
     near_objects,
 )
 from mstfilter.segmentation.boundary import ColourDepthBoundary
-from mstfilter.training.border_data import BorderSamples, read_border_samples, targets, write_border_samples
-from mstfilter.training.loop import Training, calibration_error, fit_calibration
 
 _FAR = 0.1  # weight of pixels far from everything above the table
 _COLOUR = IMAGE_CHANNELS.index("lightness")
@@ -58,13 +58,8 @@ class BorderTraining(Training):
         },
     }
     architecture: ClassVar[str] = BORDER_ARCHITECTURE
+    samples: ClassVar[type[Samples]] = BorderSamples
     losses: ClassVar[tuple[str, ...]] = ("loss_border", "loss_foreground", "loss_centre")
-
-    def write(self, folder: Path, seed: int, n_scenes: int, workers: int, kinds: tuple[str, ...]) -> list[Path]:
-        return write_border_samples(folder, seed, n_scenes, workers, kinds)
-
-    def read(self, paths: Sequence[Path]) -> BorderSamples:
-        return read_border_samples(paths)
 
     def networks(self) -> dict[str, nn.Module]:
         return {"net": BorderNet(self.width)}

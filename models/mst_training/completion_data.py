@@ -1,9 +1,8 @@
 """Samples for the completion network: what a camera sees of an object, and the space that the object fills.
 
->>> samples = scene_samples(seed=0, index=3)               # of one scene, always the same
->>> write_samples(folder, seed=0, n_scenes=1000, workers=2)     # resumable; the same files for any number of workers
+>>> samples = CompletionSamples.of_scene(seed=0, index=3)          # always the same
 
-A scene has 2 to 12 objects of the kinds in `mstfilter.training.shapes`, side by side, stacked, leaning and hidden, at
+A scene has 2 to 12 objects of the kinds in `mst_training.shapes`, side by side, stacked, leaning and hidden, at
 rest under physics. It is seen by three cameras with the noise of the simulated sensor and a small error of the
 camera's pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of
 sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. Half of the samples also
@@ -19,39 +18,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from mst_training.scenes import HEIGHT, WIDTH, Samples, View, cast, displaced, draw_camera, on_table, put_away
 from mstfilter.completion import Completer, Extrude, ObservedBox, observed_box
 from mstfilter.completion.crops import EDGE, LATTICE, crop_box
 from mstfilter.completion.observed import decode_signed, encode_box, observed_again
-from mstfilter.errors import InputError
-from mstfilter.scene import Camera, Frame, ObjectView, VoxelGrid, scene_cache
+from mstfilter.scene import Camera, Frame, ObjectView, Seen, VoxelGrid, scene_cache
 from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
 from mstfilter.simulation.sensor import DepthSensor
 from mstfilter.simulation.shapes import label_voxels
 from mstfilter.simulation.world import PhysicsWorld
-from mstfilter.training.scenes import (
-    HEIGHT,
-    WIDTH,
-    Columns,
-    cast,
-    displaced,
-    draw_camera,
-    draw_scene,
-    on_table,
-    put_away,
-    read_shard,
-    slant_of,
-    world_rays,
-    write_shards,
-)
-from mstfilter.training.shapes import TRAINED
 
 _GRID = VoxelGrid(np.array([-0.45, -0.45, 0.0]), LATTICE, (90, 90, 40))
 _N_VIEWS, _N_MASKS = 3, 14  # cameras of a scene, masks of a view
@@ -66,10 +47,10 @@ MASK_KINDS = ("whole", "part", "several")
 
 
 @dataclass(frozen=True, eq=False)
-class Samples(Columns):
+class CompletionSamples(Samples):
     """Samples of one or of many scenes."""
 
-    bits: np.ndarray  #: (n, 32, 32, 32) uint8, what is seen (`encode_box`)
+    bits: np.ndarray  #: (n, 32, 32, 32) uint8, flags of `Seen`
     signed: np.ndarray  #: (n, 32, 32, 32) int8
     truth: np.ndarray  #: (n, 32, 32, 32) bool
     kind: np.ndarray  #: (n,) str, kind of the shape with most pixels in the mask
@@ -77,28 +58,21 @@ class Samples(Columns):
     scene: np.ndarray  #: (n,) int32, number of the scene
     visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
 
+    @classmethod
+    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
+        parts = [part for _ in range(_N_VIEWS) if (part := _view_samples(rng, world, index)) is not None]
+        return cls.join(parts) if parts else None
+
     def box(self, k: int) -> ObservedBox:
         """What sample k shows, as a completer sees it."""
-        own, other, free, behind, hidden = (((self.bits[k] >> i) & 1).astype(bool) for i in range(5))
+        own, other, free, behind, hidden = (flag.among(self.bits[k]) for flag in Seen)
         height = (np.arange(EDGE) + 0.5) * LATTICE
         return ObservedBox(
             own.astype(np.int32), own, other, free, behind, hidden, decode_signed(self.signed[k]), height
         )
 
 
-def scene_samples(seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Samples:
-    """The samples of scene number `index`."""
-    for attempt in range(20):
-        rng = np.random.default_rng([seed, index, attempt])
-        world = draw_scene(rng, kinds)
-        if world is not None:
-            parts = [part for _ in range(_N_VIEWS) if (part := _view_samples(rng, world, index)) is not None]
-            if parts:
-                return Samples.join(parts)
-    raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
-
-
-def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> Samples | None:
+def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
     """The samples of one camera; None if there are none."""
     poses = world.poses()
     inside = on_table(poses)
@@ -120,7 +94,7 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     bits, signed, shapes, kinds, masks, visible = columns
     scene = np.full(len(bits), index, np.int32)
-    return Samples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
+    return CompletionSamples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
 
 
 class _Earlier(NamedTuple):
@@ -148,17 +122,15 @@ def _earlier_frames(rng: np.random.Generator, world: PhysicsWorld) -> list[_Earl
 
 def _frame(rng: np.random.Generator, world: PhysicsWorld, camera: Camera) -> tuple[Frame, np.ndarray]:
     """An image with noise, with a small error of the camera's pose, and the true instances (H, W)."""
-    geom, z, normal = cast(world, camera, (0, 1))
-    instance = np.where(geom >= 0, world.geom_object[np.maximum(geom, 0)], 0)
-    depth = np.where(geom >= 0, z, np.nan).astype(np.float32).reshape(HEIGHT, WIDTH)
+    view = View.of(world, camera)
     sensor = replace(DepthSensor(), edge_dropout=float(rng.uniform(0.05, 0.2)))
-    reading = sensor.read(rng, depth, slant_of(world_rays(camera), normal))
+    reading = sensor.read(rng, view.depth, view.slant)
     # One colour an object, with shading: the tree sees edges of colour and of depth.
     albedo = rng.uniform(0.1, 0.9, (256, 3))
-    light = 0.45 + 0.5 * np.clip(normal @ np.array([0.3, -0.4, 0.87]), 0, 1)
-    rgb = albedo[instance] * light[:, None] + rng.normal(0.0, 0.02, (len(instance), 3))
+    light = 0.45 + 0.5 * np.clip(view.normal @ np.array([0.3, -0.4, 0.87]), 0, 1)
+    rgb = albedo[view.instance.ravel()] * light[:, None] + rng.normal(0.0, 0.02, (len(light), 3))
     image = np.clip(255 * rgb, 0, 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
-    return Frame(image, reading, displaced(rng, camera)), instance.reshape(HEIGHT, WIDTH)
+    return Frame(image, reading, displaced(rng, camera)), view.instance
 
 
 def _silhouettes(world: PhysicsWorld, camera: Camera, instance: np.ndarray) -> dict[int, float]:
@@ -284,31 +256,3 @@ def _claimed(
     claimed = np.zeros_like(truth)
     claimed[tuple(voxels[inside[nearest]].T)] = True
     return claimed
-
-
-def _columns(seed: int, kinds: tuple[str, ...], start: int, stop: int) -> dict[str, np.ndarray]:
-    """The samples of scenes start .. stop - 1 as they are stored."""
-    columns = Samples.join([scene_samples(seed, index, kinds) for index in range(start, stop)]).columns()
-    return {**columns, "truth": np.packbits(columns["truth"], axis=-1)}
-
-
-def write_samples(
-    folder: str | Path,
-    seed: int,
-    n_scenes: int,
-    workers: int = 1,
-    kinds: tuple[str, ...] = TRAINED,
-    per_file: int = 10,
-) -> list[Path]:
-    """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept."""
-    return write_shards(folder, partial(_columns, seed, kinds), n_scenes, workers, per_file)
-
-
-def read_samples(paths: Sequence[Path]) -> Samples:
-    """The samples of files."""
-    return Samples.join(
-        [
-            Samples(**{**columns, "truth": np.unpackbits(columns["truth"], axis=-1).astype(bool)})
-            for columns in map(read_shard, paths)
-        ]
-    )

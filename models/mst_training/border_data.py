@@ -1,9 +1,9 @@
 """Samples for the border network: images of clutter, the object of every pixel, and the centres of the objects.
 
->>> samples = border_samples(seed=0, index=3)                   # of one scene, always the same
+>>> samples = BorderSamples.of_scene(seed=0, index=3)           # always the same
 >>> border, foreground, offset = targets(samples.instance[0], samples.centre[0])
 
-The scenes are those of the completion samples (`mstfilter.training.scenes`), seen by cameras of many elevations,
+The scenes are those of the completion samples (`mst_training.scenes`), seen by cameras of many elevations,
 distances and focal lengths. Networks of depth transfer from simulated to real images better than networks of colour
 (C. Xie, Y. Xiang, A. Mousavian, D. Fox, "Unseen object instance segmentation for robotic environments", 2021). So
 colours are random: patterns that turn with the object, random lamps and shadows, images in which all surfaces have
@@ -13,34 +13,17 @@ disparity, flying pixels between foreground and background, and holes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
 
+from mst_training.scenes import HEIGHT, WIDTH, Samples, View, displaced, draw_camera, on_table
 from mstfilter.errors import InputError
-from mstfilter.scene import Camera, Frame, fit_support_plane, rigid_from_matrix, scene_cache
+from mstfilter.scene import Camera, Frame, fit_support_plane, rigid_from_matrix
 from mstfilter.segmentation.border_network import CENTRE_UNIT
 from mstfilter.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.simulation.world import PhysicsWorld
-from mstfilter.training.scenes import (
-    HEIGHT,
-    WIDTH,
-    Columns,
-    cast,
-    displaced,
-    draw_camera,
-    draw_scene,
-    on_table,
-    read_shard,
-    slant_of,
-    world_rays,
-    write_shards,
-)
-from mstfilter.training.shapes import TRAINED
 
 _DEPTH_UNIT = 1e-4  # metres, of stored depth
 _N_VIEWS = 6
@@ -51,7 +34,7 @@ _STEP = 0.02  # metres within 3 x 3 pixels from which flying pixels occur
 
 
 @dataclass(frozen=True, eq=False)
-class BorderSamples(Columns):
+class BorderSamples(Samples):
     """Images of one or of many scenes."""
 
     depth: np.ndarray  #: (n, H, W) uint16, z-depth in 0.1 mm, 0 for no reading
@@ -61,6 +44,12 @@ class BorderSamples(Columns):
     intrinsics: np.ndarray  #: (n, 3, 3)
     pose: np.ndarray  #: (n, 4, 4) T_world_camera: measured with a small error, or fitted to the table
     scene: np.ndarray  #: (n,) int32, number of the scene
+
+    @classmethod
+    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> BorderSamples | None:
+        rows = [row for _ in range(_N_VIEWS) if (row := _view(rng, world)) is not None]
+        columns = [np.stack(column) for column in zip(*rows, strict=True)]
+        return BorderSamples(*[*columns, np.full(len(rows), index, np.int32)]) if rows else None
 
     def frame(self, k: int) -> Frame:
         """Image k."""
@@ -85,19 +74,6 @@ def targets(instance: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.nd
     return border, instance > 0, np.where(instance > 0, offset, 0).astype(np.float32)
 
 
-def border_samples(seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> BorderSamples:
-    """The samples of scene number `index`."""
-    for attempt in range(20):
-        rng = np.random.default_rng([seed, index, attempt])
-        world = draw_scene(rng, kinds)
-        if world is not None:
-            rows = [row for _ in range(_N_VIEWS) if (row := _view(rng, world)) is not None]
-            if rows:
-                columns = [np.stack(column) for column in zip(*rows, strict=True)]
-                return BorderSamples(*[*columns, np.full(len(rows), index, np.int32)])
-    raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
-
-
 def _view(rng: np.random.Generator, world: PhysicsWorld) -> tuple[np.ndarray, ...] | None:
     """The arrays of one image; None if it shows no object."""
     poses = world.poses()
@@ -106,17 +82,11 @@ def _view(rng: np.random.Generator, world: PhysicsWorld) -> tuple[np.ndarray, ..
         return None
     zoom = float(np.exp(rng.uniform(np.log(0.8), np.log(1.5))))
     camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (15, 80), (0.5, 1.3), zoom)
-    geom, z, normal = cast(world, camera, (0, 1))
-    hit = geom >= 0
-    instance = np.where(hit, world.geom_object[np.maximum(geom, 0)], 0).astype(np.uint8)
-    if np.bincount(instance)[1:].max(initial=0) < _LEAST_PIXELS:
+    view = View.of(world, camera)
+    if np.bincount(view.instance.ravel())[1:].max(initial=0) < _LEAST_PIXELS:
         return None
-    rays = world_rays(camera)
-    true_depth = np.where(hit, z, np.nan).astype(np.float32).reshape(HEIGHT, WIDTH)
-    shaped = instance.reshape(HEIGHT, WIDTH)
-    depth = _depth(rng, true_depth, slant_of(rays, normal), shaped)
-    points = np.array(camera.position) + rays * np.where(hit, z, 0)[:, None]
-    rgb = _colours(rng, world, poses, geom, points, normal, instance)
+    depth = _depth(rng, view)
+    rgb = _colours(rng, world, poses, view)
     centre = np.zeros((_MOST_OBJECTS + 1, 2), np.float32)
     projected, _ = camera.project(poses[:, :3, 3])
     centre[1 : 1 + len(poses)] = np.nan_to_num(projected)
@@ -128,18 +98,18 @@ def _view(rng: np.random.Generator, world: PhysicsWorld) -> tuple[np.ndarray, ..
         except InputError:
             pass  # too little of the table is visible: the measured pose
     stored = np.rint(np.nan_to_num(depth) / _DEPTH_UNIT).astype(np.uint16)
-    return stored, rgb, shaped, centre, np.array(camera.K), measured.pose.as_matrix()
+    return stored, rgb, view.instance, centre, np.array(camera.K), measured.pose.as_matrix()
 
 
-def _depth(rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray, instance: np.ndarray) -> np.ndarray:
+def _depth(rng: np.random.Generator, view: View) -> np.ndarray:
     """What a sensor of random quality reads (H, W), NaN for nothing."""
     sensor = DepthSensor(
         lateral=rng.uniform(0.2, 1.2), edge_dropout=rng.uniform(0.02, 0.35), fill=rng.uniform(0.0, 5.0)
     )
     if rng.uniform() < 0.5:  # the projector is on the other side
-        reading = sensor.read(rng, depth[:, ::-1], slant[:, ::-1])[:, ::-1]
+        reading = sensor.read(rng, view.depth[:, ::-1], view.slant[:, ::-1])[:, ::-1]
     else:
-        reading = sensor.read(rng, depth, slant)
+        reading = sensor.read(rng, view.depth, view.slant)
     reading = _flying(rng, reading)
     D = _DISPARITY / reading
     warp = cv2.resize(rng.normal(0.0, rng.uniform(0.0, 0.8), (6, 8)), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
@@ -152,7 +122,7 @@ def _depth(rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray, insta
     # Some objects are dark or shiny and lose readings in patches.
     dark = (rng.random(256) < 0.08) & (np.arange(256) > 0)
     coarse = cv2.resize(rng.random((60, 80)), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-    gone = (lost > 0) | (dark[instance] & (coarse < rng.uniform(0.2, 0.7)))
+    gone = (lost > 0) | (dark[view.instance] & (coarse < rng.uniform(0.2, 0.7)))
     return np.where(gone, np.nan, _DISPARITY / np.maximum(D, 1.0)).astype(np.float32)
 
 
@@ -169,29 +139,22 @@ def _flying(rng: np.random.Generator, depth: np.ndarray) -> np.ndarray:
     return np.where(moved, between, depth).astype(np.float32)
 
 
-def _colours(
-    rng: np.random.Generator,
-    world: PhysicsWorld,
-    poses: np.ndarray,
-    geom: np.ndarray,
-    points: np.ndarray,
-    normal: np.ndarray,
-    instance: np.ndarray,
-) -> np.ndarray:
+def _colours(rng: np.random.Generator, world: PhysicsWorld, poses: np.ndarray, view: View) -> np.ndarray:
     """A colour image (H, W, 3) uint8 with random patterns, lamp and exposure."""
     kind = rng.uniform()
     if kind < 0.12:
         return np.full((HEIGHT, WIDTH, 3), rng.integers(30, 220), np.uint8)
     # The surfaces are the table, the floor, the walls and the objects.
-    surface = np.where(instance > 0, instance + 3, np.clip(geom, -1, 2) + 1)
-    albedo = np.zeros((len(geom), 3))
+    instance = view.instance.ravel().astype(int)
+    surface = np.where(instance > 0, instance + 3, np.clip(view.geom, -1, 2) + 1)
+    albedo = np.zeros((len(surface), 3))
     one_pattern = kind < 0.22
     state = rng.bit_generator.state
     for k in np.unique(surface):
         if one_pattern:
             rng.bit_generator.state = state
         pixels = surface == k
-        local = points[pixels]
+        local = view.points[pixels]
         if k > 3:
             turn, at = poses[k - 4, :3, :3], poses[k - 4, :3, 3]
             local = (local - at) @ turn
@@ -200,11 +163,11 @@ def _colours(
     direction /= np.linalg.norm(direction)
     direction[2] = abs(direction[2])
     ambient, strength = rng.uniform(0.15, 0.8), rng.uniform(0.2, 0.9)
-    light = np.clip(normal @ direction, 0, 1)
+    light = np.clip(view.normal @ direction, 0, 1)
     if rng.uniform() < 0.6 and direction[2] > 0.25:
         # One cast from the lamp: a point is lit if the ray to it meets nothing before.
         lamp = 3.0 * direction
-        _, reach, _ = world.cast(lamp, points - lamp, (0, 1))
+        _, reach, _ = world.cast(lamp, view.points - lamp, (0, 1))
         light = light * ((reach < 0) | (reach > 0.995))
     tint = rng.uniform(0.7, 1.0, 3)
     linear = albedo * (ambient + strength * light[:, None] * tint) * np.exp(rng.normal(0.0, 0.35))
@@ -250,26 +213,3 @@ def _solid_noise(rng: np.random.Generator, at: np.ndarray) -> np.ndarray:
     for octave, weight in ((1.0, 0.7), (2.1, 0.4)):
         total += weight * map_coordinates(lattice, (at * octave).T, order=1, mode="grid-wrap")
     return total
-
-
-def _columns(seed: int, kinds: tuple[str, ...], start: int, stop: int) -> dict[str, np.ndarray]:
-    parts = [border_samples(seed, index, kinds) for index in range(start, stop)]
-    scene_cache.clear()
-    return BorderSamples.join(parts).columns()
-
-
-def write_border_samples(
-    folder: str | Path,
-    seed: int,
-    n_scenes: int,
-    workers: int = 1,
-    kinds: tuple[str, ...] = TRAINED,
-    per_file: int = 10,
-) -> list[Path]:
-    """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept."""
-    return write_shards(folder, partial(_columns, seed, kinds), n_scenes, workers, per_file)
-
-
-def read_border_samples(paths: Sequence[Path]) -> BorderSamples:
-    """The samples of files."""
-    return BorderSamples.join([BorderSamples(**read_shard(path)) for path in paths])

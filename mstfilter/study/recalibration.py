@@ -1,10 +1,11 @@
-"""The information of the runs of a study: every scene is scored with what the other scenes of its family say.
+"""The recalibrated log loss of the runs of a study: the forecasts of a scene are recalibrated on other scenes.
 
->>> add_information(rows, counts)               # adds the columns information, information_same, ..., energy_floor
->>> fitted = fit_information(rows, counts, [("s1", "mst")])    # to score the scenes of another study
+>>> add_log_loss(rows, counts)            # adds recalibrated_log_loss, recalibrated_log_loss_same, ..., energy_floor
+>>> fitted = fit_recalibration(rows, counts, [("s1", "mst")])  # to score the scenes of another study
 
-Information and the floor of the energy score need other scenes of the same family and arm: those of the study without
-the scene itself, or those that a recalibration was fitted to. Filter seeds of one scene are never on both sides.
+Recalibration and the floor of the energy score need other scenes of the same family and arm: those of the study
+without the scene itself, or those that a recalibration was fitted to. Filter seeds of one scene are never on both
+sides.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ class _Fitted:
         return cls(FittedForecasts(float(found["rate"]), recalibration), float(found["energy_rate"]))
 
 
-def add_information(
+def add_log_loss(
     rows: Sequence[dict[str, Any]], counts: Counts, fitted: Mapping[str, Mapping[str, Any]] | None = None
 ) -> None:
-    """Add ``information``, its splits and ``energy_floor`` to rows, in place.
+    """Add ``recalibrated_log_loss``, its splits and ``energy_floor`` to rows, in place.
 
     Parameters
     ----------
@@ -56,8 +57,8 @@ def add_information(
         One row per pause with family, scene, arm, seed, pause and ``energy_noise``.
     counts : callable
     fitted : mapping, optional
-        As `fit_information` returns it. Default: each scene is scored by the other scenes of its family, which needs
-        at least two scenes.
+        As `fit_recalibration` returns it. Default: each scene is scored by the other scenes of its family, which
+        needs at least two scenes.
     """
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -77,7 +78,7 @@ def add_information(
                 row["energy_floor"] = row["energy_noise"][NOISE_RATES.index(fit.energy_rate)]
 
 
-def fit_information(
+def fit_recalibration(
     rows: Sequence[Mapping[str, Any]], counts: Counts, arms: Sequence[tuple[str, str]]
 ) -> dict[str, dict[str, Any]]:
     """Fit each family and arm to all its scenes: family -> arm -> plain values, with the names of the scenes."""

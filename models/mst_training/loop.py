@@ -3,7 +3,7 @@
 >>> settings = CompletionTraining.recipe("cpu", ["steps=10000"])
 >>> run_training(settings, "completion-model", on_progress=print)     # resumes where it stopped
 
-A part defines its settings as a subclass of `Training`, which says how samples are made and what the loss is. The
+A part defines its settings as a subclass of `Training`, which names the samples and says what the loss is. The
 folder gets the samples (``samples/``), the state (``state.safetensors``), the curves (``curves.csv``), and at the end
 the model: ``weights.safetensors``, ``model.toml`` and ``metrics.csv``.
 
@@ -25,11 +25,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mst_training.scenes import Samples
+from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, read_csv, write_csv, write_text
 from mstfilter.reading import read_text
 from mstfilter.trained import DESCRIPTION, open_model, write_model
-from mstfilter.training.shapes import HELD_OUT, TRAINED
 
 _STATE = "state.safetensors"
 _SAVE_EVERY = 120.0  # seconds between saved states
@@ -55,6 +56,7 @@ class Training(ABC):
     #: Changes of the settings by name. "cpu" takes about four core hours, "smoke" shows that everything works.
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]]
     architecture: ClassVar[str]
+    samples: ClassVar[type[Samples]]  #: what it is trained on
     losses: ClassVar[tuple[str, ...]]  #: names of the figures of `loss`
 
     @classmethod
@@ -74,14 +76,6 @@ class Training(ABC):
             except (ValueError, KeyError):
                 raise InputError(f"setting {name} is {value!r}, expected {kind.__name__}") from None
         return replace(settings, **changes)
-
-    @abstractmethod
-    def write(self, folder: Path, seed: int, n_scenes: int, workers: int, kinds: tuple[str, ...]) -> list[Path]:
-        """Write the samples of some scenes; existing files are kept."""
-
-    @abstractmethod
-    def read(self, paths: Sequence[Path]) -> Any:
-        """The samples of files."""
 
     @abstractmethod
     def networks(self) -> dict[str, nn.Module]:
@@ -153,19 +147,20 @@ def run_training(
         return dict(open_model(str(folder), settings.architecture).description["test"])
     report(0, settings.steps, "making samples")
     seed, place = settings.seed, folder / "samples"
+    make, read = settings.samples.write, settings.samples.read
     parts = {
-        "validation": settings.write(place / "validation", seed + 1, settings.n_validation, workers, TRAINED),
-        "test": settings.write(place / "test", seed + 2, settings.n_test, workers, TRAINED + HELD_OUT),
-        "train": settings.write(place / "train", seed, settings.n_scenes, workers, TRAINED),
+        "validation": make(place / "validation", seed + 1, settings.n_validation, workers, TRAINED),
+        "test": make(place / "test", seed + 2, settings.n_test, workers, TRAINED + HELD_OUT),
+        "train": make(place / "train", seed, settings.n_scenes, workers, TRAINED),
     }
     run = _Run(settings, folder, torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
-    validation = settings.read(parts["validation"])
+    validation = read(parts["validation"])
     if run.step < settings.steps:
         last = settings.steps if max_steps is None else min(settings.steps, run.step + max_steps)
-        run.train(settings.read(parts["train"]), validation, last, report)
+        run.train(read(parts["train"]), validation, last, report)
         if run.step < settings.steps:
             return None
-    described, figures, rows = settings.finish(run.averaged, validation, settings.read(parts["test"]), run.device)
+    described, figures, rows = settings.finish(run.averaged, validation, read(parts["test"]), run.device)
     write_csv(folder / "metrics.csv", rows, float_format=".4f")
     description = {
         "architecture": settings.architecture,

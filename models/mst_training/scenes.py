@@ -2,14 +2,15 @@
 
 >>> world = draw_scene(np.random.default_rng(0), TRAINED)
 >>> camera = draw_camera(rng, (0, 0), elevation=(22, 68), distance=(0.55, 1.05))
->>> geom, z, normal = cast(world, camera, (0, 1))
+>>> View.of(world, camera).instance
+>>> CompletionSamples.write(folder, seed=0, n_scenes=1000, workers=2)      # resumable
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -17,15 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from mst_training.shapes import TRAINED, draw_kind, draw_training_shape
 from mstfilter.errors import InputError
 from mstfilter.files import atomic_path
 from mstfilter.processes import environment
 from mstfilter.reading import MAX_WEIGHTS, read_arrays
-from mstfilter.scene import Camera, look_at
+from mstfilter.scene import Camera, look_at, scene_cache
 from mstfilter.simulation.arrangement import arrange_objects
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.world import PhysicsWorld
-from mstfilter.training.shapes import draw_kind, draw_training_shape
 
 WIDTH, HEIGHT = 320, 240  # pixels of an image
 
@@ -108,21 +109,96 @@ def world_rays(camera: Camera) -> np.ndarray:
     return camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
 
 
-def slant_of(rays: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Slant (H, W) float32, the cosine of the angle of incidence, of rays (n, 3) on surfaces with normals (n, 3)."""
-    cosine = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
-    return cosine.reshape(HEIGHT, WIDTH).astype(np.float32)
-
-
 def cast(world: PhysicsWorld, camera: Camera, groups: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Geom (n,), z-depth (n,) and normal (n, 3) of every pixel of a camera (`PhysicsWorld.cast`)."""
     return world.cast(np.array(camera.position), world_rays(camera), groups)
 
 
-class Columns:
-    """Samples as a dataclass of arrays; the first axis of each is the sample."""
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera without noise sees of a scene; n is the number of pixels."""
+
+    camera: Camera
+    geom: np.ndarray  #: (n,) of `PhysicsWorld.cast`, -1 for none
+    points: np.ndarray  #: (n, 3) in the world; the camera's position where the ray hits nothing
+    normal: np.ndarray  #: (n, 3)
+    instance: np.ndarray  #: (H, W) uint8, object of every pixel, 0 for none
+    depth: np.ndarray  #: (H, W) float32 metres, NaN for none
+    slant: np.ndarray  #: (H, W) float32, cosine of the angle of incidence
+
+    @classmethod
+    def of(cls, world: PhysicsWorld, camera: Camera) -> Self:
+        """The view of all pixels of a camera."""
+        rays = world_rays(camera)
+        geom, z, normal = cast(world, camera, (0, 1))
+        hit = geom >= 0
+        instance = np.where(hit, world.geom_object[np.maximum(geom, 0)], 0).astype(np.uint8)
+        points = np.array(camera.position) + rays * np.where(hit, z, 0)[:, None]
+        cosine = np.abs((rays * normal).sum(axis=1)) / np.linalg.norm(rays, axis=1)
+        images = (instance, np.where(hit, z, np.nan).astype(np.float32), cosine.astype(np.float32))
+        return cls(camera, geom, points, normal, *(image.reshape(HEIGHT, WIDTH) for image in images))
+
+
+class Samples:
+    """Samples as a dataclass of arrays; the first axis of each is the sample.
+
+    A subclass defines the arrays, and how one scene gives samples.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @classmethod
+    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> Self | None:
+        """The samples of scene number `index`; None if it shows no object."""
+        raise NotImplementedError
+
+    @classmethod
+    def of_scene(cls, seed: int, index: int, kinds: tuple[str, ...] = TRAINED) -> Self:
+        """The samples of scene number `index`, which follow from the arguments alone."""
+        for attempt in range(20):
+            rng = np.random.default_rng([seed, index, attempt])
+            world = draw_scene(rng, kinds)
+            samples = None if world is None else cls.of_world(rng, world, index)
+            if samples is not None:
+                return samples
+        raise InputError(f"no scene could be made of the kinds {', '.join(kinds)}")
+
+    @classmethod
+    def write(
+        cls,
+        folder: str | Path,
+        seed: int,
+        n_scenes: int,
+        workers: int = 1,
+        kinds: tuple[str, ...] = TRAINED,
+        per_file: int = 10,
+    ) -> list[Path]:
+        """Write the samples of scenes 0 .. n - 1 to files of a folder; existing files are kept.
+
+        The files are the same for any number of workers.
+        """
+        jobs = [
+            (
+                Path(folder) / f"scenes-{start:06d}.npz",
+                cls,
+                seed,
+                range(start, min(start + per_file, n_scenes)),
+                kinds,
+            )
+            for start in range(0, n_scenes, per_file)
+        ]
+        if workers > 1:
+            with environment(), ProcessPoolExecutor(workers) as pool:
+                list(pool.map(_write_file, jobs))
+        else:
+            for job in jobs:
+                _write_file(job)
+        return [job[0] for job in jobs]
+
+    @classmethod
+    def read(cls, paths: Sequence[Path]) -> Self:
+        """The samples of files."""
+        return cls.join([cls(**read_arrays(path, "samples of a training", limit=MAX_WEIGHTS)) for path in paths])
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays by name."""
@@ -141,35 +217,10 @@ class Columns:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
-def write_shards(
-    folder: str | Path,
-    make: Callable[[int, int], dict[str, np.ndarray]],
-    n_scenes: int,
-    workers: int = 1,
-    per_file: int = 10,
-) -> list[Path]:
-    """Write the samples ``make(start, stop)`` of scenes 0 .. n - 1 to files of a folder; existing files are kept."""
-    jobs = [
-        (Path(folder) / f"scenes-{start:06d}.npz", make, start, min(start + per_file, n_scenes))
-        for start in range(0, n_scenes, per_file)
-    ]
-    if workers > 1:
-        with environment(), ProcessPoolExecutor(workers) as pool:
-            list(pool.map(_write_shard, jobs))
-    else:
-        for job in jobs:
-            _write_shard(job)
-    return [job[0] for job in jobs]
-
-
-def _write_shard(job: tuple[Path, Callable[[int, int], dict[str, np.ndarray]], int, int]) -> None:
-    path, make, start, stop = job
+def _write_file(job: tuple[Path, type[Samples], int, range, tuple[str, ...]]) -> None:
+    path, samples, seed, scenes, kinds = job
     if not path.exists():
-        columns: dict[str, Any] = make(start, stop)
+        columns: dict[str, Any] = samples.join([samples.of_scene(seed, k, kinds) for k in scenes]).columns()
+        scene_cache.clear()
         with atomic_path(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, **columns)
-
-
-def read_shard(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file by name."""
-    return read_arrays(path, "samples of a training", limit=MAX_WEIGHTS)

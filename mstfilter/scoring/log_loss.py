@@ -3,14 +3,14 @@
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t), object_status(recording, t))
 >>> belief.row["brier"], belief.row["energy"]                  # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
->>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # information, in nats
+>>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-**Information.** A raw proper score of hypotheses rewards noise: hypotheses of labels alone have no uncertainty of
-shape, so noise at their borders makes forecasts less sure where they are often wrong. Information takes this out. The
-forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log loss in nats;
-lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster that adds such
-noise itself gains nothing (`experiments/information` shows it for all methods), and forecasters are compared by what
-they tell apart. Noise of another kind, or more of it than the largest rate, can still help a little.
+**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise: hypotheses of labels alone have no
+uncertainty of shape, so noise at their borders makes forecasts less sure where they are often wrong. Recalibration
+removes this. Forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log
+loss in nats; lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster
+that adds such noise itself gains nothing (`experiments/information` shows it for all methods), and forecasters are
+compared by what they tell apart. Noise of another kind, or more of it than the largest rate, can still help a little.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 
@@ -37,6 +37,7 @@ from mstfilter.scene import Hypothesis, read_only
 from mstfilter.scoring.quality import STATUSES, Status
 from mstfilter.scoring.questions import NOISE_RATES, Questions
 
+LOG_LOSS = "recalibrated_log_loss"  # name of the score in tables
 N_LEVELS = 1001  # forecasts are counted to a thousandth
 
 #: Categories of questions. "same" and "different": the voxels belong to one true object or to two, of which the less
@@ -45,7 +46,7 @@ CATEGORIES = (*(f"same {status}" for status in STATUSES), *(f"different {status}
 NO_COUNTS = read_only(np.zeros((N_LEVELS, len(CATEGORIES)), np.int64))
 _SAME = np.array([name.startswith("same") for name in CATEGORIES])
 
-#: Splits of the information: name -> categories.
+#: Splits of the log loss: name -> categories.
 SPLITS: dict[str, tuple[str, ...]] = {
     "same": CATEGORIES[:3],
     "different": CATEGORIES[3:6],
@@ -188,9 +189,9 @@ class FittedForecasts:
         return self.recalibration.log_loss(forecast_table(counts[NOISE_RATES.index(self.rate)], categories))
 
     def row(self, counts: np.ndarray) -> dict[str, float]:
-        """``information``, and ``information_NAME`` of each of `SPLITS`."""
-        splits = {f"information_{name}": self.log_loss(counts, chosen) for name, chosen in SPLITS.items()}
-        return {"information": self.log_loss(counts), **splits}
+        """`LOG_LOSS` of all questions, and ``LOG_LOSS_NAME`` of each of `SPLITS`."""
+        splits = {f"{LOG_LOSS}_{name}": self.log_loss(counts, chosen) for name, chosen in SPLITS.items()}
+        return {LOG_LOSS: self.log_loss(counts), **splits}
 
 
 def leave_one_out(counts: Mapping[Any, np.ndarray]) -> dict[Any, FittedForecasts]:

@@ -13,6 +13,7 @@ from mstfilter.errors import InputError
 from mstfilter.forecasts import ForecastTable, energy_score, is_negative_type
 from mstfilter.scoring import (
     CATEGORIES,
+    LOG_LOSS,
     NOISE_RATES,
     FittedForecasts,
     Questions,
@@ -98,7 +99,7 @@ def noisy_copies(labels, rate, rng):
     return np.where(rng.random(labels.shape) < rate, drawn, labels).astype(np.uint16)
 
 
-def test_hedging_by_noise_lowers_the_energy_score_and_adds_no_information():
+def test_hedging_by_noise_lowers_the_energy_score_and_does_not_lower_the_recalibrated_log_loss():
     """Ten noisy copies of one hypothesis against the hypothesis itself, on twelve scenes."""
     plain, hedged, energies = {}, {}, []
     for seed in range(12):
@@ -113,12 +114,12 @@ def test_hedging_by_noise_lowers_the_energy_score_and_adds_no_information():
     energies = np.array(energies)
     assert (energies[:, 1] < energies[:, 0]).all()  # the raw score rewards the noise in every scene
     assert energies[:, 1].mean() < 0.85 * energies[:, 0].mean()
-    information = [
+    losses = [
         np.mean([fit.log_loss(counts[scene]) for scene, fit in leave_one_out(counts).items()])
         for counts in (plain, hedged)
     ]
     # The hypothesis without noise is read with the noise that is best for it: the copies know nothing more.
-    assert information[0] < information[1] + 0.01
+    assert losses[0] < losses[1] + 0.01
     assert leave_one_out(plain)[0].rate > 0
 
 
@@ -135,9 +136,9 @@ def test_leave_one_out_uses_the_other_scenes_only():
         assert fits[seed].log_loss(counts[seed]) == rest.log_loss(counts[seed])
     row = fits[0].row(counts[0])
     parts = [forecast_table(counts[0][0], names).n for names in (CATEGORIES[:3], CATEGORIES[3:6], ("free",))]
-    split = [row[f"information_{name}"] for name in ("same", "different", "free")]
+    split = [row[f"{LOG_LOSS}_{name}"] for name in ("same", "different", "free")]
     known = [(n, x) for n, x in zip(parts, split, strict=True) if n]
-    assert row["information"] == pytest.approx(sum(n * x for n, x in known) / sum(parts))
+    assert row[LOG_LOSS] == pytest.approx(sum(n * x for n, x in known) / sum(parts))
 
 
 # A world that can be enumerated: which of four voxels in a row belong together, free voxels included.

@@ -1,20 +1,22 @@
-"""Scores of a run, or of label volumes, against the ground truth.
+"""Scores of hypotheses, or of label volumes, at the pauses of a recording against the ground truth.
 
->>> rows = score_pauses(read_estimate(Path("runs/mine")), read_truth(Path("recordings/mine/voxels.npz")))
+>>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(Path("recordings/mine/voxels.npz")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-There is one row for each pause and form of weighted coverage (`mstfilter.scoring`). It has the mean over the
+There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). It has the mean over the
 hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of the one of least
 expected loss. It also has two floors: the occupied voxels of the same hypotheses as one blob, and as connected
 components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in the image;
 pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the weighted set:
-Brier score, log loss and that of the base rate, calibration error and energy score
-(`mstfilter.scoring.score_belief`), the same for all forms.
+Brier score, log loss and that of the base rate, calibration error and energy score (`score_belief`), the same for all
+forms.
+
+`measure_pause` gives all metrics of a pause, for the tables of a study.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,48 +26,40 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.files import reading, write_csv, writing
 from mstfilter.reading import read_arrays
-from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
-from mstfilter.scoring import (
-    FORMS,
-    Questions,
-    ask,
-    connected_components,
-    diversity,
-    least_loss,
-    object_status,
-    one_blob,
-    pause_metrics,
-    score_belief,
-    weighted_coverage,
-)
+from mstfilter.scoring.log_loss import score_belief
+from mstfilter.scoring.metrics import diversity, least_loss, pause_metrics
+from mstfilter.scoring.quality import FORMS, connected_components, object_status, one_blob, weighted_coverage
+from mstfilter.scoring.questions import Questions, ask
 
 _ROBOT = 255
 
 
 @dataclass(frozen=True, eq=False)
 class PauseEstimate:
-    """Hypotheses at one pause of a run.
+    """Hypotheses at one pause.
 
     Parameters
     ----------
-    labels : sequence of (X, Y, Z) arrays
-        One array for each hypothesis.
+    hypotheses : sequence of Hypothesis or of (X, Y, Z) arrays
+        A `Hypothesis` also says how sure it is of each voxel.
     weights : (n,) array
         Their sum is 1.
     frame : int, optional
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
-        Grid of the volumes.
-    hypotheses : sequence of Hypothesis
-        The hypotheses of a run, which also say how sure they are of each voxel.
+        Grid of arrays.
     """
 
-    labels: Sequence[np.ndarray]
+    hypotheses: Sequence[Hypothesis | np.ndarray]
     weights: np.ndarray
     frame: int | None = None
     grid: VoxelGrid | None = None
-    hypotheses: Sequence[Hypothesis] = ()
+
+    @property
+    def labels(self) -> list[np.ndarray]:
+        """Labels (X, Y, Z) of each hypothesis."""
+        return [one.labels if isinstance(one, Hypothesis) else one for one in self.hypotheses]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,21 +109,10 @@ class PauseScore:
     base_rate: float = float("nan")
 
 
-def read_estimate(path: Path) -> list[PauseEstimate]:
-    """Hypotheses of a run folder, or label volumes: .npz with ``labels`` as voxels.npz has them, or .npy."""
-    if not path.is_dir():
-        volumes, frames, grid = _read_volumes(path, "label volumes")
-        return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
-    run = RunFolder.open(path).check()
-    if run.n_pauses == 0:
-        raise InputError(f"{path}: the run has no complete pause yet")
-    frames = run.description["recording"]["pauses"]
-    found = []
-    for t in range(run.n_pauses):
-        hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
-        labels = [h.labels for h in hypotheses]
-        found.append(PauseEstimate(labels, weights, frames[t], hypotheses[0].grid, hypotheses))
-    return found
+def read_estimates(path: Path) -> list[PauseEstimate]:
+    """Label volumes of a file as estimates: .npz with ``labels`` as voxels.npz has them, or .npy."""
+    volumes, frames, grid = _read_volumes(path, "label volumes")
+    return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
 
 
 def read_truth(source: Path | Recording) -> list[PauseTruth]:
@@ -176,20 +159,32 @@ def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], 
     return labels, frames, grid
 
 
-def measure_pause(run: RunFolder, recording: Recording, t: int) -> tuple[dict[str, Any], np.ndarray | None]:
-    """Metrics of a run at pause `t`, and the counts of its forecasts.
+def measure_pause(
+    recording: Recording,
+    t: int,
+    hypotheses: Sequence[Hypothesis],
+    weights: np.ndarray,
+    questions: Questions | None = None,
+) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Metrics of weighted hypotheses at pause `t` of a recording, and the counts of their forecasts.
+
+    Parameters
+    ----------
+    weights : (n,) float
+        Sum 1.
+    questions : Questions, optional
+        Those of the pause, if they are known already.
 
     Returns
     -------
     row : dict
-        Metrics of `mstfilter.scoring.metrics` and `mstfilter.scoring.score_belief`; without ground truth only those
-        that need none. ``qualities`` and ``energy_noise`` are lists, which tables leave out.
+        Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
+        ``qualities`` and ``energy_noise`` are lists, which tables leave out.
     counts : (r, 1001, 7) int32, or None without ground truth
-        As in `mstfilter.scoring.BeliefScore`.
+        As in `BeliefScore`.
     """
-    info, hypotheses = run.info(t), run.hypotheses(t)
-    labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], dtype=float)
-    row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": info["n"]}
+    labels = [h.labels for h in hypotheses]
+    row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": len(labels)}
     row["n_objects"] = float(np.mean([h.n_objects for h in hypotheses]))
     truth = recording.truth(t)
     if truth is None:
@@ -197,7 +192,7 @@ def measure_pause(run: RunFolder, recording: Recording, t: int) -> tuple[dict[st
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
     status = object_status(recording, t) if known else {}
     found, q = pause_metrics(labels, weights, truth, status)
-    belief = score_belief(run.questions(t) or ask(recording, t), hypotheses, weights, truth, status)
+    belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth, status)
     return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
 
@@ -224,49 +219,41 @@ def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth
 
 
 def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list[PauseScore]:
-    true = truth.labels
-    if truth.camera is not None:
-        if estimate.grid is None:
-            raise InputError(
-                "label volumes without a grid cannot be projected", "add origin and voxel_size to the .npz"
-            )
-        known = true != _ROBOT
-        camera, grid = truth.camera, estimate.grid
-        true = true[known]
-
-        def seen(labels: np.ndarray) -> np.ndarray:
-            return render(labels, grid, camera).labels[known]
-    else:
-        if estimate.grid is not None and truth.grid is not None and not _same_grid(estimate.grid, truth.grid):
-            raise InputError(
-                f"pause {pause}: hypotheses are on a grid {_grid_text(estimate.grid)}, "
-                f"truth on {_grid_text(truth.grid)}",
-                "run the filter on the recording that has the ground truth, or give it the same workspace",
-            )
-
-        def seen(labels: np.ndarray) -> np.ndarray:
-            return labels
-
-    found = [seen(labels) for labels in estimate.labels]
-    floors = [
-        [seen(floor(labels).astype(np.uint16)) for labels in estimate.labels]
-        for floor in (one_blob, connected_components)
-    ]
-    w = np.asarray(estimate.weights, dtype=float)
+    seen, true = _comparable(pause, estimate, truth)
+    labels, w = estimate.labels, np.asarray(estimate.weights, dtype=float)
+    found = [seen(one) for one in labels]
+    floors = [[seen(floor(one).astype(np.uint16)) for one in labels] for floor in (one_blob, connected_components)]
     belief = {}
     if truth.questions is not None:
-        scores = score_belief(truth.questions, estimate.hypotheses or estimate.labels, w, true)
+        scores = score_belief(truth.questions, estimate.hypotheses, w, true)
         belief = {name: scores.row[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
         belief["base_rate"] = scores.base_rate_loss
-    best_guess = least_loss(found, w)
+    best_guess, where = least_loss(found, w), "volume" if truth.camera is None else "image"
     rows = []
     for form in FORMS:
-        q = np.array([weighted_coverage(labels, true, form) for labels in found])
-        low = [float(w @ [weighted_coverage(labels, true, form) for labels in floor]) for floor in floors]
-        where = "volume" if truth.camera is None else "image"
+        q = np.array([weighted_coverage(one, true, form) for one in found])
+        low = [float(w @ [weighted_coverage(one, true, form) for one in floor]) for floor in floors]
         values = float(q.mean()), float(w @ q), float(q.max()), float(q[w.argmax()]), float(q[best_guess])
         rows.append(PauseScore(pause, where, form, len(q), *values, *low, **belief))
     return rows
+
+
+def _comparable(
+    pause: int, estimate: PauseEstimate, truth: PauseTruth
+) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """What of a label volume is compared with the truth, as a function, and the truth in the same form."""
+    grid, camera = estimate.grid, truth.camera
+    if camera is None:
+        if grid is not None and truth.grid is not None and not _same_grid(grid, truth.grid):
+            raise InputError(
+                f"pause {pause}: hypotheses are on a grid {_grid_text(grid)}, truth on {_grid_text(truth.grid)}",
+                "run the filter on the recording that has the ground truth, or give it the same workspace",
+            )
+        return lambda labels: labels, truth.labels
+    if grid is None:
+        raise InputError("label volumes without a grid cannot be projected", "add origin and voxel_size to the .npz")
+    known = truth.labels != _ROBOT
+    return lambda labels: render(labels, grid, camera).labels[known], truth.labels[known]
 
 
 def _same_grid(a: VoxelGrid, b: VoxelGrid) -> bool:

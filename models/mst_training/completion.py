@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,12 +20,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mst_training.completion_data import MASK_KINDS, CompletionSamples
+from mst_training.loop import Training, calibration_error, fit_calibration
+from mst_training.scenes import Samples
+from mst_training.shapes import HELD_OUT
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, ShapePosterior
-from mstfilter.statistics import interval
-from mstfilter.training.completion_data import MASK_KINDS, Samples, read_samples, write_samples
-from mstfilter.training.loop import Training, calibration_error, fit_calibration
-from mstfilter.training.shapes import HELD_OUT
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, to_channels
+from mstfilter.scene import Seen
+
+_OWN = Seen.SURFACE | Seen.BEHIND  # on or behind the visible surface of the object
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,14 @@ class CompletionTraining(Training):
         },
     }
     architecture: ClassVar[str] = ARCHITECTURE
+    samples: ClassVar[type[Samples]] = CompletionSamples
     losses: ClassVar[tuple[str, ...]] = ("loss", "nats")
-
-    def write(self, folder: Path, seed: int, n_scenes: int, workers: int, kinds: tuple[str, ...]) -> list[Path]:
-        return write_samples(folder, seed, n_scenes, workers, kinds)
-
-    def read(self, paths: Sequence[Path]) -> Samples:
-        return read_samples(paths)
 
     def networks(self) -> dict[str, nn.Module]:
         net = CompletionNet(len(CHANNELS), self.width, self.latent)
         return {"net": net, "posterior": ShapePosterior(self.width, self.latent)}
 
-    def batches(self, samples: Samples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
+    def batches(self, samples: CompletionSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
         """Batches in which each sample is turned and mirrored."""
         for step, chosen in self.order(len(samples), first, last):
             turns = np.random.default_rng([self.seed, 2, step]).integers(8, size=self.batch)
@@ -80,23 +77,23 @@ class CompletionTraining(Training):
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=self.half_precision):
             features, prior = networks["net"].encode(x)
             law: LatentLaw = networks["posterior"](features, truth.float())
-            logits = networks["net"].decode(features, law.draw(noise))
-        unknown, own = (bits & 4) == 0, ((bits & 9) > 0).sum(dim=(1, 2, 3))
+            logits = networks["net"].decode(features, law.mean + noise * law.log_std.exp())
+        unknown, own = ~Seen.FREE.among(bits), _OWN.among(bits).sum(dim=(1, 2, 3))
         loss = functional.binary_cross_entropy_with_logits(logits.float(), truth.float(), reduction="none")
         per_sample = ((loss * unknown).sum(dim=(1, 2, 3)) / (own + 50)).mean()
-        nats = law.divergence(prior).mean()
+        nats = divergence(law, prior).mean()
         total = per_sample + self.divergence * min(1.0, step / 2000) * nats
         return total, (float(per_sample.detach()), float(nats.detach()))
 
-    def validate(self, net: CompletionNet, samples: Samples, device: torch.device) -> dict[str, float]:
+    def validate(self, net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:
         return evaluate(net, samples.take(np.arange(min(len(samples), 400))), device)
 
     def finish(
-        self, net: CompletionNet, validation: Samples, test: Samples, device: torch.device
+        self, net: CompletionNet, validation: CompletionSamples, test: CompletionSamples, device: torch.device
     ) -> tuple[dict[str, Any], dict[str, float], list[dict[str, Any]]]:
         logits, outcomes = [], []
         for part, found in _logits(net, validation, device):
-            unknown = torch.from_numpy((validation.bits[part] & 4) == 0)
+            unknown = torch.from_numpy(~Seen.FREE.among(validation.bits[part]))
             logits.append(found[unknown])
             outcomes.append(torch.from_numpy(validation.truth[part])[unknown])
         calibration = fit_calibration(torch.cat(logits), torch.cat(outcomes))
@@ -109,6 +106,33 @@ class CompletionTraining(Training):
         return described, figures, rows
 
 
+def divergence(law: LatentLaw, other: LatentLaw) -> Tensor:
+    """Kullback-Leibler divergence (b,) of `law` from `other`, in nats."""
+    ratio = 2 * (law.log_std - other.log_std)
+    distance = ((law.mean - other.mean) * (-other.log_std).exp()) ** 2
+    return 0.5 * (ratio.exp() + distance - 1 - ratio).sum(dim=1)
+
+
+class ShapePosterior(nn.Module):
+    """The law of z given the input and the true shape."""
+
+    def __init__(self, width: int, latent: int) -> None:
+        super().__init__()
+        self.stem = nn.Conv3d(8, width, 3, padding=1)
+        self.down1 = nn.Conv3d(2 * width, 2 * width, 3, stride=2, padding=1)
+        self.down2 = nn.Conv3d(2 * width, 4 * width, 3, stride=2, padding=1)
+        self.law = nn.Linear(8 * width, 2 * latent)
+
+    def forward(self, features: list[Tensor], truth: Tensor) -> LatentLaw:
+        """From the features of the input, and the true shape (b, X, Y, Z) as 0 and 1."""
+        x = functional.silu(self.stem(to_channels(truth[:, None])))
+        x = functional.silu(self.down1(torch.cat([x, features[0].detach()], dim=1)))
+        x = functional.silu(self.down2(x))
+        pooled = torch.cat([x.mean(dim=(2, 3, 4)), features[2].detach().mean(dim=(2, 3, 4))], dim=1)
+        mean, log_std = self.law(pooled.float()).chunk(2, dim=1)
+        return LatentLaw(mean, log_std.clamp(-4, 2))
+
+
 def _heights() -> Tensor:
     return (torch.arange(32) + 0.5) * LATTICE
 
@@ -119,114 +143,73 @@ def _turned(values: np.ndarray, symmetry: int) -> np.ndarray:
     return turned[::-1] if symmetry >= 4 else turned
 
 
-def _logits(
-    net: CompletionNet, samples: Samples, device: torch.device, noise: np.ndarray | None = None
-) -> Iterator[tuple[slice, Tensor]]:
-    """Logits of batches of samples, with the mode of the latent variable or with noise (n, latent)."""
+def _logits(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> Iterator[tuple[slice, Tensor]]:
+    """Logits of batches of samples, with the mode of the latent variable."""
     with torch.inference_mode():
         for start in range(0, len(samples), 32):
             part = slice(start, min(start + 32, len(samples)))
             bits, signed = torch.from_numpy(samples.bits[part]), torch.from_numpy(samples.signed[part])
             features, prior = net.encode(channels(bits, signed, _heights()).to(device))
-            z = prior.mean if noise is None else prior.draw(torch.from_numpy(noise[part]).float().to(device))
-            yield part, net.decode(features, z).cpu()
+            yield part, net.decode(features, prior.mean).cpu()
 
 
-def evaluate(net: CompletionNet, samples: Samples, device: torch.device) -> dict[str, float]:
+def evaluate(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:
     """Mean IoU of the mode, and its log loss over voxels that are not free, before calibration."""
     iou, loss, n = [], 0.0, 0
     for part, logits in _logits(net, samples, device):
-        truth, unknown = torch.from_numpy(samples.truth[part]), torch.from_numpy((samples.bits[part] & 4) == 0)
-        iou.append(_iou((logits > 0) & unknown, truth))
+        truth, unknown = (torch.from_numpy(v) for v in (samples.truth[part], ~Seen.FREE.among(samples.bits[part])))
+        iou.append(shape_iou(((logits > 0) & unknown).numpy(), truth.numpy()))
         every = functional.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
         loss, n = loss + float((every * unknown).sum()), n + int(unknown.sum())
     return {"iou": float(np.concatenate(iou).mean()), "log_loss": loss / max(n, 1)}
 
 
-def _iou(found: Tensor, truth: Tensor) -> np.ndarray:
-    dims = (1, 2, 3)
-    return np.asarray(((found & truth).sum(dims) / (found | truth).sum(dims).clamp(min=1)).numpy())
-
-
 def measure(
-    net: CompletionNet, calibration: tuple[float, float], samples: Samples, device: torch.device, n_draws: int = 8
+    net: CompletionNet, calibration: tuple[float, float], samples: CompletionSamples, device: torch.device
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """Figures on test samples, and a table by group: mean IoU of the mode and of extrusion, and volume over true
-    volume.
+    """Figures of the mode on test samples; a table of IoU and of volume over true volume by group, beside extrusion.
 
-    ``log_loss_mode`` and ``log_loss_draws`` are of hard shapes as hypotheses hold them, softened by 1 %: of the mode,
-    and of the share of `n_draws` draws that fill a voxel. ``log_loss_noise`` is of the mode and noise at its border,
-    at the rate that is best here. ``calibration_error`` is of the mode's probabilities.
+    The calibration error and the log loss, in nats a voxel, are of the probabilities.
     """
     scale, shift = calibration
-    n = len(samples)
-    unknown = (samples.bits & 4) == 0
-    p = np.zeros(samples.truth.shape, np.float32)
+    unknown, truth = ~Seen.FREE.among(samples.bits), samples.truth
+    p = np.zeros(truth.shape, np.float32)
     for part, logits in _logits(net, samples, device):
         p[part] = torch.sigmoid(scale * logits + shift).numpy() * unknown[part]
-    question = unknown & (((samples.bits & 9) > 0) | (p > 0.02))
-    mode, rule, truth = p >= 0.5, extruded(samples.bits), samples.truth
-    share = np.zeros_like(p)
-    draw_iou = np.zeros((n_draws, n))
-    rng = np.random.default_rng(0)
-    for k in range(n_draws):
-        noise = rng.standard_normal((n, net.prior.out_features // 2))
-        for part, logits in _logits(net, samples, device, noise):
-            drawn = (torch.sigmoid(scale * logits + shift).numpy() >= 0.5) & unknown[part]
-            share[part] += drawn / np.float32(n_draws)
-            draw_iou[k, part] = shape_iou(drawn, truth[part])
-    iou = {"network": shape_iou(mode, truth), "extrude": shape_iou(rule, truth)}
-    volume = {
-        name: found.sum(axis=(1, 2, 3)) / np.maximum(truth.sum(axis=(1, 2, 3)), 1)
-        for name, found in (("network", mode), ("extrude", rule))
-    }
-    groups: dict[str, np.ndarray] = {"all": np.ones(n, bool)}
-    groups |= {f"mask: {name}": samples.mask == k for k, name in enumerate(MASK_KINDS)}
-    bounds = ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5))
-    groups |= {
-        f"visible {int(100 * a)} - {int(min(100 * b, 100))} %": (samples.visible >= a) & (samples.visible < b)
-        for a, b in bounds
-    }
-    groups |= {f"shape: {name}": samples.kind == name for name in sorted(set(samples.kind.tolist()))}
-    groups["shapes not trained on"] = np.isin(samples.kind, HELD_OUT)
+    found = {"network": p >= 0.5, "extrude": extruded(samples.bits)}
+    iou = {name: shape_iou(shape, truth) for name, shape in found.items()}
+    true_volume = np.maximum(truth.sum(axis=(1, 2, 3)), 1)
+    volume = {name: shape.sum(axis=(1, 2, 3)) / true_volume for name, shape in found.items()}
     rows = [
         {
             "group": name,
             "n": int(of.sum()),
-            "network": float(iou["network"][of].mean()),
-            "extrude": float(iou["extrude"][of].mean()),
-            "one draw": float(draw_iou[:, of].mean()),
-            "volume network": float(np.median(volume["network"][of])),
-            "volume extrude": float(np.median(volume["extrude"][of])),
+            **{of_what: float(values[of].mean()) for of_what, values in iou.items()},
+            **{f"volume {of_what}": float(np.median(values[of])) for of_what, values in volume.items()},
         }
-        for name, of in groups.items()
+        for name, of in _groups(samples).items()
         if of.any()
     ]
-    losses = {"mode": _hard_loss(mode, truth, question), "draws": _hard_loss(share, truth, question)}
-    border = _border(mode)
-    noisy = [_hard_loss(np.where(border, (1 - r) * mode + r / 2, mode), truth, question) for r in _NOISE_RATES]
-    losses["noise"] = min(noisy, key=np.mean)
+    question = unknown & (_OWN.among(samples.bits) | (p > 0.02))
     figures = {
         "iou": float(iou["network"].mean()),
         "iou_extrude": float(iou["extrude"].mean()),
-        "log_loss": float(_hard_loss(p, truth, question, 0.0).mean()),
-        **{f"log_loss_{name}": float(values.mean()) for name, values in losses.items()},
+        "log_loss": float(_log_loss(p, truth, question).mean()),
         "calibration_error": calibration_error(p[question], truth[question]),
     }
-    for other in ("mode", "noise"):
-        mean, half = _by_scene(losses["draws"] - losses[other], samples.scene)
-        figures |= {f"draws_minus_{other}": mean, f"draws_minus_{other}_half_width": half}
     return figures, rows
 
 
-_NOISE_RATES = (0.1, 0.2, 0.4, 0.6, 0.8)
-
-
-def _by_scene(values: np.ndarray, scene: np.ndarray) -> tuple[float, float]:
-    """Mean over scenes, and half the width of its 95 % interval (Student's t); NaN for one scene."""
-    of_scene = np.array([values[scene == k].mean() for k in np.unique(scene)])
-    low, high = interval(of_scene)
-    return float(of_scene.mean()), (high - low) / 2
+def _groups(samples: CompletionSamples) -> dict[str, np.ndarray]:
+    """Samples (n,) bool by kind of mask, visible share of the object's silhouette, and kind of shape."""
+    groups = {"all": np.ones(len(samples), bool)}
+    groups |= {f"mask: {name}": samples.mask == k for k, name in enumerate(MASK_KINDS)}
+    for low, high in ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5)):
+        name = f"visible {int(100 * low)} - {int(min(100 * high, 100))} %"
+        groups[name] = (samples.visible >= low) & (samples.visible < high)
+    groups |= {f"shape: {name}": samples.kind == name for name in sorted(set(samples.kind.tolist()))}
+    groups["shapes not trained on"] = np.isin(samples.kind, HELD_OUT)
+    return groups
 
 
 def shape_iou(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -235,20 +218,8 @@ def shape_iou(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.asarray((found & truth).sum(axis=axes) / np.maximum((found | truth).sum(axis=axes), 1))
 
 
-def _hard_loss(p: np.ndarray, truth: np.ndarray, question: np.ndarray, softening: float = 0.02) -> np.ndarray:
-    """Mean log loss (n,) in nats of the voxels in question, after p <- (1 - e) p + e / 2."""
-    p = np.clip((1 - softening) * p + softening / 2, 1e-6, 1 - 1e-6)
+def _log_loss(p: np.ndarray, truth: np.ndarray, question: np.ndarray) -> np.ndarray:
+    """Mean log loss (n,) in nats of the voxels in question."""
+    p = np.clip(p, 1e-6, 1 - 1e-6)
     loss = -np.log(np.where(truth, p, 1 - p))
     return np.asarray((loss * question).sum(axis=(1, 2, 3)) / np.maximum(question.sum(axis=(1, 2, 3)), 1))
-
-
-def _border(shape: np.ndarray) -> np.ndarray:
-    """Voxels of shapes (n, X, Y, Z) with a face neighbour on the other side of the border."""
-    border = np.zeros_like(shape)
-    for axis in (1, 2, 3):
-        here, there = [slice(None)] * 4, [slice(None)] * 4
-        here[axis], there[axis] = slice(1, None), slice(None, -1)
-        differs = shape[tuple(here)] != shape[tuple(there)]
-        border[tuple(here)] |= differs
-        border[tuple(there)] |= differs
-    return border

@@ -1,0 +1,355 @@
+"""The numbers of a run and what they say, in sentences: for its report and the command line.
+
+>>> numbers = read_numbers(RunFolder.open("runs/demo"))
+>>> numbers.summary, numbers.tiles, numbers.steps[-1].mean
+
+They are read from the run folder alone, of a finished or an interrupted run.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mstfilter.report.page import seconds_text
+from mstfilter.runs import RunFolder
+from mstfilter.scene import project, render
+from mstfilter.scoring import (
+    BeliefScore,
+    PauseEstimate,
+    PauseScore,
+    PauseTruth,
+    pause_metrics,
+    score_belief,
+    score_pauses,
+    shown_objects,
+    status_of,
+    weighted_coverage,
+)
+
+SLOT_TITLES = {
+    "initial": "Initial particles",
+    "transition": "Transition",
+    "proposal": "Proposal",
+    "update": "Update",
+    "resampler": "Resampling",
+    "build": "Building the resampled hypotheses",
+}
+_BASELINES = {"one blob": "quality_one_blob", "connected components": "quality_components"}
+
+
+@dataclass(frozen=True)
+class PauseNumbers:
+    """Numbers of one pause."""
+
+    info: Mapping[str, Any]  #: contents of info.json
+    seconds: Mapping[str, float]  #: contents of seconds.json
+    objects: Sequence[int]  #: number of objects of each hypothesis
+    n_distinct: int  #: number of distinct hypotheses
+    metrics: Mapping[str, float] | None  #: of `mstfilter.scoring.pause_metrics`; None without ground truth
+    in_image: float | None  #: mean quality of the outlines in the image; None without ground truth
+    image_score: PauseScore | None  #: scores in the image, with floors; None with true volumes or without true image
+    compared: Mapping[str, float]  #: mean quality of the compared runs, where it is known
+    compared_losses: Mapping[str, float]  #: log loss of the compared runs in nats, where it is known
+    belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
+    time: float  #: time of the pause in the recording
+    clip_seconds: float | None  #: time since the last pause; None for the first pause
+
+    @property
+    def weights(self) -> list[float]:
+        """Normalised weights."""
+        return list(self.info["weights"])
+
+    @property
+    def quality(self) -> Sequence[float] | None:
+        """Quality of each hypothesis; None without ground truth."""
+        return None if self.info["quality"] is None else self.info["quality"]["objects"]
+
+    @property
+    def baselines(self) -> dict[str, float]:
+        """Mean quality of the trivial baselines; empty without ground truth."""
+        return {} if self.metrics is None else {name: self.metrics[key] for name, key in _BASELINES.items()}
+
+    @property
+    def true_objects(self) -> int | None:
+        """Number of objects in the ground truth."""
+        return None if self.metrics is None else int(self.metrics["true_objects"])
+
+    @property
+    def step_seconds(self) -> float:
+        return float(sum(self.seconds.values()))
+
+    @property
+    def mean_objects(self) -> float:
+        """Mean number of objects."""
+        return float(np.mean(self.objects))
+
+    @property
+    def distinct_text(self) -> str:
+        """How many hypotheses are distinct, in words."""
+        if self.n_distinct == len(self.weights):
+            return "all distinct"
+        return "all the same" if self.n_distinct == 1 else f"{self.n_distinct} distinct"
+
+    @property
+    def mean(self) -> float | None:
+        """Mean quality over the hypotheses, each counted once; None without ground truth."""
+        return None if self.quality is None else float(np.mean(self.quality))
+
+    @property
+    def best(self) -> float | None:
+        """Quality of the best hypothesis; None without ground truth."""
+        return None if self.quality is None else max(self.quality)
+
+    def parents(self, kind: str) -> list[int] | None:
+        """``"previous"`` or ``"proposed"`` parents; None if they were not recorded."""
+        return self.info["parents"].get(kind)
+
+    def notes(self, slot: str) -> Mapping[str, Any]:
+        """Notes of a component, without those that it only passed on from an earlier one."""
+        notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
+        earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
+        return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
+
+
+@dataclass(frozen=True)
+class RunNumbers:
+    """Numbers of a run."""
+
+    description: Mapping[str, Any]
+    steps: Sequence[PauseNumbers] = field(default_factory=tuple)
+
+    @property
+    def title(self) -> str:
+        """Name of the recording."""
+        return str(self.description["recording"]["name"])
+
+    @property
+    def status(self) -> str:
+        """Status of the run: running, interrupted, failed, done."""
+        return str(self.description["status"])
+
+    @property
+    def truth_users(self) -> list[str]:
+        """Classes of the components that use the ground truth."""
+        return list(self.description["uses_truth"])
+
+    @cached_property
+    def slots(self) -> list[str]:
+        """Slots with times or notes, in the order of a step."""
+        used = {s for step in self.steps for s in (*step.seconds, *step.info["notes"])}
+        return [s for s in SLOT_TITLES if s in used] + sorted(used - set(SLOT_TITLES))
+
+    def component(self, slot: str) -> str:
+        """Name of the component of a slot; empty if unknown."""
+        part = self.description["config"].get(slot)
+        name = part.get("component", "") if isinstance(part, Mapping) else part
+        return str(name).rsplit(":", 1)[-1] if name else ""
+
+    @property
+    def with_truth(self) -> list[int]:
+        """Pauses whose quality is known."""
+        return [t for t, step in enumerate(self.steps) if step.quality is not None]
+
+    @property
+    def with_images(self) -> list[int]:
+        """Pauses whose quality is known in the image only."""
+        return [t for t, step in enumerate(self.steps) if step.image_score is not None]
+
+    @property
+    def compared(self) -> list[str]:
+        """Names of the compared runs whose quality is known."""
+        return list(dict.fromkeys(name for step in self.steps for name in step.compared))
+
+    @property
+    def value_of_the_past(self) -> list[str]:
+        """What the filter gains over the latest image alone, in a sentence; empty without such a run or truth."""
+        name = "single frame"
+        known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
+        if not known:
+            return []
+        quality = float(np.mean([s.mean for s in known])), float(np.mean([s.compared[name] for s in known]))
+        losses = [s.belief.row["log_loss"] for s in known if s.belief is not None]
+        loss = float(np.mean(losses)), float(np.mean([s.compared_losses[name] for s in known]))
+        verdict = {
+            (True, True): "Earlier images help on this recording",
+            (False, False): "Earlier images do not help on this recording",
+        }.get((quality[0] > quality[1], loss[0] < loss[1]), "Earlier images help in one of two scores here")
+        return [
+            f"{verdict}: over the pauses after the first, mean quality is {quality[0]:.3f} with them and "
+            f"{quality[1]:.3f} from each image alone (higher is better); log loss is {loss[0]:.3f} and {loss[1]:.3f} "
+            "nats (lower is better)."
+        ]
+
+    @property
+    def summary(self) -> list[str]:
+        """The run in one to six sentences."""
+        planned = len(self.description["recording"]["pauses"])
+        done = len(self.steps)
+        sentences = []
+        if self.status != "done":
+            verbs = {"running": "has not ended", "interrupted": "was interrupted", "failed": "failed"}
+            sentences.append(f"The run {verbs[self.status]}: {done} of {planned} pauses are complete.")
+        if not done:
+            return sentences or ["The run has no pauses."]
+        sentences += self.value_of_the_past
+        last = self.steps[-1]
+        n = len(last.weights)
+        same = "" if last.n_distinct == n else f" ({last.distinct_text})"
+        objects = sorted(set(last.objects))
+        count = _count(objects[0], "object") if len(objects) == 1 else f"{objects[0]} to {objects[-1]} objects"
+        truth = "" if last.true_objects is None else f"; the ground truth has {last.true_objects}"
+        hypotheses = _count(n, "hypothesis", "hypotheses")
+        sentences.append(f"{hypotheses}{same} after {_count(done, 'pause')}, with {count}{truth}.")
+        if last.mean is not None:
+            others = [f"{name} {value:.2f}" for name, value in last.compared.items()]
+            baselines = [f"{name} {value:.2f}" for name, value in last.baselines.items()]
+            beside = f" Beside it: {', '.join(others)}." if others else ""
+            sentences.append(
+                f"Their mean quality is {last.mean:.2f} of 1.{beside} Trivial baselines: {', '.join(baselines)}."
+            )
+            if last.mean <= max(last.baselines.values()) + 0.005:
+                sentences.append("That is no better than the baselines.")
+        if last.image_score is not None:
+            one = last.image_score
+            sentences.append(
+                f"In the image, where hidden parts do not count, their mean quality is {one.mean:.2f} of 1. Trivial "
+                f"baselines: one blob {one.one_blob:.2f}, connected components {one.components:.2f}."
+            )
+        if last.belief is not None:
+            sentences.append(
+                "Asked whether two voxels belong to one object, the weighted set has a log loss of "
+                f"{last.belief.row['log_loss']:.2f} nats; a forecast that knows only "
+                f"how often the answer is yes has {last.belief.base_rate_loss:.2f}."
+            )
+        return sentences
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the quality of the last pause with ground truth is what it is, in sentences."""
+        if not self.with_truth:
+            return []
+        step = self.steps[self.with_truth[-1]]
+        m, mean = step.metrics, step.mean
+        assert m is not None and mean is not None
+        percent = {name: f"{100 * m[f'volume_{name}']:.0f} %" for name in ("missed", "invented")}
+        sentences = [
+            "Quality is the volume that a hypothesis and the truth share: the intersection over union of each object "
+            "with its best match, weighted by volume, in both directions. Parts that no image shows count as much as "
+            "visible ones.",
+            f"In the image the outlines overlap with a quality of {step.in_image:.2f}; in the volume it is "
+            f"{mean:.2f}. An image shows only the front of an object; the rest is completed. Compared with the true "
+            f"volume, {percent['missed']} is missed and {percent['invented']} is invented.",
+            "Small errors of shape cost much: a cube of ten voxels that is one voxel too large on each side has "
+            "(10 / 12)³ = .58.",
+        ]
+        kinds = {"visible": "visible", "hidden": "hidden, seen before", "unseen": "never seen"}
+        parts = [f"{m[f'n_{k}']:.0f} {text} {m[f'quality_{k}']:.2f}" for k, text in kinds.items() if m[f"n_{k}"]]
+        if len(parts) > 1:
+            sentences.append(f"Coverage of the true objects by what the camera shows: {', '.join(parts)}.")
+        counts = [(m[name], name) for name in ("split", "merged", "missed", "invented") if m[name] >= 0.05]
+        wrong = ", ".join(f"{n:.1f} {name}" for n, name in counts)
+        end = f"objects on average: {wrong}." if wrong else "no object is split, merged, missed or invented."
+        return [*sentences, f"Wrong {end}" if wrong else f"Beyond shape, {end}"]
+
+    @property
+    def tiles(self) -> list[tuple[str, str, str]]:
+        """Key numbers of the last pause: name, value, remark."""
+        if not self.steps:
+            return []
+        last = self.steps[-1]
+        n = len(last.weights)
+        truth = "" if last.true_objects is None else f", true {last.true_objects}"
+        tiles = [
+            ("hypotheses", str(n), last.distinct_text),
+            ("objects", f"{last.mean_objects:.1f}", f"mean{truth}"),
+        ]
+        if last.mean is not None:
+            tiles.append(
+                ("mean quality", f"{last.mean:.3f}", f"best {last.best:.3f}, in the image {last.in_image:.3f}")
+            )
+        if last.image_score is not None:
+            one = last.image_score
+            tiles.append(("quality in the image", f"{one.mean:.3f}", f"best {one.best:.3f}"))
+        if last.belief is not None:
+            row = last.belief.row
+            remark = (
+                f"nats; base rate {last.belief.base_rate_loss:.3f}; calibration error {row['calibration_error']:.3f}"
+            )
+            tiles.append(("log loss", f"{row['log_loss']:.3f}", remark))
+        remark = f"of {last.info['n_candidates']} candidates; {last.n_distinct} of {n} kept are distinct"
+        tiles.append(("effective sample size", f"{last.info['ess']:.3g}", remark))
+        if len(self.steps) > 1:
+            tiles.append(("unique ancestors", str(last.info["unique_ancestors"]), f"of {n} particles"))
+        seconds = [step.step_seconds for step in self.steps]
+        slowest = f"slowest {seconds_text(max(seconds))}"
+        tiles.append(("time per step", seconds_text(float(np.mean(seconds))), slowest))
+        return tiles
+
+
+def _count(n: int, one: str, several: str = "") -> str:
+    return f"{n} {one if n == 1 else several or one + 's'}"
+
+
+def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
+    """Numbers of a run folder; without `beliefs`, the log losses are left out, which take the most time."""
+    description = run.description
+    times = description["recording"]["times"]
+    steps = []
+    shown: set[int] = set()  # true objects that an image has shown
+    for t in range(run.n_pauses):
+        info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
+        questions = run.questions(t) if beliefs else None
+        belief = None
+        if questions is not None and truth is not None:
+            belief = score_belief(questions, hypotheses, info["weights"], truth)
+        metrics, in_image = None, None
+        if truth is not None:
+            labels, weights = [h.labels for h in hypotheses], np.array(info["weights"], float)
+            grid, camera = hypotheses[0].grid, run.camera(t)
+            seen = render(truth, grid, camera).labels
+            visible = shown_objects(seen)
+            metrics = pause_metrics(labels, weights, truth, status_of(truth, visible, shown))[0]
+            shown |= visible
+            in_image = float(np.mean([weighted_coverage(project(h, camera), seen) for h in hypotheses]))
+        beside, losses = {}, {}
+        for name, other in run.compared().items():
+            if t >= other.n_pauses or (q := other.info(t)["quality"]) is None:
+                continue
+            beside[name] = float(np.mean(q["objects"]))
+            if questions is not None and truth is not None:
+                score = score_belief(questions, other.hypotheses(t), other.info(t)["weights"], truth)
+                losses[name] = float(score.row["log_loss"])
+        steps.append(
+            PauseNumbers(
+                info=info,
+                seconds=run.seconds(t),
+                objects=[h.n_objects for h in hypotheses],
+                n_distinct=len({h.key for h in hypotheses}),
+                metrics=metrics,
+                in_image=in_image,
+                image_score=None if truth is not None else _image_score(run, t),
+                compared=beside,
+                compared_losses=losses,
+                belief=belief,
+                time=float(times[t]),
+                clip_seconds=None if t == 0 else float(times[t]) - float(times[t - 1]),
+            )
+        )
+    return RunNumbers(description, tuple(steps))
+
+
+def _image_score(run: RunFolder, t: int) -> PauseScore | None:
+    """Scores of pause `t` in the image, in the form ``objects``; None without a true label image."""
+    image = run.instance(t)
+    if image is None:
+        return None
+    hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
+    estimate = PauseEstimate(hypotheses, weights, t, hypotheses[0].grid)
+    scores = score_pauses([estimate], [PauseTruth(image, t, camera=run.camera(t))])
+    return next(score for score in scores if score.form == "objects")

@@ -1,0 +1,136 @@
+"""What is shown at the pauses of a run or a recording: for the report, the page that can be rotated, and rerun.
+
+>>> scenes = scenes_of_run(RunFolder.open("runs/demo"))
+>>> view = scenes[-1].views[0]                        # the heaviest hypothesis of the last pause
+>>> view.name, view.weight, view.overlay(scenes[-1].camera, 1, 2)
+
+Each hypothesis comes with its name, its weight and quality, and the colours of its objects (`report.identities`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from mstfilter.report.identities import TRUTH, Identities, assign_identities, heaviest, names_of, weigh_distinct
+from mstfilter.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
+from mstfilter.runs import RunFolder
+from mstfilter.scene import Camera, Frame, Hypothesis, Recording, VoxelGrid, project
+
+_MOST_VIEWS = 12  # hypotheses of a pause
+
+
+@dataclass(frozen=True)
+class ShownHypothesis:
+    """A hypothesis, the truth, or the heaviest hypothesis of another run, at a pause."""
+
+    name: str
+    text: str
+    hypothesis: Hypothesis
+    identity: Mapping[int, int]  #: label -> identity, which sets the colour
+    weight: float | None = None  #: None for the truth and other runs
+    colours: Mapping[int, Colour] = field(default_factory=dict)  #: in place of those of the identities
+    quality: float | None = None
+
+    def colour(self, label: int) -> Colour:
+        """Colour of an object."""
+        return self.colours.get(label) or colour(self.identity.get(label, -1))
+
+    @cached_property
+    def volumes(self) -> dict[int, int]:
+        """Number of voxels of each label."""
+        return self.hypothesis.volumes()
+
+    def overlay(self, camera: Camera, scale: int, line: int) -> str:
+        """The objects in the image of a camera as a data URI, with the arguments of `overlay_layer`."""
+        colours = {label: self.colour(label) for label in self.volumes}
+        image = project(self.hypothesis, camera)
+        return data_uri(png_bytes(overlay_layer(image, colours, scale=scale, line=line)))
+
+    def voxels(self, view: Camera) -> str:
+        """The voxels from a viewpoint as a data URI."""
+        colours = {label: self.colour(label) for label in self.volumes}
+        return data_uri(png_bytes(voxel_picture(self.hypothesis.labels, self.hypothesis.grid, view, colours)))
+
+
+@dataclass(frozen=True)
+class ShownPause:
+    """What is shown at a pause."""
+
+    name: str
+    views: Sequence[ShownHypothesis]
+    time: float = 0.0
+    image: np.ndarray | None = None
+    camera: Camera | None = None
+    links: Sequence[tuple[int, int]] = ()  #: (view of the last pause, view) where one descends from the other
+    hidden: float = 0.0  #: weight of the hypotheses that are not shown
+    others: Sequence[ShownHypothesis] = ()  #: of the runs that are compared
+
+
+def scenes_of_run(run: RunFolder) -> list[ShownPause]:
+    """The pauses of a run: distinct hypotheses from heavy to light (at most twelve), then the truth."""
+    identities, times = assign_identities(run), run.description["recording"]["times"]
+    scenes: list[ShownPause] = []
+    view_of: dict[int, int] = {}
+    for t in range(run.n_pauses):
+        info, hypotheses, earlier = run.info(t), run.hypotheses(t), view_of
+        views, view_of = [], {}
+        groups = weigh_distinct(hypotheses, info["weights"])
+        for v, (members, weight) in enumerate(groups[:_MOST_VIEWS]):
+            k = members[0]
+            quality = None if info["quality"] is None else info["quality"]["objects"][k]
+            text = f"weight {weight:.2f}" + ("" if quality is None else f", quality {quality:.2f}")
+            identity = identities.of(t, k)
+            views.append(ShownHypothesis(names_of(members), text, hypotheses[k], identity, weight, quality=quality))
+            view_of |= dict.fromkeys(members, v)
+        parents = enumerate(info["parents"].get("previous") or ())
+        links = {(earlier[p], view_of[k]) for k, p in parents if p in earlier and k in view_of}
+        truth = run.truth(t)
+        if truth is not None:
+            known = Hypothesis.from_labels(truth, hypotheses[0].grid)
+            views.append(ShownHypothesis("truth", "", known, identities.of(t, TRUTH)))
+        hidden, others = float(sum(weight for _, weight in groups[_MOST_VIEWS:])), _others(run, t, identities)
+        named = f"pause {t}", views, float(times[t])
+        scenes.append(ShownPause(*named, run.rgb(t), run.camera(t), sorted(links), hidden, others))
+    return scenes
+
+
+def _others(run: RunFolder, t: int, identities: Identities) -> list[ShownHypothesis]:
+    """The heaviest hypothesis of each compared run that has the pause."""
+    found = []
+    for name, other in run.compared().items():
+        if t < other.n_pauses:
+            best, scores = int(np.argmax(other.info(t)["weights"])), other.info(t)["quality"]
+            quality = None if scores is None else scores["objects"][best]
+            found.append(ShownHypothesis(name, "", heaviest(other, t), identities.of(t, name), quality=quality))
+    return found
+
+
+def scenes_of_recording(recording: Recording) -> list[ShownPause]:
+    """The pauses of a recording with the truth; without it with the surface that the camera sees."""
+    scenes = []
+    for t, clip in enumerate(recording.clips()):
+        truth, frame = recording.truth(t), clip.after
+        if truth is None:
+            view = _surface(frame, clip.grid)
+        else:
+            known = Hypothesis.from_labels(truth, clip.grid)
+            view = ShownHypothesis("truth", "", known, {k: k - 1 for k in known.volumes()})
+        scenes.append(ShownPause(f"pause {t}", [view], recording.times[recording.pauses[t]], frame.rgb, frame.camera))
+    return scenes
+
+
+def _surface(frame: Frame, grid: VoxelGrid) -> ShownHypothesis:
+    """Voxels that contain a measured point, in its colour, rounded to six levels a channel."""
+    points, rgb = frame.points[frame.valid], frame.rgb[frame.valid]
+    index = grid.index_of(points)
+    inside = grid.contains(index)
+    level = (rgb[inside] // 43).astype(np.uint16)
+    labels = np.zeros(grid.shape, np.uint16)
+    labels[tuple(index[inside].T)] = 1 + level @ np.array([36, 6, 1], np.uint16)
+    hypothesis = Hypothesis.from_labels(labels, grid)
+    colours = {k: tuple(21 + 43 * ((k - 1) // d % 6) for d in (36, 6, 1)) for k in hypothesis.volumes()}
+    return ShownHypothesis("surface", "voxels that contain a measured point", hypothesis, {}, None, colours)  # type: ignore[arg-type]
