@@ -23,21 +23,20 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mstfilter.errors import InputError, naming
 from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
-from mstfilter.formats.video import RecordingFormat
+from mstfilter.formats.video import RecordingFormat, check_images
 from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
     Camera,
@@ -47,7 +46,6 @@ from mstfilter.scene import (
     Recording,
     VoxelGrid,
     as_labels,
-    check_depth,
     examine,
     find_world,
     read_depth,
@@ -81,6 +79,10 @@ class _Workspace(BaseModel):
     @classmethod
     def of(cls, grid: VoxelGrid) -> _Workspace:
         return cls(min=tuple(grid.origin.tolist()), max=tuple(grid.upper.tolist()), voxel=grid.voxel_size)
+
+    @property
+    def grid(self) -> VoxelGrid:
+        return VoxelGrid.from_bounds(np.array(self.min), np.array(self.max), self.voxel)
 
 
 class RecordingWriter:
@@ -283,7 +285,7 @@ class CameraFile(BaseModel):
 
 
 class _CameraFile(CameraFile):
-    depth_scale: float
+    depth_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     workspace: _Workspace | None = None
 
 
@@ -296,8 +298,14 @@ class _FrameEntry(BaseModel):
 
 class _Manifest(BaseModel):
     model_config = ConfigDict(extra="allow")
-    version: int
-    frames: list[_FrameEntry]
+    version: Literal[1]
+    frames: Annotated[list[_FrameEntry], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if [entry.index for entry in self.frames] != list(range(len(self.frames))):
+            raise ValueError("frame indices are not 0, 1, 2, ...")
+        return self
 
 
 def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
@@ -337,22 +345,11 @@ def _open(path: Path, pauses: PauseRule | None) -> Recording:
         )
     manifest, manifest_data = _load(path / "manifest.json", _Manifest)
     camera_file, _ = _load(path / "camera.json", _CameraFile)
-    if manifest.version != VERSION:
-        raise InputError(f"{path / 'manifest.json'}: version is {manifest.version}, expected {VERSION}")
-    if not (math.isfinite(camera_file.depth_scale) and camera_file.depth_scale > 0):
-        raise InputError(
-            f"{path / 'camera.json'}: depth_scale is {camera_file.depth_scale}, expected metres per unit > 0"
-        )
-    entries = manifest.frames
-    if [e.index for e in entries] != list(range(len(entries))):
-        raise InputError(f"{path / 'manifest.json'}: frame indices are not 0, 1, 2, ...")
-    if not entries:
-        raise InputError(f"{path / 'manifest.json'}: there are no frames")
+    entries, scale = manifest.frames, camera_file.depth_scale
 
     with reading(path / "camera.json", "a recording"):
         camera = camera_file.camera
-        w = camera_file.workspace
-        grid = None if w is None else VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
+        grid = None if camera_file.workspace is None else camera_file.workspace.grid
     times = tuple(e.time_s for e in entries)
     marked = tuple(e.index for e in entries if e.role == "static")
     if pauses is not None:
@@ -369,18 +366,10 @@ def _open(path: Path, pauses: PauseRule | None) -> Recording:
         if e.T_world_camera is not None
     }
 
-    scale = camera_file.depth_scale
-
     def read(index: int, view: Camera) -> Frame:
         name = f"{index:06d}.png"
         rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, scale)
-        for what, image in (("rgb", rgb), ("depth", depth)):
-            if image.shape[:2] != (view.height, view.width):
-                raise InputError(
-                    f"image {path / what / name} is {image.shape[1]} x {image.shape[0]}, "
-                    f"camera.json says {view.width} x {view.height}"
-                )
-        check_depth(depth, f"depth image {path / 'depth' / name} with depth_scale {scale:g}")
+        check_images(rgb, depth, view, scale, f"frame {index} of {path}")
         robot_path = path / "robot" / name
         robot = read_labels(robot_path) > 0 if robot_path.exists() else None
         return Frame(rgb, depth, view, robot)

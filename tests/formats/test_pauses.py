@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -161,7 +162,7 @@ def test_still_intervals_of_a_simulated_recording():
     """
     from mstfilter.simulation import SimulatedScene, advance_push, finish_push, scene_family
 
-    family = scene_family("demo")
+    family = replace(scene_family("demo"), n_actions=2, supersample=False)
     scene = SimulatedScene(family, seed=3)
     images, pause_of = [], []
 

@@ -139,7 +139,10 @@ FAULTS = {
         lambda f: change(f, "manifest.json", lambda m: [e.update(role="action") for e in m["frames"]]),
         "no frame has role static",
     ),
-    "other version": (lambda f: change(f, "manifest.json", lambda m: m.update(version=9)), "version is 9"),
+    "other version": (
+        lambda f: change(f, "manifest.json", lambda m: m.update(version=9)),
+        "version: input should be 1, found 9",
+    ),
     "ragged K": (camera(K=[[1, 2], [3]]), "K"),
     "workspace upside down": (workspace_of([1] * 3, [0] * 3), "has no voxel"),
     "workspace in mm": (workspace_of([-500] * 3, [500] * 3), "too large"),
