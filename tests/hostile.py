@@ -124,7 +124,7 @@ def _draw_run(path: Path) -> None:
 
 def _write_preset(path: Path) -> None:
     path.mkdir()
-    text = 'base = "mst"\nn = 5\noverrides = ["resampler=systematic"]\n[update]\ncomponent = "partition"\n'
+    text = 'base = "mst"\nn = 5\nresampler = "systematic"\n[update]\ncomponent = "partition"\n'
     (path / "mine.toml").write_text(text, encoding="utf-8")
 
 

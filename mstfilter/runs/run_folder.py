@@ -153,6 +153,10 @@ class _InfoFile(BaseModel):
         return self
 
 
+class _PosedCamera(CameraFile):
+    T_world_camera: list[list[float]]
+
+
 class _SecondsFile(RootModel[dict[str, float]]):
     pass
 
@@ -365,7 +369,7 @@ class RunFolder:
         """Camera at a pause."""
         path = self.pause(t) / "camera.json"
         with reading(path, "a run folder"):
-            return CameraFile.model_validate(self._read(path, CameraFile)).camera
+            return _PosedCamera.model_validate(self._read(path, _PosedCamera)).camera
 
     def truth(self, t: int) -> np.ndarray | None:
         """True labels (X, Y, Z) at a pause; None if unknown."""
