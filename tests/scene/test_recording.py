@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,11 +78,19 @@ def test_true_poses_are_read_and_invalid_ones_raise_an_error(tmp_path):
             open_recording(tmp_path / "r").poses(0)
 
 
-def test_a_failed_writer_leaves_no_files(tmp_path):
+def test_a_failed_writer_leaves_no_files(tmp_path, monkeypatch):
+    images = table_scene()[:2]
     with pytest.raises(RuntimeError), RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
-        rgb, depth, _ = table_scene()
-        writer.add_frame(rgb, depth, 0.0, "static")
+        writer.add_frame(*images, 0.0, "static")
         raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+    def full(self, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "rename", full)
+    with pytest.raises(InputError, match="No space left"), RecordingWriter(tmp_path / "r", CAMERA) as writer:
+        writer.add_frame(*images, 0.0, "static")
     assert list(tmp_path.iterdir()) == []
 
 
