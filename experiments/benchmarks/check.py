@@ -15,7 +15,7 @@ import numpy as np
 from mstfilter.presets import REGISTRY
 from mstfilter.testing import run_contract
 
-SCHEMES = ("systematic", "multinomial", "residual", "ssp", "killing", "fearnhead_clifford", "clusters", "kdpp")
+SCHEMES = ("systematic", "multinomial", "residual", "ssp", "killing", "fearnhead_clifford", "clusters")
 
 
 def main() -> None:

@@ -177,7 +177,7 @@ def resampled_posterior(log_likelihood):
 def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
     basic = {
         **{name: getattr(smc, name)() for name in ("Multinomial", "Stratified", "Systematic", "Residual", "Ssp")},
-        **{name: getattr(smc, name)() for name in ("Killing", "Rejection", "FearnheadClifford", "Chopthin")},
+        **{name: getattr(smc, name)() for name in ("Killing", "FearnheadClifford", "Chopthin")},
         "Residual, stratified": smc.Residual("stratified"),
         "Residual, systematic": smc.Residual("systematic"),
         "Chopthin, 20": smc.Chopthin(20.0),
@@ -198,13 +198,10 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
         yield f"largest of {example.__name__}", smc.LargestWeights(), example, None
         yield f"coalesced of {example.__name__}", smc.Coalesced(), example, None
     for example in (numbers, vectors, mapping):
-        yield f"k-DPP of {example.__name__}", smc.KDpp(), example, None
-        yield f"greedy of {example.__name__}", smc.GreedyDiverse(), example, None
         yield f"clusters of {example.__name__}", smc.ClusterStratified(), example, None
         yield f"Hilbert sort of {example.__name__}", smc.Sorted(), example, None
     for example in (numbers, vectors):
         yield f"transform of {example.__name__}", smc.EnsembleTransform(), example, None
-    yield "Metropolis", smc.Metropolis(), numbers, None
     yield "keep weights", smc.KeepWeights(), numbers, None
 
 

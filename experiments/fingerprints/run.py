@@ -29,7 +29,7 @@ from mstfilter.smc import Population, Proposal, Transition, Update
 SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 SCHEMES = ("multinomial", "stratified", "systematic", "residual", "ssp", "killing", "fearnhead_clifford")
-SCHEMES += ("clusters", "kdpp", "greedy_diverse", "coalesced", "tempered", "shuffled")
+SCHEMES += ("clusters", "coalesced", "tempered", "shuffled")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
-For the resamplers of `mstfilter.smc` that compare particles: ``KDpp(similarity=WeightedCoverage())``,
+For the resamplers of `mstfilter.smc` that compare particles: ``ClusterStratified(similarity=WeightedCoverage())``,
 ``Coalesced(equivalence=SameSegmentation())``.
 
 In the common refinement of several segmentations, a cell holds the voxels (or pixels) that belong to the same object

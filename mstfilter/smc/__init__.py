@@ -13,6 +13,7 @@
                         `State` and `Info`
 `inputs`                time and inputs of models: `WithInput`, an observation with an input
 `population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
+`inverse_cdf`           indices drawn by weight, which all schemes share
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights
 `transport_resampling`  wrappers of schemes, sorted particles, transport
@@ -57,14 +58,10 @@ __components__ = {
         "systematic": "Systematic",
         "ssp": "Ssp",
         "killing": "Killing",
-        "rejection": "Rejection",
-        "metropolis": "Metropolis",
         "largest_weights": "LargestWeights",
         "fearnhead_clifford": "FearnheadClifford",
         "chopthin": "Chopthin",
         "clusters": "ClusterStratified",
-        "kdpp": "KDpp",
-        "greedy_diverse": "GreedyDiverse",
         "ensemble_transform": "EnsembleTransform",
         "coalesced": "Coalesced",
         "tempered": "Tempered",

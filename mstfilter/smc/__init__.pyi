@@ -50,8 +50,6 @@ from mstfilter.smc.diverse_resampling import (
     ClusterStratified as ClusterStratified,
     FearnheadClifford as FearnheadClifford,
     Gaussian as Gaussian,
-    GreedyDiverse as GreedyDiverse,
-    KDpp as KDpp,
 )
 from mstfilter.smc.evaluation import (
     Coalescence as Coalescence,
@@ -131,9 +129,7 @@ from mstfilter.smc.programs.sites import (
 from mstfilter.smc.resampling import (
     Killing as Killing,
     LargestWeights as LargestWeights,
-    Metropolis as Metropolis,
     Multinomial as Multinomial,
-    Rejection as Rejection,
     Residual as Residual,
     Ssp as Ssp,
     Stratified as Stratified,

@@ -35,11 +35,12 @@ from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
+from mstfilter.smc.inverse_cdf import draw_rows, independent_draws
 from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
 from mstfilter.smc.programs.sites import PerParticle
-from mstfilter.smc.resampling import Multinomial, independent_draws
+from mstfilter.smc.resampling import Multinomial
 from mstfilter.smc.state_space import Dynamics, GuidedInitial, GuidedTransition, Prior
 from mstfilter.smc.streams import Key, child
 
@@ -331,11 +332,7 @@ def _drawn(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = No
     top = log_weights.max(axis=1, keepdims=True)
     if not np.isfinite(top).all():
         raise _impossible(t)
-    cumulative = np.cumsum(np.exp(log_weights - top), axis=1)
-    points = rng.random((len(cumulative), 1)) * cumulative[:, -1:]
-    # The index is the number of entries at or below the point; "at" skips weights of zero.
-    index = (cumulative <= points).sum(axis=1)
-    return np.minimum(index, (cumulative < cumulative[:, -1:]).sum(axis=1))
+    return draw_rows(np.exp(log_weights - top), rng.random(len(log_weights)))
 
 
 def _impossible(t: int | None) -> InputError:

@@ -10,7 +10,7 @@ from mstfilter.fusion.similarity import SameSegmentation, WeightedCoverage, cano
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.smc import Coalesced, KDpp, Population
+from mstfilter.smc import ClusterStratified, Coalesced, Population
 from mstfilter.testing import scene_example
 
 GRID = VoxelGrid(np.zeros(3), 0.01, (6, 5, 4))
@@ -67,9 +67,9 @@ def test_resamplers_of_hypotheses():
     assert merged.notes["distinct"] == 7
     classes = SameSegmentation().classes(merged.particles)
     assert len(set(classes.tolist())) == len(merged) == 4
-    chosen = KDpp(similarity=WeightedCoverage()).resample(rng, population, 3)
+    chosen = ClusterStratified(WeightedCoverage()).resample(rng, population, 3)
     assert len(set(SameSegmentation().classes(chosen.particles).tolist())) == 3
-    assert chosen.notes["kdpp"].endswith("of 3")
+    assert len(chosen) == 3 <= chosen.notes["clusters"]
 
 
 def test_diverse_resampling_from_configuration():
@@ -77,10 +77,10 @@ def test_diverse_resampling_from_configuration():
     config = {
         "component": "coalesced",
         "equivalence": "same_segmentation",
-        "scheme": {"component": "kdpp", "similarity": {"component": "weighted_coverage", "stride": 2}},
+        "scheme": {"component": "clusters", "similarity": {"component": "weighted_coverage", "stride": 2}},
     }
     scheme = REGISTRY.build("resampler", config)
-    assert scheme == Coalesced(KDpp(WeightedCoverage(2)), SameSegmentation())
+    assert scheme == Coalesced(ClusterStratified(WeightedCoverage(2)), SameSegmentation())
     assert REGISTRY.build("resampler", REGISTRY.describe(scheme)) == scheme
     population, _ = scene_example(np.random.default_rng(0), 40)
     chosen = scheme.resample(np.random.default_rng(1), population, 3)

@@ -24,7 +24,6 @@ from mstfilter.smc import (
     EssBelow,
     FearnheadClifford,
     Gaussian,
-    KDpp,
     Never,
     Normal,
     Residual,
@@ -41,13 +40,11 @@ SCHEMES = sorted(smc.__components__["resampler"])
 SEEING = {
     "clusters": ClusterStratified(Gaussian(0.5)),
     "clusters, optimal": ClusterStratified(Gaussian(0.5), 0.5, FearnheadClifford()),
-    "kdpp": KDpp(Gaussian(0.3)),
     "fearnhead_clifford": FearnheadClifford(),
     "tempered optimal": Tempered(FearnheadClifford(), 0.5),
     "coalesced": Coalesced(),
 }
-# Rejection has the law of killing: test_exact_laws.py. Objects have no position to sort by.
-PLAIN = [name for name in SCHEMES if name not in {*SEEING, "rejection"}]
+PLAIN = [name for name in SCHEMES if name not in SEEING]
 TRIGGERS = pytest.mark.parametrize("trigger", [Always(), EssBelow(0.5)], ids=lambda t: type(t).__name__)
 
 
@@ -102,9 +99,7 @@ def test_kalman_where_schemes_choose(name):
     )
     _, infos = filter.run(FAR, 0)
     assert [info.resampled for info in infos] == [False, True, True]
-    if name == "kdpp":
-        assert "fallback" not in infos[-1].notes["resampler"]["kdpp"]
-    is_unbiased(filter, FAR, exact_mild(FAR), 1110 if name == "kdpp" else 670)
+    is_unbiased(filter, FAR, exact_mild(FAR), 670)
 
 
 @pytest.mark.parametrize("trigger", [Always(), EssBelow(0.95)], ids=lambda t: type(t).__name__)
