@@ -22,6 +22,7 @@
 `batching`              many runs of a filter at once
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
+`metropolis`            Metropolis-Hastings steps of many chains; the move of resample-move filters
 `exact`                 linear-Gaussian and finite models with exact answers, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; adapters for those of scipy and torch

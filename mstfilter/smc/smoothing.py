@@ -36,6 +36,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
 from mstfilter.smc.inverse_cdf import draw_rows, independent_draws
+from mstfilter.smc.metropolis import metropolis
 from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
@@ -202,16 +203,17 @@ class _Move:
 
     def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int, n_draws: int) -> np.ndarray:
         """(n, n_draws) states of chains that start at the parents, every `steps` steps."""
-        index, density, draws = parents, self.log_density(parents), []
+        density = self.log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
-        for _ in range(n_draws):
-            for _ in range(steps):
-                new = _by_weight(rng, self.population, len(index))
-                found = self.log_density(new)
-                yes = found - density > -rng.standard_exponential(len(new))  # minus the log of a uniform
-                index, density = np.where(yes, new, index), np.where(yes, found, density)
-            draws.append(index)
+
+        def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
+            index = _by_weight(rng, self.population, len(parents))
+            density = self.log_density(index)
+            return {"index": index, "density": density}, density - now["density"]
+
+        chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * n_draws)
+        draws = [state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0]
         return np.stack(draws, axis=1)
 
     def rejected(self, rng: np.random.Generator, n: int, log_bound: float) -> np.ndarray:

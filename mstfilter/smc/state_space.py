@@ -22,9 +22,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.errors import InputError
 from mstfilter.smc.components import EssBelow, Reweight
-from mstfilter.smc.distributions import as_distribution, hypothetical
+from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep, step_parameters, with_step
 from mstfilter.smc.interfaces import (
@@ -36,7 +36,7 @@ from mstfilter.smc.interfaces import (
     Resampler,
     Trigger,
 )
-from mstfilter.smc.population import Particles, Population, count_particles
+from mstfilter.smc.population import Population, count_particles
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Rows
 
@@ -242,76 +242,6 @@ class PriorityLookahead(Lookahead):
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         return self.function(population.particles, observation)
-
-
-@dataclass(frozen=True)
-class RandomWalkMove(Rejuvenation):
-    """Metropolis steps with Gaussian increments on an array of particles; ``notes["accepted"]`` is their rate.
-
-    After a resampling several particles share a parent. The move separates them by a Markov kernel that leaves
-    p(x_t | x_{t-1}, y_t) invariant; the weights do not change.
-
-    Parameters
-    ----------
-    model : StateSpaceModel
-        With its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of such.
-    scale : float or array_like
-        Standard deviation of a step, in the units of the state. Fixed, so that the evidence is unbiased.
-    steps : int
-        Metropolis steps per move.
-    """
-
-    model: StateSpaceModel
-    scale: Any = 1.0
-    steps: int = 1
-    step_functions: ClassVar = {"model": None}
-
-    def __post_init__(self) -> None:
-        check_component("model", self.model, StateSpaceModel)
-        check_integer("steps", self.steps)
-        scale = np.asarray(self.scale, dtype=np.float64)
-        if not (np.isfinite(scale).all() and (scale > 0).all()):
-            raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")
-
-    def move(
-        self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
-    ) -> Population:
-        def log_target(x: Any) -> np.ndarray:
-            if previous is None:
-                prior = self.model.density("log_initial")(x)
-            else:
-                prior = self.model.density("log_transition")(previous.particles, x)
-            return prior if observation is None else prior + self.model.log_likelihood(x, observation)
-
-        x, taken = population.particles, 0
-        current = log_target(x)
-        for _ in range(self.steps):
-            new = self._step(rng, x)
-            with hypothetical():
-                proposed = log_target(new)
-            with np.errstate(invalid="ignore"):
-                yes = accept_moves(rng, proposed - current)
-            x, current = choose_rows(yes, new, x), np.where(yes, proposed, current)
-            taken += int(yes.sum())
-        share = taken / (self.steps * len(population))
-        return Population(x, population.log_weights, population.parents, {"accepted": share})
-
-    def _step(self, rng: np.random.Generator, x: Particles) -> Particles:
-        if isinstance(x, np.ndarray):
-            return x + self.scale * rng.standard_normal(x.shape)
-        return {name: self._step(rng, a) for name, a in x.items()}
-
-
-def accept_moves(rng: np.random.Generator, log_ratio: np.ndarray) -> np.ndarray:
-    """(n,) bool: Metropolis-Hastings decisions; a ratio of NaN (both states impossible) is rejected."""
-    return np.log1p(-rng.random(len(log_ratio))) < log_ratio
-
-
-def choose_rows(accepted: np.ndarray, new: Particles, old: Particles) -> Particles:
-    """Rows of `new` where `accepted` is True, else of `old`."""
-    if isinstance(old, np.ndarray):
-        return np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-    return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
 
 
 def bootstrap(
