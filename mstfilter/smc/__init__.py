@@ -23,7 +23,8 @@
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
 `metropolis`            Metropolis-Hastings steps of many chains; the move of resample-move filters
-`exact`                 linear-Gaussian and finite models with exact answers, Rao-Blackwellised filters
+`exact`                 linear-Gaussian and finite models with exact answers
+`gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; adapters for those of scipy and torch
 `smoothing`             states given all observations, paths of states by conditional SMC

@@ -61,20 +61,22 @@ from mstfilter.smc.evaluation import (
     set_energy_score as set_energy_score,
 )
 from mstfilter.smc.exact import (
-    ConditionallyLinear as ConditionallyLinear,
     Kalman as Kalman,
-    Linear as Linear,
     Marginals as Marginals,
-    ekf_proposal as ekf_proposal,
     forward_backward as forward_backward,
     hidden_markov as hidden_markov,
     kalman_filter as kalman_filter,
     linear_gaussian as linear_gaussian,
+)
+from mstfilter.smc.filter import ParticleFilter as ParticleFilter
+from mstfilter.smc.gaussian import (
+    ConditionallyLinear as ConditionallyLinear,
+    Linear as Linear,
+    ekf_proposal as ekf_proposal,
     nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
     ukf_proposal as ukf_proposal,
 )
-from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.inference import (
     Chains as Chains,
     TemperedSample as TemperedSample,
