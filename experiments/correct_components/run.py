@@ -233,7 +233,7 @@ def transitions() -> Iterator[tuple[str, Any, Any, Any]]:
     model = smc.linear_gaussian(F=A, Q=eye, H=eye, R=eye, m0=[0.0, 0.0], P0=eye)
     yield "linear, two dimensions", smc.Dynamics(model), vectors, None
     yield "AR(1)", smc.Dynamics(AR1), numbers, other_faults.exact_walk
-    yield "AR(1), guided", smc.GuidedTransition(AR1, optimal), numbers, other_faults.exact_moves
+    yield "AR(1), guided", smc.Dynamics(AR1, optimal), numbers, other_faults.exact_moves
     yield "user: guided", other_faults.Guided(), numbers, other_faults.exact_moves
     yield "branching", smc.Branching(smc.Dynamics(AR1), 3), numbers, None
     yield "density", other_faults.CorrectDensity(), numbers, other_faults.exact_density
@@ -244,7 +244,7 @@ def proposals() -> Iterator[tuple[str, Any, Any, Any]]:
         yield f"draws {name}", Draw(draw), numbers, None
         yield f"draws {name}, exact", Draw(draw), numbers, lambda rng, n, draw=draw: (Population(draw(rng, n)), 0.5)
     yield "AR(1)", smc.Prior(AR1), numbers, other_faults.exact_prior
-    yield "AR(1), guided", smc.GuidedInitial(AR1, optimal_initial), numbers, guided_prior
+    yield "AR(1), guided", smc.Prior(AR1, optimal_initial), numbers, guided_prior
     for component in (
         other_faults.correct_draws(),
         other_faults.correct_weighed(),

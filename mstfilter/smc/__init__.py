@@ -27,7 +27,8 @@
 `gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; adapters for those of scipy and torch
-`smoothing`             states given all observations, paths of states by conditional SMC
+`smoothing`             states given all observations
+`conditional`           paths of states by conditional SMC, one at a time
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
 `diagnostics`           quantities of a run, energy distances, comparison of filters
 `evaluation`            coalescence and variance of a run

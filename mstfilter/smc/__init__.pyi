@@ -19,6 +19,7 @@ from mstfilter.smc.components import (
     Reweight as Reweight,
     first_seen as first_seen,
 )
+from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.diagnostics import (
     History as History,
     Measured as Measured,
@@ -141,17 +142,13 @@ from mstfilter.smc.resampling import (
 from mstfilter.smc.smoothing import (
     Record as Record,
     backward_paths as backward_paths,
-    conditional_path as conditional_path,
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
     paris as paris,
-    path_log_prob as path_log_prob,
 )
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,
-    GuidedInitial as GuidedInitial,
-    GuidedTransition as GuidedTransition,
     Prior as Prior,
     PriorityLookahead as PriorityLookahead,
     StateSpaceModel as StateSpaceModel,

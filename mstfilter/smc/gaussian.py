@@ -149,12 +149,12 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
         expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
         raise InputError(f"{name} has shape {cov.shape}, expected {expected}")
     if np.allclose(cov, cov.T):
-        values, vectors = np.linalg.eigh(cov)
+        values, axes = np.linalg.eigh(cov)
         rounding = 1e-14 * max(values.max(), 0.0)
         if (values > rounding).all():
             return np.linalg.cholesky(cov), False
         if semidefinite and (values >= -rounding).all():
-            return vectors * np.sqrt(np.maximum(values, 0.0)), True
+            return axes * np.sqrt(np.maximum(values, 0.0)), True
     kind = "semidefinite" if semidefinite else "definite"
     raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive {kind}")
 
@@ -230,13 +230,13 @@ class _Correct(Update):
         y = np.atleast_1d(np.asarray(observation, dtype=np.float64))
         m = self.model.linear(p["u"])
         H, R = np.asarray(m.H, np.float64), np.asarray(m.R, np.float64)
-        predicted = (H @ p["mean"][..., None])[..., 0]
+        expected = (H @ p["mean"][..., None])[..., 0]
         S = H @ p["cov"] @ np.swapaxes(H, -1, -2) + R
-        log_p = MultivariateNormal(predicted, S).log_prob(y)
+        log_p = MultivariateNormal(expected, S).log_prob(y)
         gain = np.swapaxes(np.linalg.solve(S, H @ p["cov"]), -1, -2)
         keep = np.eye(p["mean"].shape[1]) - gain @ H
         cov = keep @ p["cov"] @ np.swapaxes(keep, -1, -2) + gain @ R @ np.swapaxes(gain, -1, -2)
-        mean = p["mean"] + (gain @ (y - predicted)[..., None])[..., 0]
+        mean = p["mean"] + (gain @ (y - expected)[..., None])[..., 0]
         particles = {"u": p["u"], "mean": mean, "cov": cov}
         return Population(particles, population.log_weights + log_p, population.parents)
 

@@ -34,6 +34,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
 from mstfilter.smc.batching import RunFilters, batched_slots, run_batch
+from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
@@ -41,7 +42,6 @@ from mstfilter.smc.interfaces import Distribution, Resampler
 from mstfilter.smc.metropolis import metropolis
 from mstfilter.smc.population import Particles, Population, take
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.smoothing import conditional_path
 from mstfilter.smc.streams import Key, rows_of
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]

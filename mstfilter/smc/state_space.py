@@ -140,86 +140,68 @@ def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     return distribution.log_prob(y)
 
 
-@dataclass(frozen=True)
-class Prior(Proposal):
-    """Draws of the initial state of a model."""
+class _OfModel(AtStep):
+    """A component that draws from a model, or from a proposal of it."""
 
     model: StateSpaceModel
-    step_functions: ClassVar = {"model": None}
+    proposal: Callable[..., Any] | None
 
     @property
     def batched(self) -> bool | None:
-        return self.model.batched
-
-    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return Population(self.model.sample_initial(rng, n))
+        """That of the model; a batch tries whether a proposal treats each particle by itself."""
+        return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
 @dataclass(frozen=True)
-class Dynamics(DensityTransition):
-    """Moves by the transition of the model."""
+class Prior(_OfModel, Proposal):
+    """First particles from p(x_0), or from a proposal q(x_0 | y_0) with weights p(x_0) / q.
 
-    model: StateSpaceModel
-    step_functions: ClassVar = {"model": None}
-
-    @property
-    def batched(self) -> bool | None:
-        return self.model.batched
-
-    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        return population.moved(self.model.sample_transition(rng, population.particles))
-
-    def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        return self.model.density("log_transition")(previous, new)
-
-
-@dataclass(frozen=True)
-class GuidedInitial(Proposal):
-    """First particles from q(x_0 | y_0), weighted by p(x_0) / q; from the prior if y_0 is missing.
-
-    ``proposal(y)`` is the distribution q; the model needs its `log_initial`.
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With `log_initial` if there is a proposal.
+    proposal : callable, optional
+        ``y -> distribution`` q. If y_0 is missing, p(x_0) is drawn.
     """
 
     model: StateSpaceModel
-    proposal: Callable[..., Any]
+    proposal: Callable[..., Any] | None = None
     step_functions: ClassVar = {"model": None, "proposal": 1}
 
-    @property
-    def batched(self) -> bool | None:
-        return None if self.model.batched else self.model.batched
-
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        if observation is None:
+        if self.proposal is None or observation is None:
             return Population(self.model.sample_initial(rng, n))
         q = as_distribution(self.proposal(observation))
         x = q.sample(rng, n)
         return Population(x, self.model.density("log_initial")(x) - q.log_prob(x))
 
+    def log_weight(self, new: Any, observation: Any) -> np.ndarray:
+        """(n,) log p(x_0) - log q(x_0 | y_0) of given particles; 0 without a proposal."""
+        if self.proposal is None or observation is None:
+            return np.zeros(count_particles(new))
+        return self.model.density("log_initial")(new) - as_distribution(self.proposal(observation)).log_prob(new)
+
 
 @dataclass(frozen=True)
-class GuidedTransition(DensityTransition):
-    """Moves by q(x_t | x_{t-1}, y_t) and adds log f - log q to the log weights; by f if y_t is missing.
+class Dynamics(_OfModel, DensityTransition):
+    """Moves by f(x_t | x_{t-1}), or by a proposal q(x_t | x_{t-1}, y_t) with weights f / q.
 
     Parameters
     ----------
     model : StateSpaceModel
-        With `log_transition`.
-    proposal : callable
+        With `log_transition` if there is a proposal.
+    proposal : callable, optional
         ``(particles, y) -> distribution`` of x_t, one row per particle. Its tails must not be lighter than those of
-        f(x_t | x_{t-1}) p(y_t | x_t).
+        f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
     """
 
     model: StateSpaceModel
-    proposal: Callable[..., Any]
+    proposal: Callable[..., Any] | None = None
     step_functions: ClassVar = {"model": None, "proposal": 2}
-
-    @property
-    def batched(self) -> bool | None:
-        return None if self.model.batched else self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         old = population.particles
-        if observation is None:
+        if self.proposal is None or observation is None:
             return population.moved(self.model.sample_transition(rng, old))
         q = as_distribution(self.proposal(old, observation))
         new = q.sample(rng, len(population))
@@ -227,10 +209,16 @@ class GuidedTransition(DensityTransition):
         return Population(new, population.log_weights + gain, population.parents)
 
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """Log density of the move: q, or f if the observation is missing."""
-        if observation is None:
+        """(n,) log density of the move: q, or f without a proposal or observation."""
+        if self.proposal is None or observation is None:
             return self.model.density("log_transition")(previous, new)
         return as_distribution(self.proposal(previous, observation)).log_prob(new)
+
+    def log_weight(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
+        """(n,) log f - log q of given moves; 0 without a proposal."""
+        if self.proposal is None or observation is None:
+            return np.zeros(count_particles(new))
+        return self.model.density("log_transition")(previous, new) - self.log_prob(previous, new, observation)
 
 
 @dataclass(frozen=True)
@@ -283,8 +271,8 @@ def guided(
     """
     return replace(
         bootstrap(model, n),
-        initial=Prior(model) if initial is None else GuidedInitial(model, initial),
-        transition=GuidedTransition(model, proposal),
+        initial=Prior(model, initial),
+        transition=Dynamics(model, proposal),
         **components,
     )
 
@@ -313,8 +301,8 @@ def auxiliary(
     """
     return replace(
         bootstrap(model, n),
-        initial=Prior(model) if initial is None else GuidedInitial(model, initial),
-        transition=Dynamics(model) if proposal is None else GuidedTransition(model, proposal),
+        initial=Prior(model, initial),
+        transition=Dynamics(model, proposal),
         lookahead=PriorityLookahead(log_priority),
         **components,
     )

@@ -13,7 +13,6 @@ from mstfilter.smc import (
     Always,
     Dynamics,
     EssBelow,
-    GuidedTransition,
     Normal,
     Population,
     PriorityLookahead,
@@ -216,10 +215,8 @@ def test_densities_of_transitions():
     old, new = np.array([0.0, 1.0]), np.array([0.5, -0.5])
     expected = stats.norm(RHO * old, SIGMA).logpdf(new)
     np.testing.assert_allclose(Dynamics(AR1).log_prob(old, new, 0.3), expected)
-    np.testing.assert_allclose(GuidedTransition(AR1, optimal).log_prob(old, new, None), expected)
-    np.testing.assert_allclose(
-        GuidedTransition(AR1, optimal).log_prob(old, new, 0.3), optimal(old, 0.3).log_prob(new)
-    )
+    np.testing.assert_allclose(Dynamics(AR1, optimal).log_prob(old, new, None), expected)
+    np.testing.assert_allclose(Dynamics(AR1, optimal).log_prob(old, new, 0.3), optimal(old, 0.3).log_prob(new))
     bare = StateSpaceModel(AR1.sample_initial, AR1.sample_transition, AR1.log_likelihood)
     with pytest.raises(InputError, match="step 1, transition: the model has no log_transition"):
         guided(bare, optimal, 5).run(YS, 0)

@@ -19,7 +19,6 @@ from mstfilter.smc import (
     Always,
     DensityTransition,
     Dynamics,
-    GuidedTransition,
     LargestWeights,
     Population,
     Proposal,
@@ -208,9 +207,7 @@ def test_the_density_of_a_proposal_would_be_seen():
     wrong = []
     for seed in range(60):
         record = keep(FILTERS["guided"], YS, seed)
-        wrong.append(
-            moments(backward_paths(np.random.default_rng(seed), record, GuidedTransition(AR1, optimal), 100))
-        )
+        wrong.append(moments(backward_paths(np.random.default_rng(seed), record, Dynamics(AR1, optimal), 100)))
     assert not agrees(wrong, N)
 
 
