@@ -130,12 +130,14 @@ def _moved(
     """The particles of a step before the update; particle 0 is the given one, with its weight."""
     component: Any
     slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
-    moved = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
-    if len(moved) != filter.n:
-        raise InputError(f"{slot} made {len(moved)} particles of {filter.n}: conditional SMC needs one for each")
+    particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
+    if len(log_weights) != filter.n:
+        raise InputError(
+            f"{slot} made {len(log_weights)} particles of {filter.n}: conditional SMC needs one for each"
+        )
     if given is None:
-        return moved
-    log_weights = np.array(moved.log_weights)
+        return Population(particles, log_weights)
+    log_weights = np.array(log_weights)
     old = None if past is None else take(past.particles, _FIRST)
     if isinstance(component, ProgramInitial | ProgramTransition):
         given, log_weights[0] = _given_to_program(component, old, given, y)
@@ -149,21 +151,25 @@ def _moved(
             "particle is not known",
             "use Prior, Dynamics or a Program",
         )
-    return Population(_with_first(moved.particles, given), log_weights)
+    return Population(_with_first(particles, given), log_weights)
 
 
-def _drawn(rng: np.random.Generator, component: Any, past: Population | None, y: Any, n: int) -> Population:
-    """The particles of a step, all drawn. A program runs without the checks of a filter."""
+def _drawn(
+    rng: np.random.Generator, component: Any, past: Population | None, y: Any, n: int
+) -> tuple[Particles, np.ndarray]:
+    """Particles and log weights of a step, all drawn. A program runs without the checks of a filter."""
     if not isinstance(component, ProgramInitial | ProgramTransition):
         if past is None:
-            return component.sample(rng, y, n)
-        return past if component is None else component.predict(rng, past, y)
-    previous, handler = None if past is None else past.particles, SampleHandler(rng)
+            moved = component.sample(rng, y, n)
+        else:
+            moved = past if component is None else component.predict(rng, past, y)
+        return moved.particles, moved.log_weights
+    previous = None if past is None else past.particles
     if component.guide is None or y is None:
-        return Population(*run_program(component.model, handler, previous, y, n))
+        return run_program(component.model, SampleHandler(rng), previous, y, n)
     guide = GuideHandler(rng, n)
     run_program(component.guide, guide, previous, y, n)
-    return Population(*run_program(component.model, ReplayHandler(guide), previous, y, n))
+    return run_program(component.model, ReplayHandler(guide), previous, y, n)
 
 
 def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:
