@@ -2,7 +2,7 @@
 
 - `inverse_cdf` takes one point in each of n equal strata: all of systematic and stratified resampling.
 - `independent_draws` takes n independent points: multinomial resampling.
-- `draw_rows` takes one point for each row of a matrix of weights.
+- `search` finds given points, and `draw_rows` takes one point for each row of a matrix of weights.
 
 >>> import numpy as np
 >>> inverse_cdf(np.array([0.5, 0.25, 0.25]), np.array([0.3]), 4)
@@ -104,7 +104,8 @@ def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     Fewer than 2000 ascend. More are drawn in O(m + n), and ascend from one stratum of the weight to the next only.
     """
     if n < 2000:
-        return _searched(weights, ordered_uniforms(rng, n, weights.shape[:-1]))
+        points = ordered_uniforms(rng, n, weights.shape[:-1])
+        return search(weights, points) if weights.ndim == 1 else np.stack(list(map(search, weights, points)))
     if weights.ndim == 2:
         return np.stack([_draws_by_strata(g, w, n) for g, w in zip(rng.generators(), weights, strict=True)])
     return _draws_by_strata(rng, weights, n)
@@ -118,10 +119,8 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
     return points[..., :-1]
 
 
-def _searched(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The index of the interval of the cumulative weights, scaled to [0, 1), that contains each point."""
-    if weights.ndim == 2:
-        return np.stack([_searched(*row) for row in zip(weights, points, strict=True)])
+def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n,) indices of the intervals of the cumulative weights (m,), scaled to [0, 1), that contain the points."""
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
