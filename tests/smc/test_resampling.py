@@ -266,20 +266,6 @@ def test_keep_weights_keeps_them():
     assert not KeepWeights().properly_weighted
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Residual("best"),
-        lambda: Tempered(power=1.5),
-        lambda: ClusterStratified(at_least=0.0),
-        lambda: Gaussian(scale=-1.0),
-    ],
-)
-def test_fields_out_of_range(make):
-    with pytest.raises(InputError):
-        make()
-
-
 def test_triggers():
     even, peaked = Population(np.zeros(10)), Population(np.zeros(10), np.r_[0.0, np.full(9, -50.0)])
     assert not EssBelow(0.5).wants(even, 0)

@@ -8,7 +8,7 @@ alarm 3e-7 a case), which are 2 to 6.8 % of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,12 +27,11 @@ from mstfilter.smc import (
     Never,
     Normal,
     Residual,
-    Similarity,
     StateSpaceModel,
     Tempered,
     bootstrap,
 )
-from tests.smc.models import AR1, RHO, SD0, SIGMA, SYMBOLS, ar1_observations, forward, hmm, kalman_ar1, mean_ratio
+from tests.smc.models import AR1, RHO, SD0, SIGMA, ar1_observations, kalman_ar1, mean_ratio
 
 YS = ar1_observations(8)
 SCHEMES = sorted(smc.__components__["resampler"])
@@ -70,13 +69,6 @@ def test_kalman(name, trigger):
     is_unbiased(bootstrap(AR1, 3000, proper(name), trigger), YS, kalman_ar1(YS)[1], 135)
 
 
-@TRIGGERS
-@pytest.mark.parametrize("name", [name for name in PLAIN if name != "sorted"])
-def test_hidden_chain_of_objects(name, trigger):
-    """The same with particles that are objects."""
-    is_unbiased(bootstrap(hmm("objects"), 170, proper(name), trigger), SYMBOLS[:5], forward(SYMBOLS[:5])[1], 400)
-
-
 # --- schemes that see the particles, or do not duplicate ----------------------------------------------------------
 NOISE = 2.0  # weak observations: few particles give little spread
 MILD = StateSpaceModel.of(Normal(0.0, SD0), lambda x: Normal(RHO * x, SIGMA), lambda x: Normal(x, NOISE))
@@ -108,23 +100,3 @@ def test_kalman_clusters_of_as_many(trigger):
     filter = bootstrap(MILD, 40, SEEING["clusters"], trigger)
     assert any(info.resampled for info in filter.run(FAR, 0)[1])
     is_unbiased(filter, FAR, exact_mild(FAR), 400)
-
-
-@dataclass(frozen=True)
-class SameBox(Similarity):
-    """Boxes are alike where they are equal, and a little where they are neighbours."""
-
-    def matrix(self, particles):
-        k = np.array([p.state for p in particles])
-        return np.exp(-np.abs(k[:, None] - k[None, :]))
-
-
-def test_hidden_chain_where_clusters_choose():
-    """The same with particles that are objects."""
-    model = hmm("objects")
-    filter = replace(
-        bootstrap(model, 30, ClusterStratified(SameBox(), 0.9), Never()),
-        transition=Branching(bootstrap(model, 1).transition, 4),
-        resample="after",
-    )
-    is_unbiased(filter, SYMBOLS[:3], forward(SYMBOLS[:3])[1], 1330)
