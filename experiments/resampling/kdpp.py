@@ -23,8 +23,7 @@ import numpy as np
 from mstfilter.errors import check_component
 from mstfilter.smc import FearnheadClifford, Gaussian, Population, Resampler, Similarity, log_mean_exp
 from mstfilter.smc.diverse_resampling import checked_similarity
-from mstfilter.smc.inverse_cdf import checked_weights
-from mstfilter.smc.resampling import check_scheme
+from mstfilter.smc.resampling import check_scheme, checked_weights
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@
                         `State` and `Info`
 `inputs`                time and inputs of models: `WithInput`, an observation with an input
 `population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
-`inverse_cdf`           indices drawn by weight, which all schemes share
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights
 `transport_resampling`  wrappers of schemes, sorted particles, transport
@@ -22,7 +21,6 @@
 `batching`              many runs of a filter at once
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
-`metropolis`            Metropolis-Hastings steps of many chains; the move of resample-move filters
 `exact`                 linear-Gaussian and finite models with exact answers
 `gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs

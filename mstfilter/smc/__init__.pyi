@@ -109,7 +109,6 @@ from mstfilter.smc.interfaces import (
     Update as Update,
     WeightResampler as WeightResampler,
 )
-from mstfilter.smc.metropolis import RandomWalkMove as RandomWalkMove
 from mstfilter.smc.population import (
     Candidates as Candidates,
     Population as Population,
@@ -151,6 +150,7 @@ from mstfilter.smc.state_space import (
     Dynamics as Dynamics,
     Prior as Prior,
     PriorityLookahead as PriorityLookahead,
+    RandomWalkMove as RandomWalkMove,
     StateSpaceModel as StateSpaceModel,
     auxiliary as auxiliary,
     bootstrap as bootstrap,

@@ -34,7 +34,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Distribution
-from mstfilter.smc.inverse_cdf import draw_rows, search
+from mstfilter.smc.resampling import draw_rows, search
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _FLOAT64 = np.dtype(np.float64)

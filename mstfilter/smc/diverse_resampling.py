@@ -26,9 +26,8 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.smc.interfaces import Resampler, Similarity, WeightResampler
-from mstfilter.smc.inverse_cdf import checked_weights, inverse_cdf
 from mstfilter.smc.population import Population, as_matrix, log_mean_exp
-from mstfilter.smc.resampling import Systematic, check_scheme, systematic_copies
+from mstfilter.smc.resampling import Systematic, check_scheme, checked_weights, inverse_cdf, systematic_copies
 
 
 @dataclass(frozen=True)

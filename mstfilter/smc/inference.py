@@ -39,9 +39,9 @@ from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Distribution, Resampler
-from mstfilter.smc.metropolis import metropolis
 from mstfilter.smc.population import Particles, Population, take
 from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key, rows_of
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]

@@ -32,9 +32,9 @@ from mstfilter.errors import InputError, check_choice, check_component, check_in
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.inverse_cdf import draw_rows, independent_draws
-from mstfilter.smc.metropolis import metropolis
 from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
+from mstfilter.smc.resampling import draw_rows, independent_draws
+from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key
 
 BackwardMethod = Literal["exact", "mcmc", "rejection"]

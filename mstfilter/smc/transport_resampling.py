@@ -28,9 +28,8 @@ from mstfilter.errors import InputError, check_choice, check_component, check_nu
 from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
 from mstfilter.smc.interfaces import Equivalence, Resampler, TransformResampler
-from mstfilter.smc.inverse_cdf import checked_weights
 from mstfilter.smc.population import Population, as_matrix
-from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, check_scheme
+from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, check_scheme, checked_weights
 
 #: Linear programs of more variables than this are not solved: they take longer than some seconds.
 MAX_TRANSPORT = 100_000

@@ -27,11 +27,11 @@ from mstfilter.smc import (
     Stratified,
     Systematic,
     Tempered,
-    inverse_cdf,
     log_mean_exp,
     resampling,
 )
 from mstfilter.smc.diverse_resampling import optimal_threshold
+from mstfilter.smc.resampling import inverse_cdf
 from tests.smc.enumeration import outcomes
 
 
@@ -91,7 +91,7 @@ def enumerated_uniforms(monkeypatch):
             assert runs == ()
             return np.sort([middle[rng.digit(W)] for _ in range(k)])
 
-        monkeypatch.setattr(inverse_cdf, "ordered_uniforms", draw)
+        monkeypatch.setattr(resampling, "ordered_uniforms", draw)
 
     return ordered
 
@@ -224,7 +224,7 @@ def test_chopthin(weights, n, ratio):
 
     def spy(weights, shifts, rest):
         fractions.append(np.cumsum(weights) * (rest / weights.sum()))
-        return inverse_cdf.inverse_cdf(weights, shifts, rest)
+        return inverse_cdf(weights, shifts, rest)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resampling, "inverse_cdf", spy)

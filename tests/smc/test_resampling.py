@@ -40,7 +40,7 @@ from mstfilter.smc import (
     log_mean_exp,
 )
 from mstfilter.smc.diverse_resampling import leader_clusters
-from mstfilter.smc.inverse_cdf import independent_draws, inverse_cdf
+from mstfilter.smc.resampling import independent_draws, inverse_cdf
 
 EQUAL: list[WeightResampler] = [
     Multinomial(),

@@ -17,7 +17,6 @@ from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
-from mstfilter.smc.metropolis import choose_rows, moved
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
@@ -30,6 +29,7 @@ from mstfilter.smc.programs.handlers import (
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
+from mstfilter.smc.state_space import choose_rows, moved
 from mstfilter.smc.streams import RunGenerators, child
 
 Model = Callable[..., Any]
