@@ -24,8 +24,8 @@ float type, and may be zero (log weight -inf); n may differ from their number. A
 selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights are zero.
 
 All schemes share the inverse of the cumulative weights, at the end of this module: `inverse_cdf` takes one point in
-each of n equal strata, `independent_draws` n independent points, and `draw_rows` one point for each row of a matrix. A
-user's scheme is a `WeightResampler` whose `select` uses them.
+each of n equal strata, `independent_draws` n independent points, and `draw_rows` one point for each row of a matrix.
+A user's scheme is a `WeightResampler` whose `select` uses them.
 
 Ties: the random schemes do not compare weights. Of particles with equal weights, `LargestWeights.select` (a stable
 sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first.
