@@ -122,24 +122,18 @@ class _Posterior:
     observations: Sequence[Any]
     log_prior: Callable[[np.ndarray], float]
     batched: bool = False
-    paired: bool = False
     n_sweeps: int = 0
 
-    def __call__(
-        self, rng: np.random.Generator, theta: np.ndarray, chains: np.ndarray | None = None
-    ) -> dict[str, np.ndarray]:
-        """``theta`` (R, d), of the given chains (default all), with ``log_density`` and ``log_evidence`` (R,)."""
-        seeds = rng.integers(2**63, size=len(theta)).tolist()
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """``theta`` (R, d) with ``log_density`` and ``log_evidence`` (R,)."""
+        seeds = rng.integers(2**63, size=len(theta))
         log_prior = np.array([float(self.log_prior(row)) for row in theta])
         if np.isnan(log_prior).any():
             raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
-        evidence = np.full(len(theta), -np.inf)
-        rows = np.flatnonzero(log_prior > -np.inf).tolist()
-        if rows:
-            chains = np.arange(len(theta)) if chains is None else chains
-            data = [self.observations[chains[r]] for r in rows] if self.paired else [self.observations]
+        evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
+        if possible.any():
             estimate = self._in_one_sweep if self.batched else self._one_by_one
-            evidence[rows] = estimate(theta[rows], [list(ys) for ys in data], [seeds[r] for r in rows])
+            evidence[possible] = estimate(theta[possible], seeds[possible].tolist())
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
     def _filter(self, theta: np.ndarray) -> ParticleFilter:
@@ -148,15 +142,15 @@ class _Posterior:
             raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
         return filter
 
-    def _one_by_one(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _one_by_one(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             with suppress(LostRunError):
-                state, _ = self._filter(theta).run(data[r % len(data)], seed, keep_arrays=False)
+                state, _ = self._filter(theta).run(list(self.observations), seed, keep_arrays=False)
                 found[r] = state.log_evidence
         return found
 
-    def _in_one_sweep(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """The estimates of a batch whose components hold the parameters of each row.
 
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
@@ -178,7 +172,7 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_batch(filters, data, seeds, check=check, rounding=True, warn=False)
+        runs = run_batch(filters, [list(self.observations)], seeds, check=check, rounding=True, warn=False)
         if runs.single:
             self.batched = False
             slot, reason = next(iter(runs.single.items()))
@@ -196,7 +190,6 @@ def pmmh(
     seed: int = 0,
     *,
     batched: bool = False,
-    paired: bool = False,
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
@@ -218,8 +211,6 @@ def pmmh(
         chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
         parameters; some are compared. If they differ, InputError, or a warning and single runs.
-    paired : bool
-        Chain r gets the data set ``observations[r]``.
 
     Raises
     ------
@@ -229,9 +220,7 @@ def pmmh(
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    if paired and len(observations) != len(theta):
-        raise InputError(f"there are {len(observations)} data sets for {len(theta)} chains")
-    posterior = _Posterior(filter_of, observations, log_prior, batched, paired)
+    posterior = _Posterior(filter_of, observations, log_prior, batched)
     key = Key(seed).child("pmmh")
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -261,7 +250,7 @@ def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.n
                 f"the start {theta[r].tolist()} of chain {r} has log density {state['log_density'][r]}: {what}",
                 "start where the prior and the likelihood are positive, or take more particles",
             )
-        for name, values in posterior(key.child(attempt).generator(), theta[lost], lost).items():
+        for name, values in posterior(key.child(attempt).generator(), theta[lost]).items():
             state[name][lost] = values
     return state
 
