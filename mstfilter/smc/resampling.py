@@ -254,7 +254,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
     """`checked_weights` of a run; those of the runs of a batch, (R, m), are not checked."""
-    if np.ndim(log_weights) != 2:
+    if log_weights.ndim != 2:
         return checked_weights(log_weights, n)
     weights = log_weights - log_weights.max(axis=1, keepdims=True)
     return np.exp(weights, out=weights)
@@ -273,7 +273,7 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
     np.ceil(
         ends, out=ends
     )  # the number of points below each cumulative weight: greater than -1 before, so not negative
-    ends[last] = n  # whatever the rounding
+    np.putmask(ends, last, n)  # whatever the rounding
     return expanded(ends.astype(np.int64), n)
 
 
