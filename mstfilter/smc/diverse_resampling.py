@@ -155,19 +155,10 @@ class Gaussian(Similarity):
         check_number("scale", self.scale, above=0, unit="distance")
 
     def matrix(self, particles: Any) -> np.ndarray:
+        from scipy.spatial.distance import cdist
+
         x = as_matrix(particles) / self.scale
-        small = len(x) ** 2 * x.shape[1] < 1e7
-        squares = ((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2) if small else _squared_distances(x)
-        return np.exp(-0.5 * squares)
-
-
-def _squared_distances(x: np.ndarray) -> np.ndarray:
-    """(n, n) ``|x_i|^2 + |x_j|^2 - 2 x_i x_j``, without an (n, n, d) array; centred to keep rounding errors small."""
-    x = x - x.mean(axis=0)
-    norms = (x * x).sum(axis=1)
-    squares = np.maximum(norms[:, None] + norms[None, :] - 2 * (x @ x.T), 0.0)
-    np.fill_diagonal(squares, 0.0)
-    return (squares + squares.T) / 2
+        return np.exp(-0.5 * cdist(x, x, "sqeuclidean"))
 
 
 #: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.

@@ -172,15 +172,6 @@ def test_smoothers_agree_with_the_joint_gaussian(name):
         assert noise[0] > 1.3 * noise[1]
 
 
-def test_the_density_of_a_proposal_would_be_seen():
-    """Backward paths need f; with q of a guided filter in its place they are wrong, and this test can tell."""
-    wrong = []
-    for seed in range(60):
-        record = keep(FILTERS["guided"], YS, seed)
-        wrong.append(moments(backward_paths(np.random.default_rng(seed), record, Dynamics(AR1, optimal), 100)))
-    assert not agrees(wrong, N)
-
-
 def path_sums(t, previous, x):
     """Terms of sum x_t, and of sum x_{t-1} x_t."""
     return np.stack([x, np.zeros(len(x)) if previous is None else previous * x], axis=1)
