@@ -40,7 +40,7 @@ from mstfilter.smc import (
     log_mean_exp,
 )
 from mstfilter.smc.diverse_resampling import leader_clusters
-from mstfilter.smc.resampling import independent_draws, inverse_cdf
+from mstfilter.smc.resampling import draw_rows, independent_draws, inverse_cdf, search
 
 EQUAL: list[WeightResampler] = [
     Multinomial(),
@@ -119,6 +119,14 @@ def test_one_point_per_stratum_equals_a_search(kind, m, n):
         points = (np.arange(n) + shifts) * (cumulative[-1] / n)
         expected = np.searchsorted(cumulative, points, side="right")
         np.testing.assert_array_equal(inverse_cdf(weights, shifts, n), expected)
+
+
+def test_points_at_the_ends_of_intervals():
+    """A point at an end belongs to the next particle of positive weight; one rounded up to the total, to the last."""
+    weights, points = np.array([0.0, 0.25, 0.0, 0.75, 0.0]), np.array([0.0, 0.25, 1.0])
+    assert search(weights, points).tolist() == [1, 3, 3]
+    assert draw_rows(np.tile(weights, (3, 1)), points).tolist() == [1, 3, 3]
+    assert inverse_cdf(weights, np.zeros(1), 4).tolist() == [1, 3, 3, 3]
 
 
 # --- hostile weights, all schemes ---------------------------------------------------------------------------------
