@@ -29,7 +29,7 @@ from mstfilter.smc import Population, Proposal, Transition, Update
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
 SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
 SCHEMES = ("multinomial", "stratified", "systematic", "residual", "ssp", "killing", "fearnhead_clifford")
-SCHEMES += ("clusters", "kdpp", "greedy_diverse", "coalesced", "tempered", "shuffled")
+SCHEMES += ("clusters", "coalesced", "tempered", "shuffled")
 
 
 @dataclass(frozen=True)

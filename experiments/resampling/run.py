@@ -46,7 +46,7 @@ def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Ite
 
     Errors are the absolute error of a mean or the total variation of a law, averaged over the steps.
     """
-    left_out = ("kdpp", "greedy_diverse") if setting == "plain" else ()  # they keep all, as fearnhead_clifford does
+    left_out = ("kdpp",) if setting == "plain" else ()  # it keeps all, as fearnhead_clifford does
     make, full, small = {"plain": (plain, world.sizes[0], 12), "branching": (branching, world.sizes[1], 5)}[setting]
     n = full if size is FULL else small
     seeds = range(size["seeds"])

@@ -19,6 +19,7 @@ from mstfilter.smc.components import (
     Reweight as Reweight,
     first_seen as first_seen,
 )
+from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.diagnostics import (
     History as History,
     Measured as Measured,
@@ -50,8 +51,6 @@ from mstfilter.smc.diverse_resampling import (
     ClusterStratified as ClusterStratified,
     FearnheadClifford as FearnheadClifford,
     Gaussian as Gaussian,
-    GreedyDiverse as GreedyDiverse,
-    KDpp as KDpp,
 )
 from mstfilter.smc.evaluation import (
     Coalescence as Coalescence,
@@ -63,20 +62,22 @@ from mstfilter.smc.evaluation import (
     set_energy_score as set_energy_score,
 )
 from mstfilter.smc.exact import (
-    ConditionallyLinear as ConditionallyLinear,
     Kalman as Kalman,
-    Linear as Linear,
     Marginals as Marginals,
-    ekf_proposal as ekf_proposal,
     forward_backward as forward_backward,
     hidden_markov as hidden_markov,
     kalman_filter as kalman_filter,
     linear_gaussian as linear_gaussian,
+)
+from mstfilter.smc.filter import ParticleFilter as ParticleFilter
+from mstfilter.smc.gaussian import (
+    ConditionallyLinear as ConditionallyLinear,
+    Linear as Linear,
+    ekf_proposal as ekf_proposal,
     nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
     ukf_proposal as ukf_proposal,
 )
-from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.inference import (
     Chains as Chains,
     TemperedSample as TemperedSample,
@@ -131,9 +132,7 @@ from mstfilter.smc.programs.sites import (
 from mstfilter.smc.resampling import (
     Killing as Killing,
     LargestWeights as LargestWeights,
-    Metropolis as Metropolis,
     Multinomial as Multinomial,
-    Rejection as Rejection,
     Residual as Residual,
     Ssp as Ssp,
     Stratified as Stratified,
@@ -142,17 +141,13 @@ from mstfilter.smc.resampling import (
 from mstfilter.smc.smoothing import (
     Record as Record,
     backward_paths as backward_paths,
-    conditional_path as conditional_path,
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
     paris as paris,
-    path_log_prob as path_log_prob,
 )
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,
-    GuidedInitial as GuidedInitial,
-    GuidedTransition as GuidedTransition,
     Prior as Prior,
     PriorityLookahead as PriorityLookahead,
     RandomWalkMove as RandomWalkMove,

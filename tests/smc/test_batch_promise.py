@@ -308,15 +308,11 @@ def flat(theta):
 
 @pytest.mark.parametrize("n", [3, 2, 5])
 @pytest.mark.parametrize("kind", ["scalar", "vectors", "of", "vectors without axis"])
-@pytest.mark.parametrize("paired", [False, True])
-def test_chains_equal_single_chains_or_refuse(kind, paired, n):
+def test_chains_equal_single_chains_or_refuse(kind, n):
     """Three chains; parameters of all chains without an axis do not fit vectors, whatever the sizes."""
-    data = [YS, [None, *YS[1:]], YS[::-1]] if paired else YS
 
     def chains(batched):
-        return pmmh(
-            lambda theta: chain_model(kind, theta, n), data, flat, START, 0.2, 6, batched=batched, paired=paired
-        )
+        return pmmh(lambda theta: chain_model(kind, theta, n), YS, flat, START, 0.2, 6, batched=batched)
 
     if kind == "vectors without axis":
         with pytest.raises(InputError, match="step 1, transition"):

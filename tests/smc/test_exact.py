@@ -11,7 +11,7 @@ from scipy import stats
 from mstfilter.errors import InputError
 from mstfilter.smc import batch, bootstrap, forward_backward, hidden_markov, kalman_filter
 from tests.smc.models import EMIT, MOVES, START
-from tests.smc.test_particle_filter import M0, MODEL, P0, F, H, Q, R, dense_log_likelihood, kalman, observations
+from tests.smc.test_particle_filter import M0, MODEL, P0, F, H, Q, R, observations
 
 
 def joint(Fs, Qs, m0, P0):
@@ -71,15 +71,6 @@ def test_kalman_is_the_conditioned_joint_gaussian(d, k, changing, missing):
         np.testing.assert_allclose(found.smoothed_means[t], mean[t], atol=1e-9)
         block = slice(t * d, t * d + d)
         np.testing.assert_allclose(found.smoothed_covariances[t], cov[block, block], atol=1e-9)
-
-
-def test_kalman_agrees_with_the_other_oracles_of_the_tests():
-    ys = observations()
-    means, P, total = kalman(ys)
-    found = kalman_filter(F, Q, H, R, M0, P0, ys)
-    np.testing.assert_allclose(found.means, means)
-    np.testing.assert_allclose(found.covariances[-1], P)
-    assert found.log_evidence[-1] == pytest.approx(total) == pytest.approx(dense_log_likelihood(ys))
 
 
 def log_emit(y):

@@ -288,7 +288,7 @@ def test_what_exact_models_reject():
         bootstrap(linear_gaussian(np.ones((2, 1, 1)), *one[1:]), 5).run([0.1, 0.2, 0.3])
     with pytest.raises(InputError, match=r"the input has shape \(2,\), expected \(1,\)"):
         bootstrap(linear_gaussian(*one, B=[[1.0]]), 5).run([0.1, WithInput(0.2, [1.0, 2.0])])
-    with pytest.raises(InputError, match=r"B has shape \(2, 1\), expected \(1, j\)"):
+    with pytest.raises(InputError, match=r"B has shape \(2, 1\), expected \(1, 1\)"):
         linear_gaussian(*one, B=[[1.0], [2.0]])
     with pytest.raises(InputError, match=r"B has shape \(1,\)"):
         kalman_filter(*one, [0.1], B=[1.0])

@@ -14,7 +14,6 @@ from mstfilter.smc import (
     Chopthin,
     ClusterStratified,
     EnsembleTransform,
-    KDpp,
     Population,
     Shuffled,
     Sorted,
@@ -186,6 +185,5 @@ def test_what_cannot_be_transported_is_an_error():
     for wrapper in (Shuffled, Sorted):
         with pytest.raises(InputError, match="EnsembleTransform makes new particles"):
             wrapper(EnsembleTransform())
-    for outer in (ClusterStratified, KDpp):
-        with pytest.raises(InputError, match="without ancestors"):
-            outer(scheme=EnsembleTransform())
+    with pytest.raises(InputError, match="without ancestors"):
+        ClusterStratified(scheme=EnsembleTransform())

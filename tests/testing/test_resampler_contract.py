@@ -18,7 +18,6 @@ from mstfilter.smc import (
     EnsembleTransform,
     FearnheadClifford,
     Gaussian,
-    KDpp,
     Population,
     Residual,
     Shuffled,
@@ -111,7 +110,7 @@ OURS = {
 }
 # Other forms of schemes above that compare particles and are slow.
 SLOW = {
-    "kdpp, wide": KDpp(Gaussian(5.0)),
+    "clusters, wide": ClusterStratified(Gaussian(5.0)),
     "clusters, optimal inside": ClusterStratified(Gaussian(0.5), 0.3, FearnheadClifford()),
     "clusters, tempered inside": ClusterStratified(Gaussian(0.5), 0.3, Tempered()),
     "tempered, sorted": Tempered(Sorted(), 0.3),
@@ -159,7 +158,7 @@ def test_resamplers_work_on_other_particles(fewer_calls):
     def objects(rng, n):
         return Population(tuple(f"particle {i}" for i in range(n))), None
 
-    for scheme, example in ((KDpp(), vectors), (Coalesced(), mapping), (Coalesced(), objects)):
+    for scheme, example in ((ClusterStratified(), vectors), (Coalesced(), mapping), (Coalesced(), objects)):
         assert [r for r in run_contract(scheme, example) if r.failure] == []
 
 

@@ -29,10 +29,11 @@ from mstfilter.smc.programs.handlers import (
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
-from mstfilter.smc.state_space import accept_moves, choose_rows
+from mstfilter.smc.state_space import choose_rows, moved
 from mstfilter.smc.streams import RunGenerators, child
 
 Model = Callable[..., Any]
+_Scored = tuple[ProgramRun, list[Site]]
 _HERE = str(Path(__file__).parent)
 
 
@@ -224,13 +225,13 @@ class ProgramMove(_OfProgram, Rejuvenation):
         if not isinstance(self.model, PerParticle):
             particles, accepted = self._moved(rng, self.model, population.particles, past, observation, n, False)
         else:
-            moved, rates = [], []
+            traces, rates = [], []
             for i, particle in enumerate(population.particles):
                 stream, before = child(rng, "particle", i), None if past is None else past[i]
                 new, rate = self._moved(stream, self.model.function, particle, before, observation, 1, True)
-                moved.append(Trace(new))
+                traces.append(Trace(new))
                 rates.append(rate)
-            particles, accepted = tuple(moved), float(np.mean(rates))
+            particles, accepted = tuple(traces), float(np.mean(rates))
         return Population(particles, population.log_weights, population.parents, {"accepted": accepted})
 
     def _moved(
@@ -238,33 +239,34 @@ class ProgramMove(_OfProgram, Rejuvenation):
     ) -> tuple[Mapping[str, Any], float]:
         """Values after the steps, and the rate of accepted steps; `single` for one particle without particle axis."""
 
-        def score(values: Mapping[str, Any], no_axis: bool = False) -> tuple[ProgramRun, list[Site]]:
+        def score(values: Mapping[str, Any], no_axis: bool = False) -> _Scored:
             handler = ScoreHandler(values, no_axis)
             with hypothetical():
                 return _run_once(function, handler, previous, observation, n, single), handler.sites
 
-        now, sites = score(x, single)
-        taken = 0
-        for _ in range(self.steps):
+        def propose(rng: np.random.Generator, state: _Scored) -> tuple[_Scored, np.ndarray]:
+            now, sites = state
             values = self._propose(rng, now.values, sites)
             try:
                 new, new_sites = score(values)
             except InputError as error:
                 if not single or not isinstance(error.__cause__, InputError | None):
                     raise
-                continue  # other sites are reached, which have no values: rejected in both directions
+                return state, np.full(n, -np.inf)  # other sites are reached, which have no values
             if [s.name for s in new_sites] != [s.name for s in sites]:
-                continue
+                return state, np.full(n, -np.inf)
             forward = self._log_density(now.values, values, sites, n)
             backward = self._log_density(values, now.values, new_sites, n)
             with np.errstate(invalid="ignore"):
-                yes = accept_moves(rng, new.gain - now.gain + backward - forward)
-            taken += int(yes.sum())
-            if yes.all():
-                now, sites = new, new_sites
-            elif yes.any():
-                now, sites = score(choose_rows(yes, new.values, now.values))
-        return _values_of(now), taken / (self.steps * n)
+                return (new, new_sites), new.gain - now.gain + backward - forward
+
+        def choose(accepted: np.ndarray, new: _Scored, old: _Scored) -> _Scored:
+            if accepted.all() or not accepted.any():
+                return new if accepted.any() else old
+            return score(choose_rows(accepted, new[0].values, old[0].values))
+
+        (now, _), rate = moved(rng, score(x, single), propose, self.steps, choose)
+        return _values_of(now), rate
 
     def _propose(
         self, rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site]
