@@ -48,13 +48,9 @@ def check(
         _check_folder(Path(component))
         return
     from mstfilter.presets import REGISTRY, settings
+    from mstfilter.smc.testing import FALSE_ALARM
+    from mstfilter.testing import run_contract
 
-    try:
-        from mstfilter.testing import FALSE_ALARM, run_contract
-    except ModuleNotFoundError as error:
-        if error.name != "pytest":
-            raise
-        raise InputError("check needs pytest, which is not installed", "pip install 'mstfilter[check]'") from error
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
     if ".py:" not in component and kind not in REGISTRY.kinds:
         raise InputError(

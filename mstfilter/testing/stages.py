@@ -1,4 +1,4 @@
-"""The contract of the stages of MST: boundaries, trees, cuts, completion, motions and the parts of fusion."""
+"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, parts of fusion."""
 
 from __future__ import annotations
 
@@ -14,11 +14,20 @@ import numpy as np
 from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed_box
 from mstfilter.completion.completer import fault_of
 from mstfilter.errors import InputWarning
-from mstfilter.fusion import Crossover, Division, FusionUpdate, PairOdds, PartitionUpdate, Projection, Structure
+from mstfilter.fusion import (
+    Crossover,
+    Division,
+    FusionUpdate,
+    PairOdds,
+    PartitionUpdate,
+    Projection,
+    Structure,
+)
 from mstfilter.scene import Clip, Hypothesis, render_hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition, child
-from mstfilter.testing.contract import RandomContract, prerequisite, reports_errors, same, skips_errors
+from mstfilter.smc.testing.contract import Contract, close, prerequisite, reports_errors, same, seeded, skips_errors
+from mstfilter.smc.testing.values import ScoreContract
 from mstfilter.testing.scenes import scene_example
 from mstfilter.tracking import (
     DenseFlow,
@@ -49,7 +58,37 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
 }
 
 
-class StageContract(RandomContract):
+class EvidenceContract(ScoreContract):
+    """The contract of every `Evidence`. The default example is a scene."""
+
+    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+        """`n` hypotheses and a clip."""
+        return scene_example(rng, n)
+
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
+        """Log scores, rounded to 9 digits."""
+        hypotheses = tuple(inputs["population"].realised().particles)
+        return np.round(component.log_score(hypotheses, inputs["observation"]), 9)
+
+    def test_copies_score_the_same(self) -> None:
+        """Equal hypotheses have equal scores, also if the numbers of the labels differ."""
+        inputs, rng = self.inputs(9), seeded(2)
+        hypotheses = tuple(inputs["population"].realised().particles)
+
+        def renamed(labels: np.ndarray) -> np.ndarray:
+            table = np.concatenate([[0], 3 + 5 * rng.permutation(int(labels.max()))])
+            return table.astype(np.uint16)[labels]
+
+        for change, fault in (
+            (np.copy, "a hypothesis and its copy have different scores"),
+            (renamed, "other numbers for the same labels give other scores"),
+        ):
+            copies = tuple(Hypothesis.from_labels(change(h.labels), h.grid) for h in hypotheses)
+            scores = self.checked_call(self.make(), {**inputs, "population": Population(hypotheses + copies)})
+            assert close(scores[:9], scores[9:]), fault
+
+
+class StageContract(Contract):
     """The contract of a stage of MST, which is tested in its place in the proposal, the tracking or the fusion."""
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
@@ -77,7 +116,7 @@ class StageContract(RandomContract):
     def checked_step(self, component: Any, inputs: dict[str, Any]) -> None:
         """Use the component in its place; an exception is reported with a description of the inputs."""
         with reports_errors(inputs):
-            result = self.step(component, np.random.default_rng(3), inputs)
+            result = self.step(component, seeded(3), inputs)
         assert all(isinstance(h, Hypothesis) for h in result.particles), "the result has no hypotheses"
 
     @prerequisite
@@ -108,14 +147,14 @@ class CompleterContract(StageContract):
         box = _boxes(component, _correct(inputs), inputs["observation"])[0]
         odd = [_cropped(box, *size) for size in ((7, 6, 5), (0, 0, 0))]
         with reports_errors("boxes of shape (7, 6, 5) and (0, 0, 0)"):
-            _estimated(component, np.random.default_rng(0), odd, inputs["observation"])
+            _estimated(component, seeded(0), odd, inputs["observation"])
 
     def test_follows_what_is_seen(self) -> None:
         """Its probabilities are not constant, and visible surface is probably occupied."""
         component, inputs = self.make(), self.inputs(1)
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         with skips_errors():
-            filled = _estimated(component, np.random.default_rng(0), seen, inputs["observation"])
+            filled = _estimated(component, seeded(0), seen, inputs["observation"])
         fault = fault_of(seen, filled)
         assert fault is None, f"{type(component).__name__}.fill {fault}"
 
@@ -124,7 +163,7 @@ class CompleterContract(StageContract):
         component, inputs = self.make(), self.inputs(1)
         seen = _boxes(component, _correct(inputs), inputs["observation"], cut=True)
         with skips_errors():
-            filled = _estimated(component, np.random.default_rng(0), seen, inputs["observation"])
+            filled = _estimated(component, seeded(0), seen, inputs["observation"])
         choices = [axes for n in range(4) for axes in combinations(range(3), n)]
         fit = {axes: _on_surface(filled, seen, axes) for axes in choices}
         best = max(choices, key=lambda axes: fit[axes])
@@ -139,7 +178,7 @@ class CompleterContract(StageContract):
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         with skips_errors():
             every, last = (
-                _estimated(component, np.random.default_rng(0), boxes, inputs["observation"], first)
+                _estimated(component, seeded(0), boxes, inputs["observation"], first)
                 for boxes, first in ((seen, 0), (seen[-1:], len(seen) - 1))
             )
         assert same(np.asarray(every[-1]), np.asarray(last[0])), (
@@ -205,7 +244,7 @@ class MotionRuleContract(StageContract):
 
     def test_motions_stay_in_the_workspace(self) -> None:
         """No candidate moves an object farther than the workspace is wide."""
-        component, rng = self.make(), np.random.default_rng(0)
+        component, rng = self.make(), seeded(0)
         for label, track in _tracks(self.inputs(1)):
             with skips_errors(), _without_warnings():
                 candidates = component.candidates(child(rng, "segment", label), track)

@@ -13,7 +13,8 @@ from mstfilter.fusion.update import FusionUpdate
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import Clip, Frame, Hypothesis, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, ProjectOnto, Proposal, Transition
-from mstfilter.testing import UpdateContract, scene_example
+from mstfilter.smc.testing import UpdateContract
+from mstfilter.testing import scene_example
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 RGB, DEPTH, LABELS = table_scene()
