@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.optimize import brentq
 
 from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, log_mean_exp, normalise
 
@@ -95,7 +94,7 @@ def Rejection(rng, lw, n):
 class Metropolis(WeightResampler):
     """Chains of so many steps that their total variation distance from the weights is at most `tolerance`."""
 
-    tolerance: float = 0.01
+    tolerance: float = 0.05
 
     def select(self, rng, log_weights, n):
         weights = np.exp(log_weights - log_weights.max())
@@ -106,20 +105,6 @@ class Metropolis(WeightResampler):
             proposed = rng.integers(len(weights), size=n)
             chains = np.where(rng.random(n) * weights[chains] < weights[proposed], proposed, chains)
         return chains, None
-
-
-@selecting
-def Chopthin(rng, lw, n):
-    """Light particles are thinned, heavy ones chopped: the output weights differ by a factor of at most 6."""
-    weights, ratio = normalise(lw), 6.0
-
-    def copies(a):
-        return np.where(weights < a, weights / a, np.maximum(1.0, 2 * weights / (ratio * a)))
-
-    a = brentq(lambda a: copies(a).sum() - n, 0.01 / n, 1.0, xtol=1e-15, rtol=1e-12)
-    ancestors = systematic(rng, copies(a), n)
-    out = np.maximum(a, weights / np.maximum(np.bincount(ancestors, minlength=len(weights)), 1))
-    return ancestors, np.log(np.where(weights < a, a, out))[ancestors] + log_mean_exp(lw) + np.log(n)
 
 
 @dataclass(frozen=True)
@@ -179,7 +164,7 @@ def SizeChanging(rng, lw, n):
     return ancestors, lw[ancestors] + np.log((lw > -np.inf).mean())
 
 
-CORRECT = (Metropolis(), Chopthin(), MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
+CORRECT = (Metropolis(), MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
 
 # --- wrong numbers of copies --------------------------------------------------------------------------------------
 

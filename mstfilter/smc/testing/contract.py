@@ -204,8 +204,9 @@ class BatchedContract(Contract):
         component = self.make()
         if not component.batched:
             return
-        y = self.example(seeded(), 2)[1]
-        slots = {"initial": _Examples(self.example), "update": Reweight(_row_sums), "resampler": Systematic()}
+        example = number_example if self.slot in ("resampler", "trigger") else self.example  # they use weights only
+        y = example(seeded(), 2)[1]
+        slots = {"initial": _Examples(example), "update": Reweight(_row_sums), "resampler": Systematic()}
         # The numbers of runs include that of the particles, since arrays of another axis fit then.
         for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
             filter = ParticleFilter(n=n, **{"trigger": Always(), **slots, self.slot: component})

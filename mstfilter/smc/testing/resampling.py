@@ -220,7 +220,8 @@ class ResamplerContract(Contract):
         Calls are added while a mean is suspicious and the evidence is not sufficient.
         """
         m = len(case.weights)
-        population = self.population(case.weights).reweighted(np.full(m, 3.0))
+        given = self.population(case.weights)
+        population = Population(given.particles, given.log_weights + 3.0)  # faster without parents
         spread = m * max(case.weights) / sum(case.weights)
         slow = f"too slow at this weight: {m} particles to {case.n}, max w / mean w = {spread:.3g}"
         rng, sample = CountingGenerator(seed, BUDGET, slow), Sample(case)
