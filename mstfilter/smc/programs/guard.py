@@ -117,7 +117,7 @@ class Guard:
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
         """Compare some particles in a run with the same particles in a run of their own."""
-        if any(shapes.ambiguous for shapes in whole.shapes.values()):
+        if any(call.ambiguous for call in whole.calls or ()):
             rows = rows[:1]
         with recorded() as runs:
             try:
@@ -379,17 +379,17 @@ def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
     A vector with as many entries as there are particles looks like one number for each of them, and an array (n, n)
     made from (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
     """
-    for k, found in whole.shapes.items():
+    calls = alone.calls or []
+    for k, found in enumerate(whole.calls or ()):
         if not found.ambiguous:
             continue
-        if raised and k == alone.n_calls + 1:
+        if raised and k == len(calls):
             raise InputError(
                 f"{found.what}: an error with one particle, and none with {whole.n}: "
                 + raised.removeprefix(f"{found.what}: ")
             )
-        one = alone.shapes.get(k, found._replace(event=(), value=found.value and ()))
-        if k <= alone.n_calls and not (found.event == one.event and (one.value is None or one.fits)):
-            raise found.error(f"{found.what}: ")
+        if k < len(calls) and not (found.event == calls[k].event and calls[k].fits):
+            raise found.shape_error(f"{found.what}: ")
 
 
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
