@@ -141,29 +141,31 @@ class CompleterContract(StageContract):
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
+    def _case(self, cut: bool = False) -> tuple[Completer, list[ObservedBox], Clip]:
+        """The component, boxes of three objects, and the clip."""
+        component, inputs = self.make(), self.inputs(1)
+        return component, _boxes(component, _correct(inputs), inputs["observation"], cut), inputs["observation"]
+
     def test_works_for_any_box(self) -> None:
         """It works for a box with edges of different lengths, and for one without voxels."""
-        component, inputs = self.make(), self.inputs(1)
-        box = _boxes(component, _correct(inputs), inputs["observation"])[0]
-        odd = [_cropped(box, *size) for size in ((7, 6, 5), (0, 0, 0))]
+        component, seen, clip = self._case()
+        odd = [_cropped(seen[0], *size) for size in ((7, 6, 5), (0, 0, 0))]
         with reports_errors("boxes of shape (7, 6, 5) and (0, 0, 0)"):
-            _estimated(component, seeded(0), odd, inputs["observation"])
+            _estimated(component, seeded(0), odd, clip)
 
     def test_follows_what_is_seen(self) -> None:
         """Its probabilities are not constant, and visible surface is probably occupied."""
-        component, inputs = self.make(), self.inputs(1)
-        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        component, seen, clip = self._case()
         with skips_errors():
-            filled = _estimated(component, seeded(0), seen, inputs["observation"])
+            filled = _estimated(component, seeded(0), seen, clip)
         fault = fault_of(seen, filled)
         assert fault is None, f"{type(component).__name__}.fill {fault}"
 
     def test_axes_are_those_of_the_grid(self) -> None:
         """The axes of its result are those of the box: reversed, it fits the visible surface less well."""
-        component, inputs = self.make(), self.inputs(1)
-        seen = _boxes(component, _correct(inputs), inputs["observation"], cut=True)
+        component, seen, clip = self._case(cut=True)
         with skips_errors():
-            filled = _estimated(component, seeded(0), seen, inputs["observation"])
+            filled = _estimated(component, seeded(0), seen, clip)
         choices = [axes for n in range(4) for axes in combinations(range(3), n)]
         fit = {axes: _on_surface(filled, seen, axes) for axes in choices}
         best = max(choices, key=lambda axes: fit[axes])
@@ -174,11 +176,10 @@ class CompleterContract(StageContract):
 
     def test_objects_do_not_depend_on_others(self) -> None:
         """The result for an object does not depend on the others, nor on their order."""
-        component, inputs = self.make(), self.inputs(1)
-        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        component, seen, clip = self._case()
         with skips_errors():
             every, last = (
-                _estimated(component, seeded(0), boxes, inputs["observation"], first)
+                _estimated(component, seeded(0), boxes, clip, first)
                 for boxes, first in ((seen, 0), (seen[-1:], len(seen) - 1))
             )
         assert same(np.asarray(every[-1]), np.asarray(last[0])), (

@@ -171,7 +171,7 @@ def DropsParticles(rng, population, observation):
     return population.take(np.arange(len(population) // 2 + 1), None).labelled({})
 
 
-@faulty("takes_a_missing_observation", "observation=None", None, move)
+@faulty("parents_are_valid", "observation=None", None, move)
 def NeedsObservation(rng, x, y):
     return x + float(y)
 
@@ -372,13 +372,13 @@ def CorrectDensity(previous, new):
     return -0.5 * (new - previous) ** 2
 
 
-@faulty("log_prob_of_own_moves_is_finite", "have shape ()", None, density)
+@faulty("log_prob_is_of_each_move", "have shape ()", None, density)
 def OneDensity(previous, new):
     """The density of all moves together."""
     return -0.5 * np.sum((new - previous) ** 2)
 
 
-@faulty("log_prob_of_a_move_does_not_depend_on_others", "three of six", None, density)
+@faulty("log_prob_is_of_each_move", "three of six", None, density)
 def NormalisedDensity(previous, new):
     log_f = -0.5 * (new - previous) ** 2
     return log_f - np.logaddexp.reduce(log_f)
@@ -409,7 +409,7 @@ def NeedsPrediction(rng, predicted, proposed, observation):
     return predicted.reweighted(np.zeros(len(predicted)))
 
 
-@faulty("parents_exist", "99", None, of(Update, "update"))
+@faulty("takes_any_of_its_inputs", "99", None, of(Update, "update"))
 def StrangeParents(rng, predicted, proposed, observation):
     population = predicted if predicted is not None else proposed
     return replace(population, parents={"proposed": np.full(len(population), 99)})

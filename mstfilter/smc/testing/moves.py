@@ -48,21 +48,18 @@ class TransitionContract(BatchedContract, ExactContract):
         return component.predict(rng, inputs["population"], inputs["observation"])
 
     def test_parents_are_valid(self) -> None:
-        """It keeps the number of particles, or sets parents "previous" to indices of old particles."""
+        """It keeps the number of particles, or sets parents "previous"; also if the observation is missing."""
         component = self.make()
         for n in (1, 2, _N):
-            moved = self.checked_call(component, self.inputs(n))
-            previous = moved.parents.get("previous")
-            if previous is None:
-                assert len(moved) == n, f'{n} particles became {len(moved)}, and there are no parents "previous"'
-            else:
-                assert ((previous >= -1) & (previous < n)).all(), (
-                    f'parents "previous" contain {int(np.max(previous))}, and there were {n} particles'
-                )
-
-    def test_takes_a_missing_observation(self) -> None:
-        """It moves particles if the observation is missing (None)."""
-        self.checked_call(self.make(), {**self.inputs(_N), "observation": None})
+            for absent in ({}, {"observation": None}):
+                moved = self.checked_call(component, {**self.inputs(n), **absent})
+                previous = moved.parents.get("previous")
+                if previous is None:
+                    assert len(moved) == n, f'{n} particles became {len(moved)}, and there are no parents "previous"'
+                else:
+                    assert ((previous >= -1) & (previous < n)).all(), (
+                        f'parents "previous" contain {int(np.max(previous))}, and there were {n} particles'
+                    )
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights is kept and has no other effect."""
@@ -192,20 +189,15 @@ class TransitionContract(BatchedContract, ExactContract):
 class DensityTransitionContract(TransitionContract):
     """The contract of every `DensityTransition`: that of a `Transition`, and properties of `log_prob`."""
 
-    def test_log_prob_of_own_moves_is_finite(self) -> None:
-        """`log_prob` gives one finite number for each move that `predict` makes."""
-        component = self.make()
+    def test_log_prob_is_of_each_move(self) -> None:
+        """`log_prob` gives one finite number for each move that `predict` makes, whatever the others are."""
+        component, rows = self.make(), np.array([4, 0, 3])
         for n in (1, _N):
             inputs = self.inputs(n)
-            found = self._log_prob(component, inputs, self.checked_call(component, inputs))
+            moved = self.checked_call(component, inputs)
+            found = self._log_prob(component, inputs, moved)
             assert found.shape == (n,), f"log densities of {n} moves have shape {found.shape}, expected ({n},)"
             assert np.isfinite(found).all(), f"log density of a move is {found[~np.isfinite(found)][0]}"
-
-    def test_log_prob_of_a_move_does_not_depend_on_others(self) -> None:
-        """`log_prob` treats every pair of rows alone."""
-        component, inputs = self.make(), self.inputs(_N)
-        moved, rows = self.checked_call(component, inputs), np.array([4, 0, 3])
-        found = self._log_prob(component, inputs, moved)
         fewer_inputs = {**inputs, "population": inputs["population"].take(rows)}
         fewer = self._log_prob(component, fewer_inputs, moved.take(rows))
         assert np.allclose(fewer, found[rows], atol=1e-9), "three of six moves have other log densities alone"
@@ -316,23 +308,18 @@ class UpdateContract(BatchedContract, ExactContract):
         return component.update(rng, **inputs)
 
     def test_takes_any_of_its_inputs(self) -> None:
-        """It accepts predicted particles, proposed ones, or both."""
+        """It accepts predicted particles, proposed ones, or both; parents are indices of them, or -1."""
         component, inputs = self.make(), self.inputs(_N)
-        for absent in ({"proposed": None}, {"predicted": None}, {}):
-            self.checked_call(component, {**inputs, **absent})
-
-    def test_parents_exist(self) -> None:
-        """Parents are indices of particles that exist, or -1."""
-        inputs = self.inputs(_N)
-        sizes = {"previous": len(inputs["predicted"]), "proposed": len(inputs["proposed"])}
         for name, population in (("previous", "predicted"), ("proposed", "proposed")):
-            inputs[population] = replace(inputs[population], parents={name: np.arange(sizes[name])})
-        out = self.checked_call(self.make(), inputs)
-        for name, n in sizes.items():
-            index = out.parents.get(name, np.array([-1]))
-            assert ((index >= -1) & (index < n)).all(), (
-                f'parents "{name}" contain {int(np.max(index))}, and there were {n} particles'
-            )
+            n = len(inputs[population])
+            inputs[population] = replace(inputs[population], parents={name: np.arange(n)})
+        for absent in ({"proposed": None}, {"predicted": None}, {}):
+            out = self.checked_call(component, {**inputs, **absent})
+            for name, n in (("previous", _N), ("proposed", len(inputs["proposed"]))):
+                index = out.parents.get(name, np.array([-1]))
+                assert ((index >= -1) & (index < n)).all(), (
+                    f'parents "{name}" contain {int(np.max(index))}, and there were {n} particles'
+                )
 
     def test_parents_belong_to_their_particles(self) -> None:
         """A predicted particle that it keeps has that particle as parent "previous"."""
