@@ -271,7 +271,7 @@ def test_resamplers_of_other_libraries(tmp_path):
         fault["outcome"] == "wrong" and "copies are biased" in fault["why"] and "are never selected" in fault["why"]
     )
     assert rows["direct call", "any_size"]["outcome"] == "error"
-    assert rows["contract", "ancestors_in_range"]["outcome"] == "holds"
+    assert rows["contract", "gives_n_particles"]["outcome"] == "holds"
     filters = {(r["library"], r["scheme"]) for r in read_csv(tmp_path / "filters.csv")}
     assert filters >= {("mstfilter", "systematic"), ("filterpy", "residual")}
 
