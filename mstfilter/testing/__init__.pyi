@@ -1,4 +1,3 @@
-from mstfilter.testing.check import contract_of as contract_of, run_contract as run_contract
 from mstfilter.testing.scenes import scene_example as scene_example
 from mstfilter.testing.stages import (
     STAGE_OWNERS as STAGE_OWNERS,
@@ -6,6 +5,8 @@ from mstfilter.testing.stages import (
     EvidenceContract as EvidenceContract,
     MotionRuleContract as MotionRuleContract,
     StageContract as StageContract,
+    contract_of as contract_of,
+    run_contract as run_contract,
 )
 from mstfilter.testing.starters import (
     Starter as Starter,

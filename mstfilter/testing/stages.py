@@ -1,7 +1,11 @@
-"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, parts of fusion."""
+"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, parts of fusion.
+
+`contract_of` and `run_contract` are for components of every interface, also for those of `mstfilter.smc.testing`.
+"""
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+import mstfilter.smc.testing as numbers
 from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed_box
 from mstfilter.completion.completer import fault_of
-from mstfilter.errors import InputWarning
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.fusion import (
     Crossover,
     Division,
@@ -26,7 +31,17 @@ from mstfilter.fusion import (
 from mstfilter.scene import Clip, Hypothesis, render_hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition, child
-from mstfilter.smc.testing.contract import Contract, close, prerequisite, reports_errors, same, seeded, skips_errors
+from mstfilter.smc.testing.contract import (
+    CheckResult,
+    Contract,
+    check_properties,
+    close,
+    prerequisite,
+    reports_errors,
+    same,
+    seeded,
+    skips_errors,
+)
 from mstfilter.smc.testing.values import ScoreContract
 from mstfilter.testing.scenes import scene_example
 from mstfilter.tracking import (
@@ -259,3 +274,52 @@ def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
     flow = DenseFlow().track(clip)
     segments = segments_of(_correct(inputs), clip.before)
     return [(label, Track(one, clip, flow)) for label, one in segments.items() if len(one.support)]
+
+
+# --- the check of any component: what ``mstfilter check`` does -----------------------------------------------------
+
+
+def contract_of(cls: type) -> type[Contract]:
+    """The contract of a class of components: `UpdateContract` for an `Update`, and so on for the other interfaces.
+
+    InputError if no interface of the class has a contract.
+    """
+    for base in cls.__mro__:
+        if base.__module__.startswith("mstfilter."):
+            name = f"{base.__name__}Contract"
+            contract = globals().get(name) or getattr(numbers, name, None)
+            if contract is not None:
+                return contract
+        if base in STAGE_OWNERS:
+            return StageContract
+    named = [name.removesuffix("Contract") for name in dir(numbers) if name.endswith("Contract")]
+    interfaces = [*filter(None, named), "Evidence", *(stage.__name__ for stage in STAGE_OWNERS)]
+    raise InputError(f"{cls.__name__} is no component with a contract", f"inherit one of {', '.join(interfaces)}")
+
+
+def run_contract(
+    component: Any, example: Callable[..., Any] | None = None, exact: Callable[..., Any] | None = None
+) -> list[CheckResult]:
+    """Test all properties of a component, whose interface has a contract.
+
+    ``example(rng, n)`` returns a population and an observation that the component can handle. Default: the function
+    ``example`` in the module of its class; without one, a scene for components of images and numbers for others.
+
+    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
+    observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
+    """
+    cls = type(component)
+    contract = contract_of(cls)
+    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
+    return check_properties(component, contract, example, exact or _function_beside(cls, "exact"))
+
+
+def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
+    """A function in the module of a class."""
+    found = getattr(sys.modules.get(cls.__module__), name, None)
+    return found if callable(found) else None
+
+
+def _uses_images(cls: type) -> bool:
+    """Whether a class of components belongs to a package of mstfilter other than smc."""
+    return cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")

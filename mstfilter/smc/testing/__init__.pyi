@@ -1,11 +1,8 @@
-from mstfilter.smc.testing.check import (
-    NUMBER_CONTRACTS as NUMBER_CONTRACTS,
-    CheckResult as CheckResult,
-    check_properties as check_properties,
-)
 from mstfilter.smc.testing.contract import (
     FALSE_ALARM as FALSE_ALARM,
+    CheckResult as CheckResult,
     Contract as Contract,
+    check_properties as check_properties,
     number_example as number_example,
 )
 from mstfilter.smc.testing.moves import (
