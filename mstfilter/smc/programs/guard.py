@@ -119,18 +119,7 @@ class Guard:
         """Compare some particles in a run with the same particles in a run of their own."""
         if any(call.ambiguous for call in whole.calls or ()):
             rows = rows[:1]
-        with recorded() as runs:
-            try:
-                few = self._run_again(run, whole, rows)
-                _check_shapes(whole, few, "")
-            except Exception as error:
-                _check_shapes(whole, runs[0], str(error))
-                try:  # a program may be written for n particles
-                    rows = np.resize(rows, whole.n)
-                    few = self._run_again(run, whole, rows)
-                except Exception as again:
-                    message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
-                    raise InputError(message, *_ALONE) from again
+        few, rows = self._run_alone(run, whole, rows)
         for call in few.calls or ():
             if call.distribution is not None:
                 _check_density(call.what, call.distribution, self.rng)
@@ -141,17 +130,23 @@ class Guard:
             if call.size:
                 raise InputError(f"{call.what} is reached by particle {rows[0]} alone only", *_ALONE)
         for name, values in whole.returned.items():
-            found = few.returned.get(name, values[rows])
-            if found.shape[1:] != values.shape[1:]:
-                raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {found.shape[1:]}")
-            different = ~_close(values[rows], found, _VALUE, _spread(values))
-            if different.any():
-                i = tuple(np.argwhere(different)[0])
-                raise InputError(
-                    f"returned {name!r} of particle {rows[i[0]]} is {values[rows][i]} among {whole.n} particles, "
-                    f"{found[i]} alone",
-                    *_ALONE,
-                )
+            _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
+
+    def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> tuple[ProgramRun, np.ndarray]:
+        """A run of some particles, and their rows: repeated to n rows if the program needs n particles."""
+        with recorded() as runs:
+            try:
+                few = self._run_again(run, whole, rows)
+                _check_shapes(whole, few, "")
+            except Exception as error:
+                _check_shapes(whole, runs[0], str(error))
+                try:
+                    rows = np.resize(rows, whole.n)
+                    few = self._run_again(run, whole, rows)
+                except Exception as again:
+                    message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
+                    raise InputError(message, *_ALONE) from again
+        return few, rows
 
     def _check_single(self, run: Run, particles: Any, gain: np.ndarray) -> None:
         """Compare two particles of a `per_particle` program with runs that keep nothing of the other particles."""
@@ -423,6 +418,20 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
                 f"{expected[i]:.6g} alone",
                 *_ALONE,
             )
+
+
+def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np.ndarray) -> None:
+    """Raise unless particles have the same returned values among the others and alone."""
+    if alone.shape[1:] != values.shape[1:]:
+        raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}")
+    different = ~_close(values[rows], alone, _VALUE, _spread(values))
+    if different.any():
+        i = tuple(np.argwhere(different)[0])
+        raise InputError(
+            f"returned {name!r} of particle {rows[i[0]]} is {values[rows][i]} among {len(values)} particles, "
+            f"{alone[i]} alone",
+            *_ALONE,
+        )
 
 
 # --- distributions of the user --------------------------------------------------------------------------------------
