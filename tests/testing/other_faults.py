@@ -824,7 +824,7 @@ def Lists(particles):
     return particles.tolist()
 
 
-@faulty("decoded_particles_are_equal", "not the same")
+@faulty("decoded_particles_are_equal", "list index out of range")
 @dataclass(frozen=True)
 class Keeps(Codec):
     """Decodes what it has stored in itself, which a new process has not."""

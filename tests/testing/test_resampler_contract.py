@@ -27,9 +27,8 @@ from mstfilter.smc import (
     TransformResampler,
 )
 from mstfilter.smc.testing import ResamplerContract, WeightResamplerContract
-from mstfilter.smc.testing.contract import restore_global_state
-from mstfilter.testing import contract_of, run_contract
-from tests.testing import faults
+from mstfilter.testing import run_contract
+from tests.testing import faults, run_property
 from tests.testing.faults import CORRECT, FAULTS
 
 
@@ -62,16 +61,6 @@ def test_what_costs_too_much_is_left_out_by_count(name, words):
     """The cost of `Rejection` grows with max w / mean w."""
     with pytest.raises(SkipTest, match=words):
         run_property(faults.Rejection(), name)
-
-
-def run_property(component, name):
-    """One test of the contract, without the others."""
-    contract = type("Contract", (contract_of(type(component)),), {"make": lambda self: component})()
-    contract.setup_method()
-    try:
-        getattr(contract, f"test_{name}")()
-    finally:
-        restore_global_state(contract._global_state)
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
