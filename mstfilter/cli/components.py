@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mstfilter.cli.root import app
-from mstfilter.errors import InputError, missing_library
+from mstfilter.errors import InputError
 
 
 @app.command("list")
@@ -38,13 +38,10 @@ def check(
     if Path(component).is_dir():
         _check_folder(Path(component))
         return
-    from mstfilter.presets import REGISTRY
-    from mstfilter.registry import settings
+    from mstfilter.presets import REGISTRY, settings
+    from mstfilter.smc.testing import FALSE_ALARM
+    from mstfilter.testing import run_contract
 
-    try:
-        from mstfilter.testing import FALSE_ALARM, run_contract
-    except ModuleNotFoundError as error:
-        raise missing_library(error, "mstfilter check") from error
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
     if ".py:" not in component and kind not in REGISTRY.kinds:
         raise InputError(

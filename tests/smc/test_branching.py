@@ -9,7 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.smc import Always, Branching, Coalesced, Dynamics, FearnheadClifford, Never, Systematic, bootstrap
-from mstfilter.testing import TransitionContract
+from mstfilter.smc.testing import TransitionContract
 from tests.smc.models import AR1, ar1_observations, hmm, kalman_ar1, mean_ratio
 
 YS = ar1_observations(8)

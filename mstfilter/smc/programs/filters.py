@@ -16,7 +16,7 @@ from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
-from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
+from mstfilter.smc.interfaces import Component, Lookahead, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
@@ -84,46 +84,67 @@ class Program:
 class _OfProgram(AtStep):
     """A component with a model, and perhaps a guide, that may depend on the step."""
 
-    @cached_property
-    def schedule(self) -> Schedule:
-        """Which steps are checked."""
-        return Schedule.of(vars(self)["model"], vars(self).get("guide"))
-
     @property
     def step_functions(self) -> Mapping[str, int | None]:  # type: ignore[override]
         functions = {name: value for name, value in vars(self).items() if name in ("model", "guide")}
         return {name: None if isinstance(value, PerParticle) else 2 for name, value in functions.items()}
 
 
-def _advance(
-    component: ProgramInitial | ProgramTransition,
-    rng: np.random.Generator,
-    past: Population | None,
-    observation: Any,
-    n: int,
-) -> Population:
-    """The population after a step."""
-    model, guide = component.model, None if observation is None else component.guide
-    previous = None if past is None else past.particles
-    # A batch compares some of its runs with single runs, which are guarded.
-    in_batch = isinstance(rng, RunGenerators)
-    guard = None if in_batch else component.schedule.guard(rng, past, observation, model, guide)
+@dataclass(frozen=True)
+class _ProgramStep(_OfProgram, Component):
+    """A step of a program: draws, by the guide if there is one, and weights."""
 
-    def step() -> tuple[Particles, np.ndarray]:
-        return _step(rng, model, guide, previous, observation, n)
+    model: Model
+    guide: Model | None = None
 
-    try:
-        particles, gain = step() if guard is None else guard.checked(_run_once, step)
-    except Exception:
-        if guard is not None:
-            component.schedule.clear()  # the next run is checked again
-        raise
-    try:
-        return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
-    except InputError:
-        if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
-            run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
-        raise
+    @property
+    def batched(self) -> bool | None:
+        return False if isinstance(self.model, PerParticle) else None
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """Which steps are checked."""
+        return Schedule.of(self.model, self.guide)
+
+    def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
+        """The population after a step."""
+        model, guide = self.model, None if observation is None else self.guide
+        previous = None if past is None else past.particles
+        # A batch compares some of its runs with single runs, which are guarded.
+        in_batch = isinstance(rng, RunGenerators)
+        guard = None if in_batch else self.schedule.guard(rng, past, observation, model, guide)
+
+        def step() -> tuple[Particles, np.ndarray]:
+            return _step(rng, model, guide, previous, observation, n)
+
+        try:
+            particles, gain = step() if guard is None else guard.checked(_run_once, step)
+        except Exception:
+            if guard is not None:
+                self.schedule.clear()  # the next run is checked again
+            raise
+        try:
+            return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
+        except InputError:
+            if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
+                run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
+            raise
+
+
+@dataclass(frozen=True)
+class ProgramInitial(_ProgramStep, Proposal):
+    """First step of a program: draws, by the guide if there is one, and weights."""
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        return self._advance(rng, None, observation, n)
+
+
+@dataclass(frozen=True)
+class ProgramTransition(_ProgramStep, Transition):
+    """A step of a program: draws, by the guide if there is one, and weights."""
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        return self._advance(rng, population, observation, len(population))
 
 
 def _step(
@@ -137,36 +158,6 @@ def _step(
     proposed = GuideHandler(rng, n)
     run_program(guide, proposed, previous, observation, n)
     return run_program(model, ReplayHandler(proposed), previous, observation, n)
-
-
-@dataclass(frozen=True)
-class ProgramInitial(_OfProgram, Proposal):
-    """First step of a program: draws, by the guide if there is one, and weights."""
-
-    model: Model
-    guide: Model | None = None
-
-    @property
-    def batched(self) -> bool | None:
-        return False if isinstance(self.model, PerParticle) else None
-
-    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return _advance(self, rng, None, observation, n)
-
-
-@dataclass(frozen=True)
-class ProgramTransition(_OfProgram, Transition):
-    """A step of a program: draws, by the guide if there is one, and weights."""
-
-    model: Model
-    guide: Model | None = None
-
-    @property
-    def batched(self) -> bool | None:
-        return False if isinstance(self.model, PerParticle) else None
-
-    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        return _advance(self, rng, population, observation, len(population))
 
 
 @dataclass(frozen=True)
