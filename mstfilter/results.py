@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning, short_path
+from mstfilter.fields import Bounded
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
@@ -48,8 +49,8 @@ def returns(check: Callable[..., Any]) -> Callable[[_Method], _Method]:
     return mark
 
 
-class Checked:
-    """Base class of interfaces with methods that are marked by `returns`."""
+class Checked(Bounded):
+    """Base class of interfaces with methods that are marked by `returns`, and of components with bounded fields."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)

@@ -1,0 +1,111 @@
+"""Bounds of fields, stated in the annotations of a dataclass and checked when an instance is made.
+
+>>> from dataclasses import dataclass
+>>> from typing import Annotated, Literal
+>>> from mstfilter.fields import Bounded, Bounds, PositiveInt
+>>> @dataclass(frozen=True)
+... class Tempering(Bounded):
+...     steps: PositiveInt = 10
+...     power: Annotated[float, Bounds(above=0, below=1, unit="exponent")] = 0.5
+...     order: Literal["first", "last"] = "first"
+>>> Tempering(power=2.0)
+Traceback (most recent call last):
+mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
+
+Three annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded` such as the
+interface of a component, alone or as ``Interface | None``. All others are documentation.
+
+A ``__post_init__`` for conditions on several fields is called after these checks.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import types
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal
+
+from mstfilter.errors import check_choice, check_component, check_integer, check_number
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of a number, for ``Annotated[float, Bounds(...)]``, or ``Annotated[int, Bounds(at_least=...)]``."""
+
+    above: float = -math.inf
+    at_least: float = -math.inf
+    at_most: float = math.inf
+    below: float = math.inf
+    unit: str = "number"  #: what the error calls a float: "expected a finite distance above 0"
+    hint: str = ""  #: what the user can do about a wrong value
+
+
+PositiveInt = Annotated[int, Bounds(at_least=1)]
+NonNegativeInt = Annotated[int, Bounds(at_least=0)]
+PositiveFloat = Annotated[float, Bounds(above=0)]
+NonNegativeFloat = Annotated[float, Bounds(at_least=0)]
+Share = Annotated[float, Bounds(at_least=0, at_most=1)]
+
+
+class Bounded:
+    """Base class of dataclasses whose fields are checked, before a ``__post_init__`` of the class is called."""
+
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        own = cls.__dict__.get("__post_init__")
+        if own is not None:
+            cls.__post_init__ = _after_checks(own)  # type: ignore[method-assign, assignment]
+
+    def __post_init__(self) -> None:
+        """Raise InputError if a field is outside of its bounds."""
+        cls: type = type(self)
+        for name, check in _checks(cls):
+            check(name, getattr(self, name))
+
+
+def _after_checks(own: Callable[[Any], None]) -> Callable[[Any], None]:
+    @functools.wraps(own)
+    def __post_init__(self: Any) -> None:
+        Bounded.__post_init__(self)
+        own(self)
+
+    return __post_init__
+
+
+_Check = Callable[[str, Any], None]
+
+
+@functools.cache
+def _checks(cls: Any) -> tuple[tuple[str, _Check], ...]:
+    """Names of the checked fields of a dataclass, with their checks."""
+    try:
+        hints = typing.get_type_hints(cls, include_extras=True)
+    except NameError:  # names that only a function or a type checker knows: a class of a user
+        return ()
+    found = ((field.name, _check_of(hints[field.name])) for field in fields(cls))
+    return tuple((name, check) for name, check in found if check is not None)
+
+
+def _check_of(annotation: Any) -> _Check | None:
+    """The check of a field with this annotation, ``check(name, value)``; None if it has no bounds."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Literal:
+        return functools.partial(check_choice, choices=parts)
+    if origin is Annotated:
+        return next((_check_of_number(parts[0], part) for part in parts[1:] if isinstance(part, Bounds)), None)
+    optional = origin in (types.UnionType, typing.Union) and len(parts) == 2 and parts[1] is type(None)
+    interface = parts[0] if optional else annotation
+    if isinstance(interface, type) and issubclass(interface, Bounded):
+        return functools.partial(check_component, interface=interface, optional=optional)
+    return None
+
+
+def _check_of_number(kind: type, bounds: Bounds) -> _Check:
+    hints = [bounds.hint] if bounds.hint else []
+    if kind is int:
+        return lambda name, value: check_integer(name, value, *hints, at_least=int(bounds.at_least))
+    limits = {name: getattr(bounds, name) for name in ("above", "at_least", "at_most", "below", "unit")}
+    return lambda name, value: check_number(name, value, *hints, **limits)
