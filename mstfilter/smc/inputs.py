@@ -24,6 +24,7 @@ from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
 from mstfilter.errors import InputError
+from mstfilter.fields import Bounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ def _no_input(t: int, *args: Any, **named: Any) -> Any:
     )
 
 
-class AtStep:
+class AtStep(Bounded):
     """Base class of components and models: `at_step` gives time and input to the functions among the fields."""
 
     #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field

@@ -1,8 +1,8 @@
 """Interfaces of the components of a particle filter, and its `State` and `Info`.
 
-A component is a frozen dataclass: its fields are hyperparameters, its behaviour is one method. Methods that draw
-take the generator as first argument. All methods work on whole populations, so a component can share work between
-particles.
+A component is a frozen dataclass: its fields are hyperparameters, with bounds in their annotations (see
+`mstfilter.fields`), its behaviour is one method. Methods that draw take the generator as first argument. All methods
+work on whole populations, so a component can share work between particles.
 
 >>> from dataclasses import dataclass
 >>> import numpy as np
@@ -35,6 +35,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer
+from mstfilter.fields import Bounded
 from mstfilter.lazy import late, short_repr
 from mstfilter.smc.export import Table
 from mstfilter.smc.inputs import AtStep
@@ -198,7 +199,7 @@ class TransformResampler(Resampler):
         """Make `n` particles of equal weight."""
 
 
-class Trigger(ABC):
+class Trigger(Bounded, ABC):
     """Decides whether a step resamples."""
 
     #: Whether `wants` also takes the populations of R runs, whose `ess` is (R,), and returns (R,) bool or one.
@@ -213,7 +214,7 @@ class Trigger(ABC):
 _MOST_OBJECTS, _MOST_ROWS = 1_000, 100_000_000
 
 
-class Size(ABC):
+class Size(Bounded, ABC):
     """Chooses the number of particles of a resampling. The filter then only starts with `n` particles."""
 
     #: Largest number that a filter accepts; a subclass may declare a field of this name. None: 1,000 if the particles
@@ -238,7 +239,7 @@ class Size(ABC):
         return int(n)
 
 
-class Similarity(ABC):
+class Similarity(Bounded, ABC):
     """Similarity of particles."""
 
     @abstractmethod
@@ -246,7 +247,7 @@ class Similarity(ABC):
         """(n, n) symmetric similarities in [0, 1], 1 on the diagonal. It need not be positive semidefinite."""
 
 
-class Equivalence(ABC):
+class Equivalence(Bounded, ABC):
     """Classes of particles that count as equal."""
 
     @abstractmethod
