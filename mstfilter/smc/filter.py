@@ -32,7 +32,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning, check_choice, check_component, check_integer
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.inputs import AtStep, split_input
@@ -114,8 +115,8 @@ class ParticleFilter(AtStep):
     lookahead: Lookahead | None = None
     rejuvenation: Rejuvenation | None = None
     size: Size | None = None
-    n: int = 100
-    n_proposed: int = 0
+    n: PositiveInt = 100
+    n_proposed: NonNegativeInt = 0
     resample: Literal["after", "before"] = "before"
 
     #: A resampler sees weights only: it does not depend on the step.
@@ -124,13 +125,8 @@ class ParticleFilter(AtStep):
     }
 
     def __post_init__(self) -> None:
-        check_integer("n", self.n)
-        check_integer("n_proposed", self.n_proposed, at_least=0)
-        for name, interface in _INTERFACES.items():
-            check_component(name, getattr(self, name), interface, optional=name not in ("resampler", "trigger"))
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
-        check_choice("resample", self.resample, ("after", "before"))
         if self.lookahead is not None and self.resample == "after":
             raise InputError(
                 'a lookahead needs the next observation, which is not known yet if resample="after"',
