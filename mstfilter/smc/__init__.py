@@ -18,7 +18,10 @@
 `transport_resampling`  wrappers of schemes, sorted particles, transport
 `components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
 `streams`               random streams named by seed, step, slot and index
-`batching`              many runs of a filter at once
+`history`               collectors: quantities of a run, recorded at every step
+`running`               `run_many`: several filters, seeds and data sets
+`batching`              the runs of a filter together, as arrays
+`rows`                  arrays and generators of the particles of many runs
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
 `exact`                 linear-Gaussian and finite models with exact answers, Rao-Blackwellised filters
@@ -26,8 +29,7 @@
 `distributions`         distributions for models; adapters for those of scipy and torch
 `smoothing`             states given all observations, paths of states by conditional SMC
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
-`diagnostics`           quantities of a run, energy distances, comparison of filters
-`evaluation`            coalescence and variance of a run
+`diagnostics`           energy distances, coalescence and variance of a run, scores against the truth
 `export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """

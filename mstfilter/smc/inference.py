@@ -32,16 +32,18 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
-from mstfilter.smc.batching import RunFilters, batched_slots, run_batch
+from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.rows import rows_of
 from mstfilter.smc.smoothing import conditional_path
 from mstfilter.smc.state_space import accept_moves, choose_rows
-from mstfilter.smc.streams import Key, rows_of
+from mstfilter.smc.streams import Key
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 
@@ -143,7 +145,11 @@ class _Posterior:
 
     def _estimates(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
         if self.batched and not self.singly:
-            return self._in_one_sweep(thetas, data, seeds)
+            try:
+                return self._in_one_sweep(thetas, data, seeds)
+            except NotTogether as why:
+                self.singly = True
+                warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=4)
         found = []
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             filter = self.filter_of(theta)
@@ -164,14 +170,12 @@ class _Posterior:
         first = self.filter_of(thetas[0])
         if not first.properly_weighted:
             raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
-        slots = batched_slots(first) or ()
-        if any(
-            getattr(first, slot) is not None and slot not in slots for slot in ("initial", "transition", "update")
-        ):
-            raise InputError(
-                "with batched=True the initial, transition and update of the filter must be batched",
-                "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes them so",
-            )
+        for slot in ("initial", "transition", "update"):
+            if getattr(first, slot) is not None and getattr(first, slot).batched is False:
+                raise InputError(
+                    f"with batched=True the {slot} of the filter must be batched",
+                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes it so",
+                )
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:
@@ -180,12 +184,8 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_batch(filters, data, seeds, check=check, rounding=True, warn=False)
-        if runs.single:
-            self.singly = True
-            slot, reason = next(iter(runs.single.items()))
-            warnings.warn(f"the filters are run one by one: {slot}: {reason}", stacklevel=5)
-        return runs.log_evidence[:, -1]
+        runs = run_together(filters, data, seeds, {"z": log_evidence}, check=check, rounding=True)
+        return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
 
 def pmmh(

@@ -77,8 +77,8 @@ class Component(AtStep, ABC):
     def batched(self) -> bool | None:
         """Whether the component treats each particle by itself, so that those of several runs can be given together.
 
-        True states so. With None, a batch tries it, and calls the component once for each run if the results differ
-        (see `mstfilter.smc.batching`). Default: False, then it is called once for each run.
+        True states so. With None, `run_many` tries it, and makes runs one by one if the results differ (see
+        `mstfilter.smc.batching`). Default: False, then runs are made one by one.
         """
         return False
 

@@ -21,10 +21,12 @@ from mstfilter.smc import (
     Record,
     StateSpaceModel,
     Systematic,
-    batch,
     bootstrap,
     coalescence,
     keep,
+    log_evidence,
+    mean,
+    run_many,
     run_variance,
 )
 from tests.smc.models import AR1, EMIT, MOVES, RHO, SD0, SIGMA, START, TAU, ar1_observations, hmm
@@ -78,14 +80,13 @@ def test_the_variance_from_one_run_is_that_of_many_runs(name, arm):
     """
     model, ys = MODELS[name]
     filter = bootstrap(model, 400, *arm)
-    runs = batch(filter, ys, range(1500))
-    log_evidence = runs.log_evidence[:, -1].var(ddof=1)
-    mean = np.var([s.population.weights @ s.population.particles for s in runs.states], ddof=1)
+    runs = run_many(filter, ys, range(1500), z=log_evidence, mean=mean)
+    variances = {name: runs[name][:, -1].var(ddof=1) for name in runs}
     bound = 0.2 if isinstance(arm[1], Always) else 0.3
     for lag in (None, 6):
         found = [run_variance(filter, ys, seed, lag) for seed in range(5000, 5040)]
-        assert np.mean([f.log_evidence_variance[-1] for f in found]) == pytest.approx(log_evidence, rel=bound)
-        assert np.mean([f.mean_variance[-1] for f in found]) == pytest.approx(mean, rel=0.3)
+        assert np.mean([f.log_evidence_variance[-1] for f in found]) == pytest.approx(variances["z"], rel=bound)
+        assert np.mean([f.mean_variance[-1] for f in found]) == pytest.approx(variances["mean"], rel=0.3)
 
 
 def by_pairs(record, t, begin):
@@ -165,9 +166,9 @@ def test_estimates_are_those_of_the_run(filter):
 def test_filters_with_more_candidates_than_particles(resample):
     """Mean of 40 runs within 40 % of the variance of 250 (errors 9 % and 6 %: 3.7 sd, false alarm 2e-4)."""
     filter = replace(bootstrap(AR1, 60), transition=Branching(Dynamics(AR1), 3), resample=resample)
-    runs = batch(filter, YS[:6], range(250))
+    runs = run_many(filter, YS[:6], range(250))
     found = [run_variance(filter, YS[:6], seed).log_evidence_variance[-1] for seed in range(1000, 1040)]
-    assert np.mean(found) == pytest.approx(runs.log_evidence[:, -1].var(ddof=1), rel=0.4)
+    assert np.mean(found) == pytest.approx(runs["log_evidence"][:, -1].var(ddof=1), rel=0.4)
 
 
 def test_functions_of_objects():

@@ -20,7 +20,6 @@ from mstfilter.smc import (
     WithInput,
     auxiliary,
     backward_paths,
-    batch,
     bootstrap,
     conditional_path,
     forward_backward,
@@ -32,6 +31,7 @@ from mstfilter.smc import (
     nonlinear_gaussian,
     paris,
     path_log_prob,
+    run_many,
 )
 from mstfilter.smc.inputs import step_parameters
 from tests.smc.models import mean_ratio
@@ -92,9 +92,9 @@ def test_the_first_transition_is_called_with_the_second_step():
 def test_batches_smoothing_and_conditional_paths_take_inputs():
     filter = bootstrap(MODEL, 20)
     for paired, data in ((False, WITH), (True, [WITH, WITH[::-1]])):
-        runs = batch(filter, data, [3, 4], paired)
+        runs = run_many(filter, data, [3, 4], paired=paired)
         single = [filter.run(data[r] if paired else data, seed)[0] for r, seed in enumerate((3, 4))]
-        assert [state.log_evidence for state in single] == runs.log_evidence[:, -1].tolist()
+        assert [state.log_evidence for state in single] == runs["log_evidence"][:, -1].tolist()
     path = conditional_path(filter, WITH, 1)
     total = MODEL.log_initial(path[:1])[0]
     for t, y in enumerate(YS):

@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning, MissingLibraryError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.files import folder_name
 from mstfilter.smc import (
     ArrayCodec,
@@ -34,17 +34,21 @@ from mstfilter.smc import (
     StateSpaceModel,
     Tempered,
     Trace,
-    batch,
     bootstrap,
     collect,
-    diagnostics,
+    ess,
     kalman_filter,
     keep as keep_record,
     linear_gaussian,
+    log_evidence,
+    mean,
     observe,
     per_particle,
+    resampled,
     run_many,
     sample,
+    unique_ancestors,
+    weight_entropy,
 )
 from mstfilter.smc.checkpoint import digest, load_state, save_state
 from tests.conftest import REPOSITORY
@@ -56,41 +60,25 @@ FACTOR = 2.0
 
 # --- collectors ---------------------------------------------------------------------------------------------------
 def test_collectors():
-    history = collect(
-        bootstrap(AR1, 64).iterate(YS, 3),
-        ess=diagnostics.ess,
-        unique=diagnostics.unique_ancestors,
-        entropy=diagnostics.weight_entropy,
-        evidence=diagnostics.log_evidence,
-        mean=diagnostics.mean,
-        own=lambda state, info: [info.t, 2 * info.t],
-    )
-    state, infos = bootstrap(AR1, 64).run(YS, 3)
-    assert set(history) == {"ess", "unique", "entropy", "evidence", "mean", "own"}
-    np.testing.assert_array_equal(history["ess"], [i.ess for i in infos])
-    np.testing.assert_array_equal(history["own"], [[t, 2 * t] for t in range(10)])
-    assert history["evidence"][-1] == state.log_evidence == history.state.log_evidence
-    assert (history["entropy"] <= np.log(64) + 1e-12).all() and (
-        history["entropy"] >= np.log(history["ess"]) - 1e-9
-    ).all()
-    assert history["mean"][-1] == state.population.weights @ state.population.particles
+    filter = bootstrap(AR1, 64)
+    kept = {"ess": ess, "unique": unique_ancestors, "entropy": weight_entropy, "z": log_evidence, "mean": mean}
+    found = collect(filter.iterate(YS, 3), **kept, own=lambda state, info: [info.t, 2 * info.t])
+    state, infos = filter.run(YS, 3)
+    assert set(found) == {*kept, "own"}
+    for name, attribute in (("ess", "ess"), ("unique", "unique_ancestors")):
+        np.testing.assert_array_equal(found[name], [getattr(info, attribute) for info in infos])
+    np.testing.assert_array_equal(found["own"], [[t, 2 * t] for t in range(10)])
+    assert found["z"][-1] == state.log_evidence == found.state.log_evidence
+    w = state.population.weights
+    assert found["entropy"][-1] == pytest.approx(-(w * np.log(w)).sum())
+    assert found["mean"][-1] == pytest.approx(w @ state.population.particles)
     with pytest.raises(KeyError, match="nothing was collected as 'es'"):
-        history["es"]
+        found["es"]
     with pytest.raises(InputError, match="different shapes"):
-        collect(bootstrap(AR1, 4).iterate(YS, 0), odd=lambda state, info: np.zeros(info.t))
-
-
-def test_to_xarray(monkeypatch):
-    history = collect(bootstrap(AR1, 8).iterate(YS, 3), ess=diagnostics.ess)
-    xarray = pytest.importorskip("xarray")
-    runs = run_many({"a": bootstrap(AR1, 8)}, YS, [1, 2], ess=diagnostics.ess, two=lambda s, i: np.zeros(2))
-    table = runs.to_xarray()
-    assert isinstance(table, xarray.Dataset)
-    assert table["ess"].dims == ("arm", "seed", "time")
-    assert table["two"].shape == (1, 2, 10, 2)
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(MissingLibraryError, match="needs the library xarray"):
-        history.to_xarray()
+        collect(filter.iterate(YS, 0), odd=lambda state, info: np.zeros(info.t))
+    for odd in (lambda state, info: np.zeros(info.t), lambda state, info: np.zeros(state.key.seed)):
+        with pytest.raises(InputError, match="different shapes"):
+            run_many(filter, YS, [0, 1], odd=odd)
 
 
 def test_a_run_without_arrays():
@@ -142,7 +130,7 @@ def test_the_memory_of_a_long_run_is_bounded(monkeypatch):
 # --- many runs ----------------------------------------------------------------------------------------------------
 def test_results_do_not_depend_on_workers_or_on_other_arms():
     arms = {"systematic": bootstrap(AR1, 50), "multinomial": bootstrap(AR1, 50, Multinomial())}
-    kept = {"log_evidence": diagnostics.log_evidence, "mean": diagnostics.mean}
+    kept = {"log_evidence": log_evidence, "mean": mean}
     one = run_many(arms, YS, range(6), **kept)
     four = run_many(arms, YS, range(6), workers=4, **kept)
     alone = run_many({"multinomial": arms["multinomial"]}, YS, [4], workers=2, **kept)
@@ -160,8 +148,9 @@ def test_errors_in_workers_name_the_run():
         raise InputError("no")
 
     for workers in (1, 2):
-        with pytest.raises(InputError, match="arm 'a', seed 5: no"):
-            run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=workers, x=broken)
+        for filters, where in (({"a": bootstrap(AR1, 4)}, "arm 'a', seed 5: no"), (bootstrap(AR1, 4), "^seed 5: no")):
+            with pytest.raises(InputError, match=where):
+                run_many(filters, YS, [5], workers=workers, x=broken)
     with pytest.raises(InputError, match="workers is 0"):
         run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=0)
 
@@ -172,19 +161,19 @@ FRAGILE = replace(AR1, log_likelihood=lambda x, y: np.where(x < -0.2, AR1.log_li
 @pytest.mark.parametrize("workers", [1, 2])
 def test_lost_runs_are_counted_and_the_others_are_kept(workers):
     arms = {"few": bootstrap(FRAGILE, 3), "many": bootstrap(FRAGILE, 60)}
-    kept = {"log_evidence": diagnostics.log_evidence, "mean": diagnostics.mean, "resampled": diagnostics.resampled}
+    kept = {"log_evidence": log_evidence, "mean": mean, "resampled": resampled}
     runs = run_many(arms, YS[:5], range(12), workers=workers, **kept)
     lost = {arm: [seed for name, seed in runs.lost if name == arm] for arm in arms}
     assert 0 < len(lost["few"]) < 12 and not lost["many"]
     for seed in range(12):
-        history = runs["log_evidence"][0, seed]
+        logs = runs["log_evidence"][0, seed]
         if seed not in lost["few"]:
-            assert history[-1] == arms["few"].run(YS[:5], seed)[0].log_evidence
+            assert logs[-1] == arms["few"].run(YS[:5], seed)[0].log_evidence
             continue
         reason = runs.lost["few", seed]
         assert reason.startswith("step ") and "all 3 log weights are -inf" in reason
         t = int(reason.split(",")[0].split()[1])
-        assert np.isneginf(history[t:]).all() and np.isfinite(history[:t]).all()
+        assert np.isneginf(logs[t:]).all() and np.isfinite(logs[:t]).all()
         assert np.isnan(runs["mean"][0, seed, t:]).all() and np.isnan(runs["resampled"][0, seed, t:]).all()
 
 
@@ -202,7 +191,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
 
     steps: list[tuple[int, int]] = []
     first = run(range(4), progress=lambda done, total: steps.append((done, total)))
-    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert steps[-1] == (4, 4)
     before = len(CALLS)
     (tmp_path / "runs" / folder_name("a/b") / "2.npz").unlink()
     again = run(range(4))
@@ -223,12 +212,30 @@ def test_stored_runs_are_not_run_again(tmp_path):
 def test_a_batched_arm_gives_the_numbers_of_single_runs(tmp_path):
     model = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
     arms = {"batched": bootstrap(model, 20), "single": bootstrap(replace(model, batched=False), 20)}
-    kept = {"z": diagnostics.log_evidence, "ess": diagnostics.ess, "x": diagnostics.mean}
+    kept = {"z": log_evidence, "ess": ess, "x": mean}
     runs = run_many(arms, YS, range(5), **kept, folder=tmp_path)
     for name in kept:
         np.testing.assert_array_equal(runs[name][0], runs[name][1])
+    assert list(runs.single) == ["single"] and run_many(arms, YS, range(5), **kept, folder=tmp_path).single == {}
     two = run_many(arms, YS, range(5), workers=2, **kept)
     np.testing.assert_array_equal(two["z"], runs["z"])
+    one = run_many(arms["batched"], YS, range(5), **kept)
+    assert one.dims == ("seed", "time")
+    np.testing.assert_array_equal(one["x"], runs["x"][0])
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_every_seed_with_its_own_data(workers, tmp_path):
+    model = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
+    filter, data = bootstrap(model, 20), [YS, YS[::-1], 2 * np.asarray(YS)]
+    runs = run_many(filter, data, [5, 3, 4], paired=True, workers=workers, folder=tmp_path)
+    for r, seed in enumerate([5, 3, 4]):
+        assert runs["log_evidence"][r, -1] == filter.run(data[r], seed)[0].log_evidence
+    assert run_many(filter, data, [5, 3, 4], paired=True, folder=tmp_path)["log_evidence"].tolist() == (
+        runs["log_evidence"].tolist()
+    )
+    with pytest.raises(InputError, match=r"3.npz was made by .*; 2 stored runs cannot be used"):
+        run_many(filter, [data[0], data[2], data[1]], [5, 3, 4], paired=True, folder=tmp_path)
 
 
 ODD_NAMES = (
@@ -258,22 +265,20 @@ ODD_NAMES = (
 def test_every_name_of_an_arm_has_a_folder_inside(tmp_path):
     folder = tmp_path / "in" / "runs"
     arms = {name: bootstrap(AR1, n) for n, name in enumerate(ODD_NAMES, 3)}
-    runs = run_many(arms, YS[:3], [1], folder=folder, x=diagnostics.ess)
+    runs = run_many(arms, YS[:3], [1], folder=folder, x=ess)
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
     names = [p.parent.name for p in files]
     assert len(files) == len(arms) and all(p.parent.parent == folder and p.name == "1.npz" for p in files)
     assert len({name.lower() for name in names}) == len(arms) and max(map(len, names)) < 100
     assert all(re.fullmatch("[a-z0-9_~-]+", name) and name != "con" for name in names)
-    np.testing.assert_array_equal(run_many(arms, YS[:3], [1], folder=folder, x=diagnostics.ess)["x"], runs["x"])
+    np.testing.assert_array_equal(run_many(arms, YS[:3], [1], folder=folder, x=ess)["x"], runs["x"])
 
 
 def test_damaged_stored_runs_are_named(tmp_path):
     """Cut anywhere, with any byte changed, or other content: never a raw error, never another result."""
 
     def run(**collectors):
-        return run_many(
-            {"a": bootstrap(AR1, 4)}, YS[:3], [0, 1], folder=tmp_path, **(collectors or {"x": diagnostics.ess})
-        )
+        return run_many({"a": bootstrap(AR1, 4)}, YS[:3], [0, 1], folder=tmp_path, **(collectors or {"x": ess}))
 
     first = run()["x"]
     path = tmp_path / "a" / "1.npz"
@@ -333,7 +338,7 @@ def test_a_worker_that_dies_once_changes_nothing(tmp_path):
     arms = {"a": bootstrap(AR1, 4), "b": bootstrap(AR1, 5)}
     runs = run_many(arms, YS[:3], range(5), workers=2, x=dies_once)
     assert (tmp_path / "died").exists()
-    np.testing.assert_array_equal(runs["x"], run_many(arms, YS[:3], range(5), x=diagnostics.ess)["x"])
+    np.testing.assert_array_equal(runs["x"], run_many(arms, YS[:3], range(5), x=ess)["x"])
 
 
 def test_workers_need_a_script_that_is_not_imported(tmp_path):
@@ -627,7 +632,7 @@ def test_observations_that_cannot_be_meant_are_refused_before_the_first_step(obs
     calls = (
         lambda: filter.run(observations, seed=0),
         lambda: next(iter(filter.iterate(observations, filter.start(0)))),
-        lambda: batch(filter, observations, range(2)),
+        lambda: run_many(filter, observations, range(2)),
         lambda: keep_record(filter, observations),
         lambda: kalman_filter(*one, np.zeros(1), np.eye(1), observations),
     )

@@ -29,8 +29,9 @@ from mstfilter.smc.programs.handlers import (
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
+from mstfilter.smc.rows import RunGenerators
 from mstfilter.smc.state_space import accept_moves, choose_rows
-from mstfilter.smc.streams import RunGenerators, child
+from mstfilter.smc.streams import child
 
 Model = Callable[..., Any]
 _HERE = str(Path(__file__).parent)
