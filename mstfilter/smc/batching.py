@@ -404,6 +404,8 @@ class _Sweep:
         assert self.ancestors is not None
         filter, ancestors = self.filter, self.ancestors[row]
         parents = {"previous": ancestors} if t else {}
+        if filter.resample == "after" and self.resampled[row]:
+            parents["ancestor"] = ancestors
         population = Population(of_runs(self.particles, row), self.log_weights[row], parents)
         info = object.__new__(_RunInfo)
         info.__dict__.update(
@@ -412,9 +414,6 @@ class _Sweep:
             n_candidates=filter.n,
             ess=float(self.ess[row]),
             resampled=bool(self.resampled[row]),
-            ancestors=ancestors if filter.resample == "after" else identity(filter.n),
-            parents=population.parents,
-            log_weights=population.log_weights,
         )
         return State(t + 1, population, Key(self.seeds[self.runs[row]]), filter.properly_weighted), info
 

@@ -224,7 +224,8 @@ def run_variance(
         assert population is not None and total is not None
         if info.t == 0:
             ancestry.begin(info.n_candidates)
-        parents = known_parents(population, info.t) if info.t else info.ancestors
+            first = np.arange(info.n_candidates)
+        parents = known_parents(population, info.t) if info.t else population.parents.get("ancestor", first)
         ancestry.descend(watched.selections, parents, population.weights)
         watched.selections.clear()
         if info.t > 0 and lag is not None:

@@ -23,7 +23,6 @@ function of a `State`, so a run can be stopped, stored and resumed at any step.
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,13 +31,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError
 from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.inputs import AtStep, split_input
 from mstfilter.smc.interfaces import (
-    ARRAY_BYTES,
     Codec,
     Component,
     Info,
@@ -208,30 +206,22 @@ class ParticleFilter(AtStep):
         checkpoint: str | Path | None = None,
         codec: Codec | None = None,
         observer: Observer | None = None,
-        keep_arrays: bool | None = None,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
 
         ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
 
-        If the run continues from a checkpoint, it returns the infos of the later steps only. The infos hold some (n,)
-        arrays of each step, so memory grows with n times the number of steps. By default, if the sum of their sizes
-        exceeds 268 MB, they are removed from all infos (see `Info.without_arrays`), with an `InputWarning`.
-        ``keep_arrays=True`` always keeps them, ``keep_arrays=False`` never. `collect` keeps what it is asked for.
+        If the run continues from a checkpoint, it returns the infos of the later steps only. To keep weights or
+        particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
         """
         total = len(observations) if isinstance(observations, Sized) else None
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
-        infos, n_bytes = Infos(), 0
+        infos = Infos()
         with progress_of(progress, "filter") as advance:
             advance(state.t, total)
-            for current, info in self._steps(observations, state, store, observer):
-                state = current
-                infos.append(info.without_arrays() if keep_arrays is False else info)
-                if keep_arrays is None and (n_bytes := n_bytes + info.n_bytes) > ARRAY_BYTES:
-                    infos.remove_arrays()
-                    keep_arrays = False
-                    warnings.warn(_without_arrays(len(infos)), stacklevel=2)
+            for state, info in self._steps(observations, state, store, observer):  # noqa: B020
+                infos.append(info)
                 advance(state.t, total)
         return state, infos
 
@@ -421,9 +411,6 @@ class _Step:
             n_candidates=len(fused),
             ess=ess,
             resampled=resampled_before or resampled_after,
-            ancestors=chosen.parents["ancestor"] if resampled_after else identity(len(chosen)),
-            parents=population.parents,
-            log_weights=population.log_weights,
             notes=self.slot.notes,
             seconds=self.slot.seconds,
         )
@@ -490,13 +477,6 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
             "a particle that is never selected would bias the filter: bound the priority from below",
         )
     return priority
-
-
-def _without_arrays(steps: int) -> InputWarning:
-    return InputWarning(
-        f"the infos of the run do not keep arrays, which exceed {ARRAY_BYTES / 1e6:.0f} MB after {steps} steps",
-        "keep_arrays=True keeps them, keep_arrays=False removes them without a warning; `collect` keeps values",
-    )
 
 
 @lru_cache(maxsize=1)

@@ -33,7 +33,8 @@ def ess(state: State, info: Info) -> float:
 
 def unique_ancestors(state: State, info: Info) -> int:
     """Number of particles of the previous population that have descendants."""
-    return info.unique_ancestors
+    assert state.population is not None
+    return state.population.unique_ancestors
 
 
 def weight_entropy(state: State, info: Info) -> float:

@@ -156,7 +156,7 @@ class _Posterior:
             if not filter.properly_weighted:
                 raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
             try:
-                state, _ = filter.run(data[r % len(data)], seed, keep_arrays=False)
+                state, _ = filter.run(data[r % len(data)], seed)
                 found.append(state.log_evidence)
             except LostRunError:
                 found.append(-np.inf)

@@ -231,7 +231,7 @@ class Population(Table):
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
         proposed particles, -1 for none; the filter numbers both, an update takes the numbers over. ``"mate"``: the
         second parent of a particle that two previous ones made. A resampler adds ``"ancestor"``, the index before the
-        resampling, which is in `Info.ancestors` after the step.
+        resampling; a population after a step has it if the step resampled after its update.
     notes : mapping
         Values that a component records: plain numbers, strings and lists.
     """
@@ -337,6 +337,12 @@ class Population(Table):
         return self.__dict__["_both"]
 
     @property
+    def unique_ancestors(self) -> int:
+        """Number of particles of the previous population that have descendants; 0 if it is not known."""
+        previous = self.parents.get("previous", np.zeros(0, np.int64))
+        return len(np.unique(previous[previous >= 0]))
+
+    @property
     def best(self) -> Any:
         """The particle of largest weight; the first, if several have equal weights."""
         index = int(np.argmax(self.log_weights))
@@ -383,9 +389,9 @@ class Population(Table):
         """The same particles, with parents traced through a resampling before the prediction.
 
         ``parents["previous"]`` and ``parents["mate"]`` are indices into `resampled`; they become indices into the
-        population that was resampled, if it is known. ``parents["ancestor"]`` and the notes are dropped.
+        population that was resampled, if it is known. The notes are dropped.
         """
-        parents = {name: index for name, index in self.parents.items() if name != "ancestor"}
+        parents = dict(self.parents)
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         for name in ("previous", "mate"):
             if ancestors is not None and name in parents:

@@ -121,8 +121,8 @@ def particles(state, info):
     """All that a step leaves, as one array."""
     p = state.population
     found = p.particles if isinstance(p.particles, np.ndarray) else list(p.particles.values())
-    parents = [p.parents.get("previous", -1), info.parents.get("previous", -1), info.ancestors]
-    return np.concatenate([np.ravel(a) for a in (found, p.log_weights, *np.broadcast_arrays(*parents))])
+    parents = [p.parents.get(name, np.full(len(p), -1)) for name in ("previous", "ancestor")]
+    return np.concatenate([np.ravel(a) for a in (found, p.log_weights, *parents)])
 
 
 ALL = {"z": log_evidence, "ess": ess, "resampled": resampled, "ancestors": unique_ancestors, "all": particles}

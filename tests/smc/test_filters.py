@@ -101,9 +101,8 @@ def test_one_step_with_the_optimal_proposal_is_exact_for_any_n(n):
 def test_a_fully_adapted_filter_has_equal_weights():
     """With p(y | x_{t-1}) as priority and the optimal proposal, weights after a resampled step are equal."""
     filter = auxiliary(AR1, predictive, 40, optimal, optimal_initial, trigger=Always())
-    _, infos = filter.run(YS, 0)
-    for info in infos:
-        np.testing.assert_allclose(info.log_weights, info.log_weights[0], atol=1e-9)
+    for state, _ in filter.iterate(YS, 0):
+        np.testing.assert_allclose(state.population.log_weights, state.population.log_weights[0], atol=1e-9)
 
 
 def test_a_priority_that_says_nothing_changes_nothing():

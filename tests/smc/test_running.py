@@ -12,14 +12,13 @@ import subprocess
 import sys
 import time
 import tracemalloc
-import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError
 from mstfilter.files import folder_name
 from mstfilter.smc import (
     ArrayCodec,
@@ -65,8 +64,9 @@ def test_collectors():
     found = collect(filter.iterate(YS, 3), **kept, own=lambda state, info: [info.t, 2 * info.t])
     state, infos = filter.run(YS, 3)
     assert set(found) == {*kept, "own"}
-    for name, attribute in (("ess", "ess"), ("unique", "unique_ancestors")):
-        np.testing.assert_array_equal(found[name], [getattr(info, attribute) for info in infos])
+    np.testing.assert_array_equal(found["ess"], [info.ess for info in infos])
+    parents = [state.population.parents.get("previous", []) for state, _ in filter.iterate(YS, 3)]
+    assert found["unique"].tolist() == [len(set(index)) for index in parents]
     np.testing.assert_array_equal(found["own"], [[t, 2 * t] for t in range(10)])
     assert found["z"][-1] == state.log_evidence == found.state.log_evidence
     w = state.population.weights
@@ -81,50 +81,13 @@ def test_collectors():
             run_many(filter, YS, [0, 1], odd=odd)
 
 
-def test_a_run_without_arrays():
-    full, light = (bootstrap(AR1, 16).run(YS, 3, keep_arrays=keep)[1] for keep in (True, False))
-    for a, b in zip(full, light, strict=True):
-        assert (a.t, a.n, a.ess, a.resampled, a.unique_ancestors) == (
-            b.t,
-            b.n,
-            b.ess,
-            b.resampled,
-            b.unique_ancestors,
-        )
-        assert len(a.log_weights) == 16
-        assert len(b.log_weights) == len(b.ancestors) == len(b.parents) == 0
-
-
-def test_the_infos_of_a_long_run_keep_no_arrays(monkeypatch):
-    """At 10 steps of 16 log weights, ancestors and parents: 3 * 16 * 8 bytes each."""
-    run = partial(bootstrap(AR1, 16).run, YS, 3)
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 10 * 384)
-    kept = run()[1]
-    assert {len(info.log_weights) for info in kept} == {16} and "without" not in repr(kept)
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 5 * 384)
-    with pytest.warns(InputWarning, match="do not keep arrays, which exceed") as told:
-        infos = run()[1]
-    assert len(told) == 1 and "keep_arrays=True" in told[0].message.hints[0] and told[0].filename == __file__
-    assert [info.n_bytes for info in infos] == [0] * 10 and "without arrays (above 268 MB)" in repr(infos)
-    assert [i.unique_ancestors for i in infos] == [i.unique_ancestors for i in kept]
-    for keep in (True, False):
-        found = run(keep_arrays=keep)[1]
-        assert {info.n_bytes > 0 for info in found} == {keep} and "without" not in repr(found)
-
-
-def test_the_memory_of_a_long_run_is_bounded(monkeypatch):
-    """Peak of the allocations of 60 steps of 4,000 particles, whose arrays of infos have 2 to 6 MB."""
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 500_000)
-    held = {}
-    for keep, given in ((None, {}), (True, {"keep_arrays": True})):
-        tracemalloc.start()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)
-            infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3, **given)[1]
-        held[keep] = tracemalloc.get_traced_memory()[0]
-        tracemalloc.stop()
-        del infos
-    assert held[None] < 500_000 < 2_000_000 < held[True]
+def test_the_memory_of_a_long_run_is_bounded():
+    """60 steps of 4,000 particles: the weights and parents of one step have 64 kB, infos of all steps less."""
+    tracemalloc.start()
+    infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3)[1]
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert len(infos) == 60 and held < 500_000
 
 
 # --- many runs ----------------------------------------------------------------------------------------------------
