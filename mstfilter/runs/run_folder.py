@@ -126,7 +126,6 @@ class _InfoFile(BaseModel):
     ess: float
     resampled: bool
     unique_ancestors: int | None
-    ancestors: list[int] | None
     parents: dict[str, list[int]]
     weights: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
     quality: dict[str, list[float]] | None

@@ -81,21 +81,6 @@ def test_kld_follows_the_posterior_in_a_filter():
     assert 20 <= len(state.population) < 300
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Fixed(0),
-        lambda: Kld(epsilon=0.0),
-        lambda: Kld(delta=1.0),
-        lambda: Kld(n_min=5, n_max=4),
-        lambda: Bins(0.0),
-    ],
-)
-def test_fields_out_of_range(make):
-    with pytest.raises(InputError):
-        make()
-
-
 def test_fixed():
     assert Fixed(12).choose(Population(np.zeros(3))) == 12
 
