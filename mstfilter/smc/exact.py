@@ -41,9 +41,9 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import MultivariateNormal
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import AtStep, bind_step, split_input, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep, bind_step, check_observations, split_input, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
-from mstfilter.smc.population import Population, check_observations, union
+from mstfilter.smc.population import Population, union
 from mstfilter.smc.rows import Rows
 from mstfilter.smc.state_space import StateSpaceModel
 

@@ -35,7 +35,7 @@ from mstfilter.errors import InputError
 from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
-from mstfilter.smc.inputs import AtStep, split_input
+from mstfilter.smc.inputs import AtStep, check_observations, split_input
 from mstfilter.smc.interfaces import (
     Codec,
     Component,
@@ -52,21 +52,14 @@ from mstfilter.smc.interfaces import (
     Trigger,
     Update,
 )
-from mstfilter.smc.population import Population, check_observations, identity
+from mstfilter.smc.population import Population, identity
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key, step_generator
 
-_INTERFACES: dict[str, type] = {
-    "initial": Proposal,
-    "transition": Transition,
-    "proposal": Proposal,
-    "update": Update,
-    "resampler": Resampler,
-    "trigger": Trigger,
-    "lookahead": Lookahead,
-    "rejuvenation": Rejuvenation,
-    "size": Size,
-}
+_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "lookahead", "rejuvenation", "size")
+_WITHOUT_STEP = ("resampler", "trigger", "size")  # they see the population only
+#: For components that draw no random numbers. Saves the time to make a stream.
+_UNUSED = Key(0).child("unused").generator()
 
 
 @dataclass(frozen=True)
@@ -117,10 +110,7 @@ class ParticleFilter(AtStep):
     n_proposed: NonNegativeInt = 0
     resample: Literal["after", "before"] = "before"
 
-    #: A resampler sees weights only: it does not depend on the step.
-    step_functions: ClassVar = {
-        name: None for name, kind in _INTERFACES.items() if issubclass(kind, Component) and kind is not Resampler
-    }
+    step_functions: ClassVar = {slot: None for slot in _SLOTS if slot not in _WITHOUT_STEP}
 
     def __post_init__(self) -> None:
         if self.initial is None and self.proposal is None:
@@ -132,7 +122,7 @@ class ParticleFilter(AtStep):
             )
 
     def __repr__(self) -> str:
-        parts = {slot: type(getattr(self, slot)).__name__ for slot in _INTERFACES if getattr(self, slot) is not None}
+        parts = {slot: type(getattr(self, slot)).__name__ for slot in _SLOTS if getattr(self, slot) is not None}
         lines = [f"ParticleFilter(n={self.n}, n_proposed={self.n_proposed}, resample={self.resample!r})"]
         return "\n  ".join([*lines, ", ".join(f"{slot} {name[:24]}" for slot, name in parts.items())])
 
@@ -146,7 +136,7 @@ class ParticleFilter(AtStep):
         """
         if self.proposal is not None:
             return False
-        components = (getattr(self, slot) for slot in _INTERFACES)
+        components = (getattr(self, slot) for slot in _SLOTS)
         return all(c.properly_weighted for c in components if isinstance(c, Component))
 
     def start(self, seed: int | Key = 0) -> State:
@@ -344,7 +334,7 @@ class _Step:
             assert fused is not None
             return fused
         with self.slot("update"):
-            rng = self.rng("update") if update.draws else _unused_generator()
+            rng = self.rng("update") if update.draws else _UNUSED
             fused = _checked(update.update(rng, predicted, proposed, self.observation), update)
             self.slot.record(fused.notes)
         return fused
@@ -488,9 +478,3 @@ def keep_freed_memory() -> None:
     million. The memory of the block itself is never touched. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)
-
-
-@lru_cache(maxsize=1)
-def _unused_generator() -> np.random.Generator:
-    """A generator for components that draw no random numbers. Saves the time to make a stream."""
-    return Key(0).child("unused").generator()

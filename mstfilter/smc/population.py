@@ -19,7 +19,7 @@ write to an array after a population was made from it; pass ``array.copy()`` if 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -190,31 +190,6 @@ def _within(index: np.ndarray, n: int) -> np.ndarray:
             "indices are positions in the population that is selected from",
         )
     return index
-
-
-def check_observations(observations: Iterable[Any], where: str = "") -> Any:
-    """The same observations; InputError for a table, a mapping or a text, and for one that is NaN in every entry.
-
-    Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
-    """
-    if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
-        raise InputError(
-            f"{where}observations are a {type(observations).__name__}, expected one observation for each step",
-            "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
-        )
-    if isinstance(observations, (list, tuple, np.ndarray)):
-        for t, y in enumerate(observations):
-            if (isinstance(y, float) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y)):
-                raise InputError(
-                    f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
-                )
-    return observations
-
-
-def _all_nan(y: np.ndarray) -> bool:
-    if not y.size or y.dtype.kind != "f" or not math.isnan(y.item(0)):  # the usual case
-        return False
-    return bool(np.isnan(y).all())
 
 
 @dataclass(frozen=True, eq=False)

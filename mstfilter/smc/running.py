@@ -40,8 +40,8 @@ from mstfilter.smc.batching import Collected, NotTogether, RunFilters, check_tog
 from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import Collector, History, check_one_shape, collect, log_evidence
+from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Info, State
-from mstfilter.smc.population import check_observations
 
 
 def run_many(
@@ -71,7 +71,7 @@ def run_many(
     workers : int
         Number of processes. 1 uses the calling process; more are started by joblib's loky, as new interpreters that
         get the filters by cloudpickle, and limit the numerical libraries to one thread. InputError if a worker dies,
-        with the arm and the seed.
+        with the runs that may have ended it.
     folder : path, optional
         Every finished run is stored there, as ``arm/seed.npz``; characters of an arm other than lower-case letters,
         digits, ``_`` and ``-`` are replaced by a hash. The same call runs only those that are missing. InputError if
@@ -324,43 +324,26 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
     if workers == 1:
         yield from (job.run(*chunk) for chunk in chunks)
         return
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    left = {(arm, seed) for arm, seeds in chunks for seed in seeds}
-    try:
-        for part in _parallel(job, chunks, workers):
-            left -= part.runs.keys()
-            yield part
-    except TerminatedWorkerError:
-        rest = [(arm, [seed for seed in seeds if (arm, seed) in left]) for arm, seeds in chunks]
-        rest = [chunk for chunk in rest if chunk[1]]
-        # Chunks begin in order, so the worker died in one of the first of those that are left.
-        for arm, seeds in rest[:workers]:
-            yield from (_alone(job, arm, seed) for seed in seeds)
-        yield from _finished(job, rest[workers:], workers)
-
-
-def _parallel(job: _Job, chunks: list[_Chunk], workers: int) -> Iterable[_Part]:
     from joblib import Parallel, delayed, parallel_config
-
-    with environment(), parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-        parallel = Parallel(batch_size=1, return_as="generator_unordered")
-        yield from parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks)
-
-
-def _alone(job: _Job, arm: str, seed: int) -> _Part:
-    """Run once more, in a process that does nothing else, what may have ended a worker."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    left = [(arm, seed) for arm, seeds in chunks for seed in seeds]
     try:
-        return next(iter(_parallel(job, [(arm, [seed])], 2)))  # one task of two workers; n_jobs=1 starts no process
+        with environment(), parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
+            parallel = Parallel(batch_size=1, return_as="generator_unordered")
+            for part in parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks):
+                left = [task for task in left if task not in part.runs]
+                yield part
     except TerminatedWorkerError as error:
         code = re.search(r"exit codes of the workers are {(.*?)}", str(error))
         how = f" ({code[1]})" if code else ""
+        # Chunks begin in order, so the worker died in one of the first of those that are left.
+        begun = "; ".join(job.where(*task) for task in left[:workers])
         raise InputError(
-            f"{job.where(arm, seed)}: the worker process died{how}",
+            f"a worker process died{how}; the first runs that are not finished: {begun}",
             "if memory ran out: use fewer workers or fewer particles",
             "workers=1 runs in this process and shows a crash of compiled code",
+            *(["the same call with the folder continues"] if job.folder else []),
         ) from None
 
 

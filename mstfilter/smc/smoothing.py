@@ -33,9 +33,9 @@ import numpy as np
 from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import split_input
+from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State, Transition
-from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
+from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
 from mstfilter.smc.programs.sites import PerParticle
