@@ -101,7 +101,8 @@ def by_pairs(record, t, begin):
         if (parents != np.arange(n)).any():
             pairs = [(i, j) for i in range(n) for j in range(n) if line[i] != line[j]]
             after = np.bincount(parents, minlength=n) / n
-            f *= sum(before[i] * before[j] for i, j in pairs) / sum(after[i] * after[j] for i, j in pairs)
+            left = sum(after[i] * after[j] for i, j in pairs)  # 0: all have one ancestor, and V is 1 for any f
+            f *= sum(before[i] * before[j] for i, j in pairs) / left if left else 1.0
         line = line[parents]
     w, x = record.populations[t].weights, record.populations[t].particles
     different = line[:, None] != line
@@ -219,7 +220,7 @@ def safe_log(w):
 def test_neutral_selections_coalesce_as_wright_and_fisher_say():
     """Pairs within 4.5 standard errors of 1 - (1 - 1/n)^s, common ancestors of 3 by the chain of their numbers."""
     flat = replace(AR1, log_likelihood=lambda x, y: np.zeros(len(x)))
-    filter, R, T = bootstrap(flat, 3, Multinomial(), Always()), 150, 15
+    filter, R, T = bootstrap(flat, 3, Multinomial(), Always()), 150, 40
     found = [coalescence(keep(filter, [0.0] * T, seed)) for seed in range(R)]
     shared = np.array([f.shared for f in found])[:, -9:]
     back = np.arange(9)[::-1]
