@@ -5,8 +5,8 @@
     python experiments/paper_figures/make.py quality_over_time --study studies/main
     python experiments/paper_figures/make.py --smoke --out DIR     # all at small size, a minute
 
-`merging` and `fusion_step` need the authors' particles (r1.py) and are left out, with a message, if these are
-missing; `quality_over_time` needs the folder of a study.
+`merging` needs the authors' particles (r1.py) and is left out, with a message, if these are missing;
+`quality_over_time` needs the folder of a study.
 """
 
 from __future__ import annotations
@@ -21,10 +21,8 @@ from mstfilter.errors import InputError
 
 FIGURES = (
     "merging",
-    "fusion_step",
     "teaser",
     "initial",
-    "over_segmenting",
     "sampled_cuts",
     "quality_over_time",
 )

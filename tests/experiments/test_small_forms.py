@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import runpy
-from contextlib import nullcontext
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from mstfilter.files import read_csv
 from mstfilter.scene import read_rgb
 from tests.conftest import REPOSITORY, find_shared
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
-from tests.study.scenes import InProcess
 
 SCRIPTS = [
     str(p.relative_to(EXPERIMENTS)) for p in sorted(EXPERIMENTS.glob("*/*.py")) if '"--smoke"' in p.read_text()
@@ -27,38 +24,11 @@ def test_small_form_never_overwrites_results(script):
     assert "would overwrite the" in run_script(script, "--smoke", expected_exit=2)
 
 
-def test_beliefs(tmp_path):
-    run_script("beliefs/speed.py", "--n", 2, "--repeat", 1, "--out", tmp_path / "speed.csv")
-    rows = read_csv(tmp_path / "speed.csv")
-    assert list(rows[0]) == ["seconds of processor time", "n=2", "n=2 rough"]
-    assert all(float(row["n=2"]) >= 0 for row in rows)
-
-
 def test_benchmark_of_the_filter(tmp_path):
     run_script("benchmarks/speed.py", "--smoke", "--clock", "cpu", "--out", tmp_path)
     rows = {r["what"]: r for r in read_csv(tmp_path / "speed.csv")}
     assert rows["array components / particles 0.4"]["median"] == "not measured"
     assert all(float(r["median"]) > 0 for r in rows.values() if r["unit"] == "ms" or "peers" in r["what"])
-
-
-def test_benchmark_of_fusion(tmp_path):
-    """The script stops with an error if both programs make different labels of the same random decisions."""
-    run_script("benchmarks/fusion.py", "--smoke", "--out", tmp_path)
-    rows = read_csv(tmp_path / "fusion.csv")
-    assert [r["unit"] for r in rows if r["target"]] == ["pairs", "ratio", "ratio", "MiB"]
-    assert float(rows[0]["median"]) == 1
-
-
-def test_benchmark_of_scoring(tmp_path):
-    run_script("benchmarks/scoring.py", "--smoke", "--n", 2, "--out", tmp_path / "scoring.csv")
-    seconds = {r["what"]: float(r["seconds"]) for r in read_csv(tmp_path / "scoring.csv")}
-    assert list(seconds)[-1] == "all" and all(s >= 0 for s in seconds.values())
-
-
-def test_benchmark_of_the_networks(tmp_path):
-    run_script("benchmarks/networks.py", "--smoke", "--out", tmp_path / "networks.csv")
-    rows = read_csv(tmp_path / "networks.csv")
-    assert len(rows) == 3 and all(float(row["ms"]) > 0 and float(row["ratio"]) > 0 for row in rows)
 
 
 def test_smoothing(tmp_path):
@@ -134,13 +104,6 @@ def test_decisions(tmp_path):
     assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
-def test_crop_sizes(tmp_path):
-    run_script("completion/crop_sizes.py", "--smoke", "--out", tmp_path)
-    rows = read_csv(tmp_path / "crop_sizes.csv")
-    assert [(row["edge"], row["n"]) for row in rows] == [(edge, rows[0]["n"]) for edge in ("32", "48", "64")]
-    assert all(0.2 < float(row["iou"]) < 1 and 0.2 < float(row["volume"]) < 2 for row in rows)
-
-
 def test_past(tmp_path):
     """The differences are those of the means, and nothing is run again."""
     arguments = ("controls/past.py", "--smoke", "--out", tmp_path)
@@ -162,22 +125,6 @@ def test_past(tmp_path):
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
 
 
-def test_candidates_of_decisions(tmp_path):
-    """The lead of the largest volume is that of the table; an interval needs two scenes with a preferred push."""
-    run_script("decisions/candidates.py", "--smoke", "--out", tmp_path)
-    pushes: dict[str, list[tuple[float, float]]] = {}
-    for row in read_csv(tmp_path / "candidates.csv"):
-        pushes.setdefault(row["scene"], []).append((float(row["volume"]), float(row["gain coverage"])))
-    leads = []
-    for found in pushes.values():
-        largest = [gain for volume, gain in found if volume == max(v for v, _ in found)]
-        leads.append(sum(largest) / len(largest) - sum(gain for _, gain in found) / len(found))
-    rows = {(r["gain"], r["score"], r["criterion"]): r for r in read_csv(tmp_path / "criteria.csv")}
-    assert len(pushes) == 2 and len(rows) == 4 * 2 * 5
-    assert float(rows["coverage", "lead", "volume"]["mean"]) == pytest.approx(sum(leads) / len(leads), abs=1e-3)
-    assert all(abs(float(r["mean"])) <= 1 for key, r in rows.items() if key[1] == "rank" and r["mean"])
-
-
 def test_families(tmp_path):
     arguments = ("families/run.py", "--smoke", "--out", tmp_path)
     run_script(*arguments)
@@ -191,28 +138,6 @@ def test_families(tmp_path):
     (tmp_path / "counts.csv").write_text(text.replace(counts[0]["median_pixels"], "1.5"))
     run_script(*arguments)
     assert read_csv(tmp_path / "counts.csv")[0]["median_pixels"] == "1.5"
-
-
-def test_speed_of_the_renderer(tmp_path):
-    """The script stops with an error if the images of both forms of the renderer differ."""
-    run_script("families/speed.py", "--smoke", "--out", tmp_path)
-    (row,) = read_csv(tmp_path / "speed.csv")
-    assert row["family"] == "s1" and int(row["frames"]) == 15
-
-
-def test_claims_of_fusion(tmp_path):
-    run_script("fusion/claims.py", "--smoke", "--out", tmp_path)
-    rows, hidden = read_csv(tmp_path / "claims.csv"), read_csv(tmp_path / "hidden.csv")
-    assert {"sample: sample alone", "prediction: prediction alone"} <= {r["claimed by"] for r in rows}
-    assert sum(int(r["voxels"]) for r in rows) > 100
-    alone = sum(
-        int(r["voxels"])
-        for r in rows
-        if r["claimed by"] == "prediction: prediction alone"
-        and r["where"] == "hidden"
-        and r["cleared"] in ("<= 0.01", "<= 0.03")
-    )
-    assert sum(int(r["voxels"]) for r in hidden) == alone > 0
 
 
 def test_full_size(tmp_path):
@@ -253,27 +178,6 @@ def test_tracking_rules(tmp_path):
     assert int(rows["mst"]["n_moved"]) >= 1
     # An object counts as moved if its IoU before/after is below .9, which is the score of the arm that moves nothing.
     assert float(rows["identity"]["iou_moved"]) < 0.9
-
-
-def test_killed_runs(tmp_path):
-    lines = run_script("killed_runs/trials.py", "--trials", 1, "--kinds", "run_many", "--out", tmp_path)
-    assert "1 ended identically" in lines
-    assert [r["identical"] for r in read_csv(tmp_path / "trials.csv")] == ["1"]
-
-
-def test_resamplers_of_other_libraries(tmp_path):
-    """The table names the faults of filterpy: residual resampling that drops light particles, and n to n only."""
-    run_script("peer_resamplers/run.py", "--smoke", "--only", "filterpy", "--out", tmp_path)
-    rows = {(r["kind"], r["test"]): r for r in read_csv(tmp_path / "table.csv")}
-    assert {r["scheme"] for r in rows.values()} == {"residual"}
-    fault = rows["contract", "carried_weight"]
-    assert (
-        fault["outcome"] == "wrong" and "copies are biased" in fault["why"] and "are never selected" in fault["why"]
-    )
-    assert rows["direct call", "any_size"]["outcome"] == "error"
-    assert rows["contract", "ancestors_in_range"]["outcome"] == "holds"
-    filters = {(r["library"], r["scheme"]) for r in read_csv(tmp_path / "filters.csv")}
-    assert filters >= {("mstfilter", "systematic"), ("filterpy", "residual")}
 
 
 def test_miniature(tmp_path):
@@ -345,18 +249,6 @@ def test_newcomer(tmp_path):
     rows = read_csv(tmp_path / "hour.csv")
     assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer", "notebook"}
     assert [row["step"] for row in rows if row["fault"]] == []
-
-
-@pytest.mark.parametrize(("script", "table"), [("trials", "results"), ("sharing", "sharing")])
-def test_study_runner(tmp_path, script, table):
-    local = mock.patch("mstfilter.study.Local", lambda workers: InProcess()) if script == "sharing" else nullcontext()
-    with local:
-        run_script(f"study_runner/{script}.py", "--smoke", "--out", tmp_path)
-    rows = read_csv(tmp_path / f"{table}.csv")
-    assert len(rows) == 3
-    if script == "trials":
-        assert all(row["done"] == row["runs"] for row in rows)
-        assert [row["killed"] for row in rows] == ["0", "0", "1"]
 
 
 def test_correct_components(tmp_path):

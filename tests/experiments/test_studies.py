@@ -146,26 +146,3 @@ def test_error_budget(tmp_path):
     quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
     assert len(quality) == 3
     assert quality["all true"] >= 0.95 > quality["mst"]  # readings change their segment at borders, voxels are 2 cm
-
-
-def test_mask_quality(tmp_path):
-    folder = run_small(tmp_path, EXPERIMENTS / "error_budget/mask_quality.toml")
-    quality = {row["arm"]: float(row["quality"]) for row in read_csv(folder / "runs.csv")}
-    assert len(quality) == 10
-    best = [q for arm, q in quality.items() if "=1.0" in arm]
-    assert min(best) > max(q for arm, q in quality.items() if "=0.7" in arm)
-
-    run_script("error_budget/mask_quality.py", folder, tmp_path / "tables")
-    rows = read_csv(tmp_path / "tables/mask_quality.csv")
-    lines = {(row["source"], row["masks"], row["method"]): row for row in rows}
-    own = next(masks for source, masks, _ in lines if source == "own")
-    assert 0.5 < float(own) < 1
-    fused, sampled = ("mst", "object_fusion"), ("mst", "samples_only")
-    expected = {("own", own): fused, ("lasting", "0.7"): fused, ("lasting", "1"): fused}
-    expected |= {("independent", "0.7"): sampled, ("independent", "0.9"): sampled}
-    assert set(lines) == {(*masks, method) for masks, methods in expected.items() for method in methods}
-    mst, other = (lines["lasting", "1", method] for method in fused)
-    for ending in ("", "_weighted"):
-        gain = float(mst[f"quality{ending}"]) - float(other[f"quality{ending}"])
-        assert float(other[f"mst_minus{ending}"]) == pytest.approx(gain, abs=2e-4)
-    assert (tmp_path / "tables/mask_quality.png").stat().st_size > 5000

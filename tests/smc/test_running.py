@@ -491,8 +491,8 @@ def test_a_hash_follows_the_constants_that_a_function_uses(monkeypatch):
 
 
 def killed(kind, path, delays):
-    """Run the script that experiments/killed_runs kills, and kill it after each delay."""
-    script = REPOSITORY / "experiments" / "killed_runs" / "victim.py"
+    """Run a script and kill it after each delay."""
+    script = REPOSITORY / "tests" / "smc" / "killed.py"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     for delay in delays:
         process = subprocess.Popen([sys.executable, script, kind, path], env=environment, stdout=subprocess.PIPE)
@@ -507,7 +507,7 @@ def killed(kind, path, delays):
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
 @pytest.mark.parametrize(("kind", "n_kills"), [("checkpoint", 4), ("run_many", 2)])
 def test_a_killed_run_ends_as_one_that_was_not(kind, n_kills, tmp_path):
-    """Some kills at random moments; experiments/killed_runs has a hundred."""
+    """Kills at random moments; experiments/reliability stops a run at every operation on files."""
     whole, path = tmp_path / "whole.npz", tmp_path / "run.npz"
     killed(kind, whole, [])
     killed(kind, path, np.random.default_rng(1).uniform(0, 0.12, n_kills))

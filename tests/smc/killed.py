@@ -1,7 +1,6 @@
-"""The run that trials.py kills: ``victim.py KIND PATH``. It continues from what PATH holds.
+"""The run that `test_running` kills: ``killed.py KIND PATH``. It continues from what PATH holds.
 
-`checkpoint` is one run with a checkpoint file; `run_many` stores finished runs of two filters in a folder; `batch` is
-`run_many` where it processes many seeds together.
+`checkpoint` is one run with a checkpoint file; `run_many` stores finished runs of two filters in a folder.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def run(kind: str, path: Path) -> None:
     if kind == "checkpoint":
         bootstrap(MODEL, 2000).run(OBSERVATIONS, 3, checkpoint=path)
         return
-    model = LINEAR if kind == "batch" else replace(LINEAR, batched=False)
+    model = replace(LINEAR, batched=False)  # runs that are processed together are stored together
     arms = {"systematic": bootstrap(model, 500), "multinomial": bootstrap(model, 500, Multinomial())}
     history = run_many(arms, OBSERVATIONS, range(8), folder=path, log_evidence=log_evidence, mean=mean)
     np.savez(path / "history.npz", **history)
