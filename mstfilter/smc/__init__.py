@@ -17,11 +17,10 @@
 `diverse_resampling`    schemes that keep different particles, with unequal weights
 `transport_resampling`  wrappers of schemes, sorted particles, transport
 `components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
-`streams`               random streams named by seed, step, slot and index
+`streams`               random streams named by seed, step, slot and index; generators of many runs
 `history`               collectors: quantities of a run, recorded at every step
 `running`               `run_many`: several filters, seeds and data sets
 `batching`              the runs of a filter together, as arrays
-`rows`                  arrays and generators of the particles of many runs
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
 `exact`                 linear-Gaussian and finite models with exact answers, Rao-Blackwellised filters

@@ -133,7 +133,6 @@ from mstfilter.smc.resampling import (
     Stratified as Stratified,
     Systematic as Systematic,
 )
-from mstfilter.smc.rows import RunGenerators as RunGenerators
 from mstfilter.smc.running import run_many as run_many
 from mstfilter.smc.smoothing import (
     Record as Record,
@@ -158,7 +157,7 @@ from mstfilter.smc.state_space import (
     guided as guided,
     resample_move as resample_move,
 )
-from mstfilter.smc.streams import Key as Key, child as child, key_of as key_of
+from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
 from mstfilter.smc.transport_resampling import (
     Coalesced as Coalesced,
     EnsembleTransform as EnsembleTransform,

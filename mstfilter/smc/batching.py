@@ -31,8 +31,17 @@ from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence,
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import Info, State, WeightResampler
 from mstfilter.smc.population import Population, identity
-from mstfilter.smc.rows import RunGenerators, SlotStreams, by_run, flat, of_runs, resampled_runs, rows_of, summaries
-from mstfilter.smc.streams import Key
+from mstfilter.smc.streams import (
+    Key,
+    RunGenerators,
+    SlotStreams,
+    by_run,
+    flat,
+    of_runs,
+    resampled_runs,
+    rows_of,
+    summaries,
+)
 
 #: Runs that are compared with a call for the runs in another order.
 _MOST_COMPARED = 64

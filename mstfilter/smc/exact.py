@@ -44,8 +44,8 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep, bind_step, check_observations, split_input, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
-from mstfilter.smc.rows import Rows
 from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.streams import Rows
 
 _Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d)
 

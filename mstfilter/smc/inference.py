@@ -40,10 +40,9 @@ from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.rows import rows_of
 from mstfilter.smc.smoothing import conditional_path
 from mstfilter.smc.state_space import accept_moves, choose_rows
-from mstfilter.smc.streams import Key
+from mstfilter.smc.streams import Key, rows_of
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 

@@ -38,7 +38,7 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.rows import Rows
+from mstfilter.smc.streams import Rows
 
 
 @dataclass(frozen=True)

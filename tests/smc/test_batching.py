@@ -48,8 +48,7 @@ from mstfilter.smc import (
     unique_ancestors,
 )
 from mstfilter.smc.population import Population
-from mstfilter.smc.rows import summaries
-from mstfilter.smc.streams import Key, pcg64_states
+from mstfilter.smc.streams import Key, pcg64_states, summaries
 from tests.smc.models import AR1, ar1_observations, hmm
 from tests.smc.test_particle_filter import MODEL, observations
 from tests.smc.test_streams import words_of

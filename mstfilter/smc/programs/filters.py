@@ -29,9 +29,8 @@ from mstfilter.smc.programs.handlers import (
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
-from mstfilter.smc.rows import RunGenerators
 from mstfilter.smc.state_space import accept_moves, choose_rows
-from mstfilter.smc.streams import child
+from mstfilter.smc.streams import RunGenerators, child
 
 Model = Callable[..., Any]
 _HERE = str(Path(__file__).parent)
