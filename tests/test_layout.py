@@ -74,11 +74,11 @@ def source_of(module: str, name: str) -> str:
 
 def test_the_package_does_not_grow():
     """A new capability replaces code more often than it adds some. Lower a bound when code is removed."""
-    assert n_lines(FILES) <= 45_378
+    assert n_lines(FILES) <= 45_374
     assert len(FILES) <= 190
     smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
-    assert n_lines(smc) <= 9_757
-    assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 20  # programs/ is one
+    assert n_lines(smc) <= 9_754
+    assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 21  # programs/ is one
     assert max(n_lines([path]) for path in FILES) <= 650
 
 
