@@ -91,7 +91,7 @@ def run_many(
     Warns
     -----
     InputWarning
-        If the runs of a filter whose components state ``batched=True`` were made one by one.
+        If the runs of an arm were made one by one because of a component that states ``batched=True``.
     """
     arms = dict(filters) if isinstance(filters, Mapping) else {_ALONE: filters}
     if not arms:
@@ -114,8 +114,8 @@ def run_many(
             single.update(part.single)
             advance(len(found), len(arms) * len(job.seeds))
     for arm, why in single.items():
-        slots = (getattr(arms[arm], slot) for slot in ("initial", "transition", "update"))
-        if any(component is not None and component.batched is True for component in slots):
+        component = getattr(arms[arm], why.partition(":")[0], None)
+        if component is not None and component.batched is True:
             warnings.warn(InputWarning(f"the runs of {arm!r} are made one by one: {why}"), stacklevel=2)
     return job.history(found, single, isinstance(filters, Mapping))
 
