@@ -217,7 +217,9 @@ class _Sweep:
         except NotTogether:
             raise
         except LostRunError:  # all weights of all runs are 0
-            particles, log_weights = self.particles, np.full((len(rows), self.filter.n), -np.inf)
+            self.lose(t, slot, rows)
+            self.runs = self.runs[:0]
+            return
         except Exception as error:
             self.refuse_error(t, slot, error)
         if log_weights is not self.log_weights:

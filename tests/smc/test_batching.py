@@ -29,6 +29,7 @@ from mstfilter.smc import (
     StateSpaceModel,
     Stratified,
     Systematic,
+    Uniform,
     WithInput,
     bootstrap,
     collect,
@@ -360,6 +361,16 @@ def test_lost_runs_are_recorded_and_the_others_continue(model):
         assert np.isnan(runs["ess"][seed, lost_at:]).all() and np.isnan(runs["all"][seed, lost_at:]).all()
     everything = run_many(bootstrap(limited(model, -1e9), 3), ys, range(4))
     assert set(everything.lost) == {0, 1, 2, 3} and np.isneginf(everything["log_evidence"]).all()
+
+
+def test_all_runs_are_lost_at_the_first_step():
+    def program(previous, y):
+        x = sample("x", Normal(0.0, 1.0))
+        observe("y", Uniform(x, x + 1.0), y)
+
+    runs = run_many(Program(program).bootstrap(5), [100.0, 0.0], range(3), **ALL)
+    assert runs.single == {} and runs["all"].shape[:2] == (3, 2) and np.isneginf(runs["z"]).all()
+    assert runs.lost[1].startswith("step 0, initial: ")
 
 
 def test_inputs_of_each_run_are_given_by_row():
