@@ -117,10 +117,6 @@ class _RunFile(BaseModel):
     machine: dict[str, str | int]
 
 
-# Fields of `Info` that info.json holds.
-_COPIED = ("t", "n", "n_candidates", "ess", "resampled", "unique_ancestors", "ancestors", "parents", "log_weights")
-
-
 class _InfoFile(BaseModel):
     """What readers use of info.json."""
 
@@ -131,7 +127,6 @@ class _InfoFile(BaseModel):
     ess: float
     resampled: bool
     unique_ancestors: int | None
-    ancestors: list[int] | None
     parents: dict[str, list[int]]
     weights: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
     quality: dict[str, list[float]] | None
@@ -290,9 +285,12 @@ class RunFolder:
                 pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
                 np.savez_compressed(folder / "truth.npz", labels=truth, questions=pairs.astype(np.int32))
                 quality = {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
-            record = {name: getattr(info, name) for name in _COPIED}
-            weights = state.population.weights
-            record |= {"n_frames": len(clip), "weights": weights, "quality": quality, "notes": info.notes}
+            population = state.population
+            record = {name: getattr(info, name) for name in ("t", "n", "n_candidates", "ess", "resampled")}
+            record |= {
+                name: getattr(population, name) for name in ("unique_ancestors", "parents", "log_weights", "weights")
+            }
+            record |= {"n_frames": len(clip), "quality": quality, "notes": info.notes}
             write_json(folder / "info.json", record)
             write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)

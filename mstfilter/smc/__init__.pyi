@@ -1,8 +1,3 @@
-from mstfilter.smc.batching import (
-    Batch as Batch,
-    batch as batch,
-    batched_slots as batched_slots,
-)
 from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec, load_state as load_state, save_state as save_state
 from mstfilter.smc.components import (
     Always as Always,
@@ -21,19 +16,16 @@ from mstfilter.smc.components import (
 )
 from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.diagnostics import (
-    History as History,
+    Coalescence as Coalescence,
     Measured as Measured,
-    collect as collect,
+    RunVariance as RunVariance,
+    coalescence as coalescence,
     energy_distance as energy_distance,
-    ess as ess,
-    log_evidence as log_evidence,
-    mean as mean,
-    n_particles as n_particles,
-    resampled as resampled,
-    run_many as run_many,
+    log_score as log_score,
+    pit as pit,
+    run_variance as run_variance,
     selection_distance as selection_distance,
-    unique_ancestors as unique_ancestors,
-    weight_entropy as weight_entropy,
+    set_energy_score as set_energy_score,
 )
 from mstfilter.smc.distributions import (
     Bernoulli as Bernoulli,
@@ -52,15 +44,6 @@ from mstfilter.smc.diverse_resampling import (
     FearnheadClifford as FearnheadClifford,
     Gaussian as Gaussian,
 )
-from mstfilter.smc.evaluation import (
-    Coalescence as Coalescence,
-    RunVariance as RunVariance,
-    coalescence as coalescence,
-    log_score as log_score,
-    pit as pit,
-    run_variance as run_variance,
-    set_energy_score as set_energy_score,
-)
 from mstfilter.smc.exact import (
     Kalman as Kalman,
     Marginals as Marginals,
@@ -77,6 +60,17 @@ from mstfilter.smc.gaussian import (
     nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
     ukf_proposal as ukf_proposal,
+)
+from mstfilter.smc.history import (
+    History as History,
+    collect as collect,
+    ess as ess,
+    log_evidence as log_evidence,
+    mean as mean,
+    n_particles as n_particles,
+    resampled as resampled,
+    unique_ancestors as unique_ancestors,
+    weight_entropy as weight_entropy,
 )
 from mstfilter.smc.inference import (
     Chains as Chains,
@@ -138,6 +132,7 @@ from mstfilter.smc.resampling import (
     Stratified as Stratified,
     Systematic as Systematic,
 )
+from mstfilter.smc.running import run_many as run_many
 from mstfilter.smc.smoothing import (
     Record as Record,
     backward_paths as backward_paths,

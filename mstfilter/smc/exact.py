@@ -22,8 +22,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.gaussian import entry, nonlinear_gaussian, vectors
-from mstfilter.smc.inputs import bind_step, split_input, step_parameters, with_step
-from mstfilter.smc.population import check_observations
+from mstfilter.smc.inputs import bind_step, check_observations, split_input, step_parameters, with_step
 from mstfilter.smc.state_space import StateSpaceModel
 
 

@@ -33,11 +33,12 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
-from mstfilter.smc.batching import RunFilters, batched_slots, run_batch
+from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
 from mstfilter.smc.population import Particles, Population, take
 from mstfilter.smc.resampling import Systematic
@@ -132,9 +133,18 @@ class _Posterior:
             raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
         evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
         if possible.any():
-            estimate = self._in_one_sweep if self.batched else self._one_by_one
-            evidence[possible] = estimate(theta[possible], seeds[possible].tolist())
+            evidence[possible] = self._estimates(theta[possible], seeds[possible].tolist())
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
+
+    def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
+        """Log evidences of filters in one sweep, or one by one if this is impossible."""
+        if self.batched:
+            try:
+                return self._in_one_sweep(thetas, seeds)
+            except NotTogether as why:
+                self.batched = False
+                warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=5)
+        return self._one_by_one(thetas, seeds)
 
     def _filter(self, theta: np.ndarray) -> ParticleFilter:
         filter = self.filter_of(theta)
@@ -146,7 +156,7 @@ class _Posterior:
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             with suppress(LostRunError):
-                state, _ = self._filter(theta).run(list(self.observations), seed, keep_arrays=False)
+                state, _ = self._filter(theta).run(list(self.observations), seed)
                 found[r] = state.log_evidence
         return found
 
@@ -156,14 +166,12 @@ class _Posterior:
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
         """
         first = self._filter(thetas[0])
-        slots = batched_slots(first) or ()
-        if any(
-            getattr(first, slot) is not None and slot not in slots for slot in ("initial", "transition", "update")
-        ):
-            raise InputError(
-                "with batched=True the initial, transition and update of the filter must be batched",
-                "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes them so",
-            )
+        for slot in ("initial", "transition", "update"):
+            if getattr(first, slot) is not None and getattr(first, slot).batched is False:
+                raise InputError(
+                    f"with batched=True the {slot} of the filter must be batched",
+                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes it so",
+                )
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:
@@ -172,12 +180,10 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_batch(filters, [list(self.observations)], seeds, check=check, rounding=True, warn=False)
-        if runs.single:
-            self.batched = False
-            slot, reason = next(iter(runs.single.items()))
-            warnings.warn(f"the filters are run one by one: {slot}: {reason}", stacklevel=5)
-        return runs.log_evidence[:, -1]
+        runs = run_together(
+            filters, [list(self.observations)], seeds, {"z": log_evidence}, check=check, rounding=True
+        )
+        return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
 
 def pmmh(

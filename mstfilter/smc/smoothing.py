@@ -30,9 +30,9 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import split_input
+from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
+from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import draw_rows, independent_draws
 from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key

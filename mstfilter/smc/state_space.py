@@ -67,7 +67,7 @@ class StateSpaceModel(AtStep):
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
     batched : bool or None
         Whether the functions treat each particle by itself, so that they can be called with the particles of many
-        runs (see `mstfilter.smc.batching`). None: a batch tries it.
+        runs (see `mstfilter.smc.batching`). None: `run_many` tries it.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]

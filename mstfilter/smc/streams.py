@@ -14,14 +14,19 @@ with a fixed prefix, so that a child never equals a child of `Generator.spawn`.
 A name adds two words to the spawn key, its CRC-32 and 1. It therefore differs from every single index below 2^32, but
 equals that pair of indices: ``key.child("a")`` is ``key.child(zlib.crc32(b"a"), 1)``. Two names with the same CRC-32
 share a stream (probability one in a million for a hundred names).
+
+Rows (R n, ...) are the particles of R runs of n particles, run by run, in components that are called once for all of
+them. `Rows` are such arrays; `RunGenerators` draw them, row r of every array by the generator of run r.
 """
 
 from __future__ import annotations
 
 import ctypes
 import inspect
+import math
 import threading
 import zlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, ClassVar
@@ -31,8 +36,6 @@ from numpy.random.bit_generator import ISpawnableSeedSequence
 
 from mstfilter.errors import InputError
 
-#: Streams whose states are computed together.
-_BLOCK = 1 << 16
 _PREFIX = 0x6D7374  # "mst"; spawn() numbers its children from 0
 
 
@@ -121,10 +124,10 @@ def step_generator(key: Key, t: int, slot: str) -> np.random.Generator:
 @lru_cache(maxsize=32)
 def _seeds_of_steps(key: Key, slot: str, block: int) -> np.ndarray:
     """(64, 4) uint64 seeds of the generators of a slot."""
-    return pcg64_seeds(_step_words([key], slot, range(64 * block, 64 * block + 64)))
+    return pcg64_seeds(step_words([key], slot, range(64 * block, 64 * block + 64)))
 
 
-def _step_words(keys: list[Key], slot: str, steps: range) -> np.ndarray:
+def step_words(keys: list[Key], slot: str, steps: range) -> np.ndarray:
     """(len(steps) * len(keys), k) uint32 words of ``key.child("step", t, slot)`` for each step and key."""
     words = np.array([key_words(key.child("step", 0, slot)) for key in keys], np.uint32)
     repeated = np.tile(words, (len(steps), 1, 1))
@@ -202,18 +205,18 @@ def pcg64_states(words: np.ndarray) -> np.ndarray:
     seed_high, seed_low, inc_high, inc_low = pcg64_seeds(words).T
     # inc = 2 * sequence + 1; state = (inc + seed) * multiplier + inc, modulo 2^128.
     inc_high, inc_low = inc_high << np.uint64(1) | inc_low >> np.uint64(63), inc_low << np.uint64(1) | np.uint64(1)
-    low, high = _add(inc_low, inc_high, seed_low, seed_high)
-    low, high = _add(*_times_multiplier(low, high), inc_low, inc_high)
+    low, high = add_128(inc_low, inc_high, seed_low, seed_high)
+    low, high = add_128(*times_multiplier(low, high), inc_low, inc_high)
     return np.stack([low, high, inc_low, inc_high], axis=1)
 
 
-def _add(a_low: np.ndarray, a_high: np.ndarray, b_low: np.ndarray, b_high: np.ndarray) -> tuple[Any, Any]:
+def add_128(a_low: np.ndarray, a_high: np.ndarray, b_low: np.ndarray, b_high: np.ndarray) -> tuple[Any, Any]:
     """Sums modulo 2^128."""
     low = a_low + b_low
     return low, a_high + b_high + (low < a_low)
 
 
-def _times_multiplier(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def times_multiplier(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Products with the multiplier of PCG64, modulo 2^128."""
     m_high, m_low = np.uint64(0x2360ED051FC65DA4), np.uint64(0x4385DF649FCCF645)
     half, mask = np.uint64(32), np.uint64(0xFFFFFFFF)
@@ -244,12 +247,17 @@ def _named(name: str) -> int:
     return zlib.crc32(name.encode()) | 1 << 32  # two words, so different from any single index below 2^32
 
 
+# --- many runs -----------------------------------------------------------------------------------------------------
+#: Streams whose states are computed together.
+_STREAMS = 1 << 16
+
+
 class SlotStreams:
     """States of the streams of many runs in one slot, for all steps; `seeds` are one per run, below 2^128."""
 
     def __init__(self, seeds: list[int], slot: str, n_steps: int) -> None:
         self.seeds, self.slot, self.n_steps = seeds, slot, n_steps
-        self.block, self.known = max(1, _BLOCK // len(seeds)), -1
+        self.block, self.known = max(1, _STREAMS // len(seeds)), -1
         self.found = np.zeros((0, len(seeds), 4), np.uint64)
 
     def states(self, t: int, runs: np.ndarray) -> np.ndarray:
@@ -257,7 +265,7 @@ class SlotStreams:
         block, position = divmod(t, self.block)
         if block != self.known:
             steps = range(block * self.block, min((block + 1) * self.block, self.n_steps))
-            found = pcg64_states(_step_words([Key(seed) for seed in self.seeds], self.slot, steps))
+            found = pcg64_states(step_words([Key(seed) for seed in self.seeds], self.slot, steps))
             self.found, self.known = found.reshape(len(steps), len(self.seeds), 4), block
         return self.found[position][runs]
 
@@ -391,7 +399,7 @@ def _next_uniforms(states: np.ndarray) -> np.ndarray:
     the number.
     """
     low, high, inc_low, inc_high = states.T
-    low, high = _add(*_times_multiplier(low, high), inc_low, inc_high)
+    low, high = add_128(*times_multiplier(low, high), inc_low, inc_high)
     states[:, 0], states[:, 1] = low, high
     rotation, word = high >> np.uint64(58), high ^ low
     word = word >> rotation | word << (np.uint64(64) - rotation & np.uint64(63))
@@ -416,3 +424,55 @@ def _reused_generator(thread: int) -> tuple[np.random.Generator, memoryview] | N
             return None
         rng.random()
     return rng, memory.data.cast("B")
+
+
+def summaries(log_weights: np.ndarray, top: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n); the numbers of `Population`.
+
+    `top` are the largest log weights (R,), if they are known.
+    """
+    top = log_weights.max(axis=1) if top is None else top
+    weights = log_weights - top[:, None]
+    np.exp(weights, out=weights)
+    totals = weights.sum(axis=1)
+    ess = totals * totals / np.vecdot(weights, weights)
+    # `math.log`, as for a single population: numpy's may differ in the last bit.
+    logs = np.fromiter(map(math.log, (totals / log_weights.shape[1]).tolist()), np.float64, len(totals))
+    return ess, top + logs
+
+
+def each_array(function: Callable[[np.ndarray], np.ndarray], particles: Any) -> Any:
+    """A function of the particles if they are an array, or of every array of a mapping."""
+    if isinstance(particles, Mapping):
+        return {name: function(a) for name, a in particles.items()}
+    if isinstance(particles, np.ndarray):
+        return function(particles)
+    raise InputError("the particles are objects")
+
+
+def flat(particles: Any, n: int) -> Any:
+    """Particles (R n, ...) of particles (R, n, ...)."""
+    return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(n)), particles)
+
+
+def by_run(particles: Any, n: int) -> Any:
+    """Particles (R, n, ...) of particles (R n, ...)."""
+    return each_array(lambda a: np.asarray(a).reshape(-1, n, *a.shape[1:]), particles)
+
+
+def of_runs(particles: Any, row: Any) -> Any:
+    """Particles of one run, or of the runs of an index."""
+    return each_array(lambda a: a[row], particles)
+
+
+def resampled_runs(particles: Any, rows: np.ndarray, index: np.ndarray) -> Any:
+    """Particles after resampling some rows by (len(rows), n) ancestors."""
+
+    def chosen(a: np.ndarray) -> np.ndarray:
+        if len(rows) == len(a):
+            return a[rows[:, None], index]
+        out = a.copy()
+        out[rows] = a[rows[:, None], index]
+        return out
+
+    return each_array(chosen, particles)

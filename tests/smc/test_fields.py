@@ -138,15 +138,3 @@ def test_hints_say_what_was_meant():
     with pytest.raises(InputError) as raised:
         bootstrap(AR1, 5, Systematic)
     assert raised.value.hints == ("pass an instance: resampler=Systematic(...)",)
-
-
-def test_sense_is_not_refused():
-    for part in (
-        EssBelow(1),
-        EssBelow(np.float32(0.25)),
-        EveryKth(np.int64(3)),
-        Kld(n_min=5, n_max=5),
-        Tempered(power=0),
-    ):
-        assert part == part
-    assert len(bootstrap(AR1, np.int64(7)).run([0.1], 0)[0].population) == 7

@@ -21,10 +21,12 @@ from mstfilter.smc import (
     StateSpaceModel,
     WeightResampler,
     auxiliary,
-    batch,
     bootstrap,
     guided,
+    log_evidence,
+    mean,
     resample_move,
+    run_many,
 )
 from tests.smc.models import (
     AR1,
@@ -61,11 +63,13 @@ def test_every_filter_agrees_with_kalman(name, trigger):
     """Mean of L_hat / L within 4 standard errors of 1 (false alarm 6e-5 a case), means and variances within 5."""
     filter = FILTERS[name](trigger)
     moments, exact = kalman_ar1(YS)
-    runs = batch(filter, YS, range(400))
-    ratios = np.exp(runs.log_evidence[:, -1] - exact)
-    populations = [state.population for state in runs.states]
-    means = [p.weights @ p.particles for p in populations]
-    squares = [p.weights @ (p.particles - moments[-1, 0]) ** 2 for p in populations]
+
+    def square(state, info):
+        return state.population.weights @ (state.population.particles - moments[-1, 0]) ** 2
+
+    runs = run_many(filter, YS, range(400), z=log_evidence, mean=mean, square=square)
+    ratios = np.exp(runs["z"][:, -1] - exact)
+    means, squares = runs["mean"][:, -1], runs["square"][:, -1]
     standard = ratios.std(ddof=1) / np.sqrt(len(ratios))
     assert abs(ratios.mean() - 1) < 4 * standard
     assert standard < 0.005, "noise could hide a bias of 2 %"
@@ -85,9 +89,8 @@ def test_one_step_with_the_optimal_proposal_is_exact_for_any_n(n):
 def test_a_fully_adapted_filter_has_equal_weights():
     """With p(y | x_{t-1}) as priority and the optimal proposal, weights after a resampled step are equal."""
     filter = auxiliary(AR1, predictive, 40, optimal, optimal_initial, trigger=Always())
-    _, infos = filter.run(YS, 0)
-    for info in infos:
-        np.testing.assert_allclose(info.log_weights, info.log_weights[0], atol=1e-9)
+    for state, _ in filter.iterate(YS, 0):
+        np.testing.assert_allclose(state.population.log_weights, state.population.log_weights[0], atol=1e-9)
 
 
 def test_a_priority_that_says_nothing_changes_nothing():
@@ -101,10 +104,14 @@ def test_a_priority_that_says_nothing_changes_nothing():
 def test_a_hidden_chain(trigger):
     """Evidence within 4 standard errors (6e-5), filtered marginals within 5."""
     marginals, exact = forward()
-    runs = batch(bootstrap(hmm("vector"), 700, trigger=trigger), SYMBOLS, range(400))
-    ratios = np.exp(runs.log_evidence[:, -1] - exact)
-    populations = [state.population for state in runs.states]
-    shares = np.array([np.bincount(p.particles, p.weights, minlength=3) for p in populations])
+
+    def share(state, info):
+        return np.bincount(state.population.particles, state.population.weights, minlength=3)
+
+    filter = bootstrap(hmm("vector"), 700, trigger=trigger)
+    runs = run_many(filter, SYMBOLS, range(400), z=log_evidence, share=share)
+    ratios = np.exp(runs["z"][:, -1] - exact)
+    shares = runs["share"][:, -1]
     standard = ratios.std(ddof=1) / np.sqrt(len(ratios))
     assert abs(ratios.mean() - 1) < 4 * standard
     assert standard < 0.005

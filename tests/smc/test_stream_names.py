@@ -24,7 +24,6 @@ from mstfilter.smc import (
     StateSpaceModel,
     Systematic,
     auxiliary,
-    batch,
     bootstrap,
     filter as filter_module,
     guided,
@@ -32,6 +31,7 @@ from mstfilter.smc import (
     observe,
     per_particle,
     resample_move,
+    run_many,
     sample,
 )
 from mstfilter.smc.programs import guard as checks
@@ -77,7 +77,7 @@ def test_two_selections_in_a_step_are_independent(filter):
 
     If both selections of a step used one stream, the first case would have the mean 0.888.
     """
-    ratios = np.exp(batch(filter, range(3), range(1000)).log_evidence[:, -1]) / EVIDENCE
+    ratios = np.exp(run_many(filter, range(3), range(1000))["log_evidence"][:, -1]) / EVIDENCE
     assert abs(1 - 0.888) > 5 * ratios.std() / np.sqrt(len(ratios))
     assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(ratios))
 

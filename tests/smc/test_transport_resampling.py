@@ -165,10 +165,10 @@ def test_filter_by_transport_follows_the_kalman_filter():
     exact = kalman_ar1(ys)[0][-1, 0]
     filter = bootstrap(AR1, 200, EnsembleTransform(), Always())
     means, runs = [], [filter.run(ys, seed) for seed in range(20)]
-    for state, infos in runs:
+    for state, _ in runs:
         means.append(state.population.weights @ state.population.particles)
         assert state.log_evidence is None
-        assert (infos[-1].parents["previous"] == -1).all() and infos[-1].unique_ancestors == 0
+        assert (state.population.parents["previous"] == -1).all() and state.population.unique_ancestors == 0
     assert abs(np.mean(means) - exact) <= 3.5 * stats.sem(means) + 0.02
     with pytest.raises(InputError, match="a lookahead needs a resampler that reports ancestors"):
         auxiliary(AR1, predictive, 20, resampler=EnsembleTransform(), trigger=Always()).run(ys, 0)
