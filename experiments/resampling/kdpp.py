@@ -1,7 +1,7 @@
 """A resampler that selects heavy particles that differ from each other: a determinantal point process of fixed size.
 
     mstfilter check ./experiments/resampling/kdpp.py:KDpp
-    mstfilter run SCENE --set resampler=./experiments/resampling/kdpp.py:KDpp
+    mstfilter run RECORDING resampler=./experiments/resampling/kdpp.py:KDpp
 
 `KDpp` draws a set A of n particles with probability proportional to det L_A, L_ij = sqrt(w_i w_j) S_ij, S the
 similarity. Equal particles are never selected together. A selected particle gets the weight w_i / pi_i, pi_i its
