@@ -1,0 +1,207 @@
+"""How good are the methods on real images?
+
+    python experiments/real/run.py                        # all sequences; finished ones are not run again
+    python experiments/real/run.py --only mix_1,jack --methods mst,samples_only --out DIR --sheets DIR
+    python experiments/real/run.py --smoke --out DIR      # one pause
+
+Needs the data in MSTFILTER_SHARED (default ../shared) under real/. Writes pauses.csv (means over the hypotheses at
+each pause), sequences.csv (means over pauses), summary.csv (`mst` minus each method, paired by sequence). With
+--sheets, the worst pauses of `mst` are drawn into a folder outside of the repository, since the images are not ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scores import identities, image_scores, kept, witness_scores
+from sequences import Sequence, sequences
+
+from mstfilter.files import read_csv, write_csv
+from mstfilter.presets import preset
+from mstfilter.scene import Clip, Hypothesis, project
+from mstfilter.smc import State
+from mstfilter.statistics import compare
+
+HERE = Path(__file__).resolve().parent
+SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared")) / "real"
+
+CONSTANTS = HERE.parent / "osd_frames" / "results" / "constants.csv"
+#: Name -> preset and changes. `no past` starts again at every pause.
+METHODS: dict[str, tuple[str, ...]] = {
+    "mst": ("mst",),
+    "mst, no past": ("mst",),
+    "samples_only": ("samples_only",),
+    "single_frame": ("single_frame",),
+    "union": ("union",),
+    "crossover": ("mst_rules", "proposal.completer=network"),
+    "paper": ("paper",),
+    "authors": ("authors",),
+    "floor_image": ("floor_image",),
+    "floor_components": ("floor_components",),
+    "floor_one_blob": ("floor_one_blob",),
+}
+_WORST = 12  # pauses on a contact sheet
+
+
+def held_out(sequence: Sequence, method: str) -> list[str]:
+    """Constants of the segmentation that were chosen on OSD frames of the other camera set-ups.
+
+    They replace the defaults on frames of OSD, which were chosen on all of them.
+    """
+    if sequence.source != "osd" or method.startswith("floor"):
+        return []
+    row = next(r for r in read_csv(CONSTANTS) if r["frames"] == sequence.name)
+    contour = method in ("paper", "authors")
+    weight = row["colour_weight" if contour else "colour_weight_learned"]
+    changes = ["proposal.boundary.component=colour_depth", f"proposal.boundary.colour_weight={weight}"]
+    return changes + [f"proposal.tree.{field}={row[field]}" for field in ("centre", "slope") if contour]
+
+
+def run(sequence: Sequence, methods: list[str], seed: int, last: int | None) -> Iterator[dict[str, object]]:
+    """One row for each pause and method."""
+    filters = {name: preset(*METHODS[name], *held_out(sequence, name)) for name in methods}
+    states: dict[str, State] = {name: f.start(seed) for name, f in filters.items()}
+    histories: dict[str, list[list[dict[str, int]]]] = defaultdict(list)  # of each hypothesis and its ancestors
+    for clip in sequence.recording.clips()[:last]:
+        truth = sequence.truth(clip.index)
+        for name, f in filters.items():  # all methods process a pause before the next one: they share cached work
+            own = Clip((clip.after,), clip.grid, 0) if name == "mst, no past" else clip
+            start = f.start(seed) if name == "mst, no past" else states[name]
+            began = time.process_time()
+            states[name], _ = f.step(start, own)
+            seconds = time.process_time() - began
+            particles = states[name].population.particles
+            images = [project(h, clip.after.camera) for h in particles]
+            rows = [image_scores(image, truth, clip.after, clip.grid) for image in images]
+            if sequence.witness is not None:
+                pairs = zip(rows, particles, strict=True)
+                rows = [row | witness_scores(h, clip.after, sequence.witness(clip.index)) for row, h in pairs]
+            parents = states[name].population.parents.get("previous", np.full(len(particles), -1))
+            named = (identities(i, h, truth) for i, h in zip(images, particles, strict=True))
+            before = histories[name]
+            histories[name] = [
+                [*(before[j] if before and j >= 0 else []), one] for j, one in zip(parents, named, strict=True)
+            ]
+            mean = {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
+            least = {"least_found": min(row["found"] for row in rows)}
+            followed = _kept(histories[name])
+            about = {"sequence": sequence.name, "source": sequence.source, "pause": clip.index, "method": name}
+            yield about | mean | least | followed | {"seconds": round(seconds, 2)}
+
+
+def _kept(lineages: list[list[dict[str, int]]]) -> dict[str, int]:
+    """Identities kept up to now in the hypothesis that kept most; `lineages` has those of it and its ancestors."""
+    best = max((kept(line) for line in lineages), key=lambda found: found[0] / max(found[1], 1))
+    return {"kept": best[0], "named": best[1]}
+
+
+def sequence_means(rows: list[dict[str, str]]) -> list[dict[str, object]]:
+    """Means over pauses, of each sequence and method; `kept` and `named` are those of the last pause."""
+    groups: dict[tuple[str, str], list[dict[str, str]]] = defaultdict(list)
+    for row in rows:
+        groups[row["sequence"], row["method"]].append(row)
+    found = []
+    for (name, method), own in groups.items():
+        numbers = [k for k in own[0] if k not in ("sequence", "source", "pause", "method", "kept", "named")]
+        means = {
+            k: round(float(np.mean([float(r[k]) for r in own if r[k] != ""])), 4) for k in numbers if own[0][k] != ""
+        }
+        last = max(own, key=lambda r: int(r["pause"]))
+        about = {"sequence": name, "source": own[0]["source"], "method": method, "pauses": len(own)}
+        found.append(about | means | {k: last[k] for k in ("kept", "named")})
+    return found
+
+
+def summary(means: list[dict[str, object]]) -> list[dict[str, object]]:
+    """`mst` minus each method in quality, over the sequences of each source and over those with labels."""
+    table: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
+    for row in means:
+        for group in (row["source"], "labelled") if row["source"] in ("hots", "osd") else (row["source"],):
+            table[str(group)][str(row["method"])][str(row["sequence"])] = float(str(row["quality"]))
+    rows = []
+    for group, methods in table.items():
+        for method, values in methods.items():
+            row: dict[str, object] = {"source": group, "method": method, "sequences": len(values)}
+            row["quality"] = round(float(np.mean(list(values.values()))), 4)
+            if method != "mst" and "mst" in methods and len(values) > 1:
+                d = compare(methods["mst"], values)
+                row |= {"mst_minus": round(d.mean, 4), "low": round(d.low, 4), "high": round(d.high, 4)}
+            rows.append(row)
+    return rows
+
+
+def overlay(rgb: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Objects of a label image (H, W) in colour over an image (H, W, 3)."""
+    colours = np.random.default_rng(5).integers(40, 255, (int(image.max()) + 1, 3))
+    colours[0] = 0
+    mixed = np.where((image > 0)[..., None], 0.5 * rgb + 0.5 * colours[image], 0.8 * rgb).astype(np.uint8)
+    edges = cv2.morphologyEx(image.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
+    mixed[edges & (image > 0)] = 255
+    return mixed
+
+
+def sheet(sequence: Sequence, seed: int, pauses: list[int], out: Path) -> None:
+    """Truth, and the first hypotheses of `mst`, at some pauses."""
+    lines = []
+    for state, info in preset("mst").iterate(sequence.recording.clips()[: max(pauses) + 1], seed):
+        if info.t in pauses:
+            frame = sequence.recording.clips()[info.t].after
+            shown: tuple[Hypothesis, ...] = tuple(state.population.particles[:3])
+            images = [np.maximum(sequence.truth(info.t).labels, 0), *(project(h, frame.camera) for h in shown)]
+            lines.append(np.hstack([cv2.resize(overlay(frame.rgb, i.astype(np.int64)), (480, 360)) for i in images]))
+    cv2.imwrite(str(out / f"{sequence.name}.jpg"), cv2.cvtColor(np.vstack(lines), cv2.COLOR_RGB2BGR))
+
+
+def main() -> None:
+    """Run the missing sequences and methods, then summarise."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="one pause; needs --out")
+    parser.add_argument("--out", type=Path, default=HERE / "results")
+    parser.add_argument("--only", default="", help="names of sequences or sources, separated by commas")
+    parser.add_argument("--methods", default=",".join(METHODS).replace("mst, no past", "no past"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sheets", type=Path, help="draw the worst pauses of `mst` into this folder")
+    options = parser.parse_args()
+    if options.smoke and options.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
+    cv2.setNumThreads(1)
+    methods = [{"no past": "mst, no past"}.get(name, name) for name in options.methods.split(",")]
+    if options.smoke:
+        options.only, methods = "learn0-1", ["mst", "floor_image"]
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "pauses.csv"
+    rows: list[dict] = read_csv(path) if path.exists() else []
+    wanted = options.only.split(",") if options.only else []
+    for sequence in sequences(SHARED):
+        if wanted and not {sequence.name, sequence.source} & set(wanted):
+            continue
+        done = {row["method"] for row in rows if row["sequence"] == sequence.name}
+        rows += run(
+            sequence, [name for name in methods if name not in done], options.seed, 1 if options.smoke else None
+        )
+        columns = dict.fromkeys(key for row in rows for key in row)
+        rows = [{key: str(row.get(key, "")) for key in columns} for row in rows]
+        write_csv(path, rows)
+        own = [row for row in rows if row["sequence"] == sequence.name and row["method"] == "mst"]
+        print(sequence.name, f"mst {np.mean([float(row['quality']) for row in own]):.3f}" if own else "", flush=True)
+        if options.sheets:
+            options.sheets.mkdir(parents=True, exist_ok=True)
+            worst = sorted(own, key=lambda row: float(row["quality"]))[:_WORST]
+            sheet(sequence, options.seed, [int(row["pause"]) for row in worst], options.sheets)
+    means = sequence_means(rows)
+    write_csv(options.out / "sequences.csv", means, list(dict.fromkeys(key for row in means for key in row)))
+    found = summary(means)
+    write_csv(options.out / "summary.csv", found, list(dict.fromkeys(key for row in found for key in row)))
+    for row in found:
+        print("  ".join(f"{value!s:>16}" for value in row.values()))
+
+
+if __name__ == "__main__":
+    main()
