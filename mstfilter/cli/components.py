@@ -67,7 +67,7 @@ def check(
 def _check_folder(path: Path) -> None:
     """Print which files of a run, of the runs of a study, or of a recording are damaged; then exit with code 1."""
     from mstfilter.files import SUMS, damaged_files
-    from mstfilter.formats import RecordingFolder
+    from mstfilter.formats import open_recording
     from mstfilter.runs import RunFolder
 
     runs = [run.parent for run in sorted(path.glob("**/run.json")) if ".partial/" not in run.as_posix()]
@@ -76,7 +76,7 @@ def _check_folder(path: Path) -> None:
     if not runs and noted:
         damaged = [f"{path}: {wrong}" for wrong in damaged_files(path)]
     if not runs and not damaged:
-        RecordingFolder().open(path).check()
+        open_recording(path, "recording").check()
     note = "" if noted else f"; {SUMS} is missing, so changes are not noticed"
     print("\n".join(f"damaged     {line}" for line in damaged) or f"sound       {path}{note}")
     if damaged:
