@@ -139,18 +139,29 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
     raise InputError(f"{name} is {found}, expected {article} {interface.__name__}", *hints)
 
 
-def missing_library(error: ImportError, what: str, *hints: str) -> MissingLibraryError:
-    """The error for a library that cannot be imported: `what` needs it, and how to install it."""
-    library = (error.name or str(error)).partition(".")[0]
+def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
+    """The error for a library that cannot be imported: `what` needs it, and how to install it.
+
+    `library` is its name; by default that of the module in the exception.
+    """
+    library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
-        f"{what} needs {library}, which cannot be imported: {reason(error)}",
+        f"{what} needs {library}, which cannot be imported: {error}",
         f"pip install {_PACKAGES.get(library, library)}",
         *hints,
     )
 
 
-#: Packages of libraries whose names differ, and extras of this package for those that it does not install by itself.
-_PACKAGES = {"cv2": "opencv-python-headless", "pytest": "'mstfilter[check]'"}
+#: What pip installs for a library if the name is another, or the library belongs to an extra of this package.
+_PACKAGES = {
+    "cv2": "opencv-python-headless",
+    "pytest": "'mstfilter[check]'",
+    "h5py": "'mstfilter[h5py]'",
+    "rosbags": "'mstfilter[bags]'",
+    "onnxruntime": "'mstfilter[onnx]'",
+    "dask.distributed": "'mstfilter[dask]'",
+    "rerun-sdk": "'mstfilter[viewer]'",
+}
 
 
 def place_in_user_file(error: BaseException) -> str | None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
-from mstfilter.errors import MissingLibraryError
+from mstfilter.errors import MissingLibraryError, missing_library
 
 SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")
 
@@ -26,9 +26,7 @@ def import_open3d() -> ModuleType:
     try:
         open3d = import_module("open3d")
     except ModuleNotFoundError as error:
-        raise MissingLibraryError(
-            f"open3d cannot be imported: {error}", f"pip install {(error.name or 'open3d').partition('.')[0]}"
-        ) from error
+        raise missing_library(error, "this function") from error
     except (ImportError, OSError) as error:  # a shared library does not load
         raise MissingLibraryError(
             f"open3d cannot be imported: {error}",

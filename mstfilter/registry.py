@@ -313,7 +313,7 @@ def nested_components(component: Any) -> Iterator[Any]:
     if isinstance(component, tuple):
         for part in component:
             yield from nested_components(part)
-    elif dataclasses.is_dataclass(component):
+    elif dataclasses.is_dataclass(component) and not isinstance(component, type):
         yield component
         for field in dataclasses.fields(component):
             yield from nested_components(getattr(component, field.name))

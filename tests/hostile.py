@@ -19,7 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +49,6 @@ def _write_recording(path: Path) -> None:
                 writer.add_voxels(labels)
 
 
-def _read_recording(path: Path) -> None:
-    from mstfilter.formats import open_recording
-
-    recording = open_recording(path)
-    recording.check()
-    _ = recording.truth_key
-
-
 def _reader(name: str, *options: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
         from mstfilter.formats import open_recording
@@ -69,21 +61,15 @@ def _reader(name: str, *options: str) -> Callable[[Path], None]:
 
 
 def _layout(name: str) -> Callable[[Path], Any]:
-    def write(path: Path) -> None:
-        from tests.formats import layouts
+    from tests.formats import layouts
 
-        getattr(layouts, f"write_{name}")(path, shifts=(0, 0, 3, 3))
-
-    return write
+    return partial(getattr(layouts, f"write_{name}"), shifts=(0, 0, 3, 3))
 
 
 def _bag(kind: str) -> Callable[[Path], Any]:
-    def write(path: Path) -> None:
-        from tests.formats import bags
+    from tests.formats import bags
 
-        bags.write(path / "it", kind, bags.scene_messages(kind == "bag", shifts=(0, 0, 3, 3)))
-
-    return write
+    return lambda path: bags.write(path / "it", kind, bags.scene_messages(kind == "bag", shifts=(0, 0, 3, 3)))
 
 
 def _read_bag(path: Path) -> None:
@@ -301,7 +287,7 @@ def _read_cache(path: Path) -> None:
 
 #: Every kind of input, by name.
 KINDS = {
-    "recording": Kind(_write_recording, _read_recording),
+    "recording": Kind(_write_recording, _reader("")),
     "run": Kind(_write_run, _read_run),
     "report": Kind(_write_run, _draw_run),
     "preset": Kind(_write_preset, _read_preset),

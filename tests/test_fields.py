@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
@@ -58,7 +59,7 @@ class Own(Part):
     ],
 )
 def test_values_outside_of_their_bounds_are_named(wrong, message):
-    Whole(), Whole(other=Part(), free=-5)
+    Whole(), Whole(other=Part(), free=-5, count=np.int64(3), scale=np.float32(0.5), share=1)
     with pytest.raises(InputError) as caught:
         Whole(**wrong)
     assert caught.value.message == message

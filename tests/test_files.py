@@ -201,7 +201,7 @@ def test_a_demo_replaces_demos_only(recording, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(recording.path, out / "recording")
     before = content(tmp_path)
-    assert "is missing" in call("demo", "--out", out, capsys=capsys)[2]
+    assert "not of a demo: recording" in call("demo", "--out", out, capsys=capsys)[2]
     run(recording, out / "run")
     with_run = content(tmp_path)
     code, _, err = call("demo", "--out", out, capsys=capsys)

@@ -72,3 +72,11 @@ def test_a_component_says_which_library_it_needs():
     done = light("from mstfilter.presets import REGISTRY; REGISTRY.find_class('update', 'partition')")
     assert "MissingLibraryError: update: component 'partition' needs networkx" in done.stderr
     assert done.stderr.endswith("hint: pip install networkx\n")
+
+
+def test_storing_a_run_imports_neither_programs_nor_studies():
+    code = "import sys; from mstfilter.runs import RunFolder, filter_recording; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
+    loaded = done.stdout.split()
+    assert "mstfilter.smc.checkpoint" in loaded
+    assert not [name for name in loaded if name.startswith(("mstfilter.smc.programs", "mstfilter.study"))]

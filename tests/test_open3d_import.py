@@ -12,7 +12,7 @@ from mstfilter.open3d_import import import_open3d
 
 def test_a_missing_package_is_reported_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(MissingLibraryError, match="open3d cannot be imported") as caught:
+    with pytest.raises(MissingLibraryError, match="needs open3d, which cannot be imported") as caught:
         import_open3d()
     assert caught.value.hints == ("pip install open3d",)
 

@@ -60,13 +60,16 @@ def test_in_a_wheel(wheel, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path / "site")
-    assert {"mstfilter/_models/mst.toml", "mstfilter/_models/published/cob.py"} <= set(names)
+    programs = {f"mstfilter/_models/{name}.py" for name in ("published/cob", "mst_training/border")}
+    assert {"mstfilter/_models/mst.toml", *programs} <= set(names)
     assert "mstfilter/_examples/resampler.py" in names
     assert "mstfilter/_examples/scenes/transition.py" in names
     assert {"mstfilter/report/templates/viewer.html", "mstfilter/report/figures.mplstyle"} <= set(names)
     assert "mstfilter/py.typed" in names
     assert any(name.startswith("mstfilter/report/") and name.endswith((".html", ".j2", ".jinja")) for name in names)
-    assert not [name for name in names if name.startswith(("tests/", "experiments/", "docs/"))]
+    assert not [
+        name for name in names if name.startswith(("tests/", "experiments/", "docs/")) or name.endswith(".pyc")
+    ]
     package, folder = ask(tmp_path, PYTHONPATH=str(tmp_path / "site"))
     assert package == str(tmp_path / "site" / "mstfilter")
     assert folder == str(tmp_path / "site" / "mstfilter" / "_models")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.smc import KDpp, Similarity, bootstrap, linear_gaussian
+from mstfilter.smc import ClusterStratified, Similarity, bootstrap, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,6 @@ class MySimilarity(Similarity):
 if __name__ == "__main__":
     # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
     model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
-    filter = replace(bootstrap(model, n=50), resampler=KDpp(similarity=MySimilarity()))
+    filter = replace(bootstrap(model, n=50), resampler=ClusterStratified(similarity=MySimilarity()))
     state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
     print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -23,10 +23,10 @@ from mstfilter.smc import (
     StateSpaceModel,
     Stratified,
     Systematic,
-    batch,
     bootstrap,
     observe,
     pmmh,
+    run_many,
     sample,
 )
 
@@ -99,9 +99,9 @@ def ratios(ys: np.ndarray, n_runs: int, n: int) -> None:
         "program, 4 arms": [Program(walk).bootstrap(n, resampler=scheme) for scheme in schemes],
     }
     for name, arms in families.items():
-        assert not any(batch(arm, ys[:2], range(4)).single for arm in arms)
+        assert not any(run_many(arm, ys[:2], range(4)).single for arm in arms)
         found = [
-            seconds_of(lambda arm=arm: batch(arm, ys, range(n_runs)))
+            seconds_of(lambda arm=arm: run_many(arm, ys, range(n_runs)))
             / (10 * seconds_of(lambda arm=arm: [arm.run(ys, seed) for seed in range(n_runs // 10)]))
             for arm in arms
         ]
@@ -127,7 +127,7 @@ def main() -> None:
     filter = bootstrap(MODEL, options.particles)
     programs = {
         "plain": lambda: plain(ys, options.runs, options.particles),
-        "batch": lambda: batch(filter, ys, range(options.runs)).log_evidence[:, -1],
+        "batch": lambda: run_many(filter, ys, range(options.runs))["log_evidence"][:, -1],
         "single runs (a tenth)": lambda: [filter.run(ys, seed)[0] for seed in range(options.runs // 10)],
     }
     means = {name: np.mean(programs[name]()) for name in ("plain", "batch")}

@@ -116,7 +116,8 @@ def smc_tasks() -> dict[str, Callable[[], Any]]:
 
     def sweep(model: Any, observations: Any) -> Callable[[], Any]:
         filter = smc.bootstrap(model, 100)
-        return lambda: smc.batch(filter, observations[:100], range(200))
+        many = getattr(smc, "batch", smc.run_many)  # the name in versions before run_many took a single filter
+        return lambda: many(filter, observations[:100], range(200))
 
     def resample(scheme: Any) -> Callable[[], Any]:
         return lambda: scheme.select(rng, log_weights, len(log_weights))

@@ -177,7 +177,7 @@ def resampled_posterior(log_likelihood):
 def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
     basic = {
         **{name: getattr(smc, name)() for name in ("Multinomial", "Stratified", "Systematic", "Residual", "Ssp")},
-        **{name: getattr(smc, name)() for name in ("Killing", "Rejection", "FearnheadClifford", "Chopthin")},
+        **{name: getattr(smc, name)() for name in ("Killing", "FearnheadClifford", "Chopthin")},
         "Residual, stratified": smc.Residual("stratified"),
         "Residual, systematic": smc.Residual("systematic"),
         "Chopthin, 20": smc.Chopthin(20.0),
@@ -198,13 +198,10 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
         yield f"largest of {example.__name__}", smc.LargestWeights(), example, None
         yield f"coalesced of {example.__name__}", smc.Coalesced(), example, None
     for example in (numbers, vectors, mapping):
-        yield f"k-DPP of {example.__name__}", smc.KDpp(), example, None
-        yield f"greedy of {example.__name__}", smc.GreedyDiverse(), example, None
         yield f"clusters of {example.__name__}", smc.ClusterStratified(), example, None
         yield f"Hilbert sort of {example.__name__}", smc.Sorted(), example, None
     for example in (numbers, vectors):
         yield f"transform of {example.__name__}", smc.EnsembleTransform(), example, None
-    yield "Metropolis", smc.Metropolis(), numbers, None
     yield "keep weights", smc.KeepWeights(), numbers, None
 
 
@@ -236,7 +233,7 @@ def transitions() -> Iterator[tuple[str, Any, Any, Any]]:
     model = smc.linear_gaussian(F=A, Q=eye, H=eye, R=eye, m0=[0.0, 0.0], P0=eye)
     yield "linear, two dimensions", smc.Dynamics(model), vectors, None
     yield "AR(1)", smc.Dynamics(AR1), numbers, other_faults.exact_walk
-    yield "AR(1), guided", smc.GuidedTransition(AR1, optimal), numbers, other_faults.exact_moves
+    yield "AR(1), guided", smc.Dynamics(AR1, optimal), numbers, other_faults.exact_moves
     yield "user: guided", other_faults.Guided(), numbers, other_faults.exact_moves
     yield "branching", smc.Branching(smc.Dynamics(AR1), 3), numbers, None
     yield "density", other_faults.CorrectDensity(), numbers, other_faults.exact_density
@@ -247,7 +244,7 @@ def proposals() -> Iterator[tuple[str, Any, Any, Any]]:
         yield f"draws {name}", Draw(draw), numbers, None
         yield f"draws {name}, exact", Draw(draw), numbers, lambda rng, n, draw=draw: (Population(draw(rng, n)), 0.5)
     yield "AR(1)", smc.Prior(AR1), numbers, other_faults.exact_prior
-    yield "AR(1), guided", smc.GuidedInitial(AR1, optimal_initial), numbers, guided_prior
+    yield "AR(1), guided", smc.Prior(AR1, optimal_initial), numbers, guided_prior
     for component in (
         other_faults.correct_draws(),
         other_faults.correct_weighed(),

@@ -29,7 +29,7 @@ from mstfilter.smc import Population, Proposal, Transition, Update
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
 SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
 SCHEMES = ("multinomial", "stratified", "systematic", "residual", "ssp", "killing", "fearnhead_clifford")
-SCHEMES += ("clusters", "kdpp", "greedy_diverse", "coalesced", "tempered", "shuffled")
+SCHEMES += ("clusters", "coalesced", "tempered", "shuffled")
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,9 @@ def of_run(recording: Any, preset: str, *overrides: str) -> dict[str, str]:
     found = {}
     for state, info in mstfilter.preset(preset, *overrides).iterate(recording.clips(), 0):
         labels = [hypothesis.labels for hypothesis in state.population.particles]
-        parents = [np.asarray(info.parents[name]) for name in sorted(info.parents)]
-        found[f"pause {info.t}"] = digest(*labels, info.log_weights, *parents)
+        population = state.population
+        parents = [np.asarray(population.parents[name]) for name in sorted(population.parents) if name != "ancestor"]
+        found[f"pause {info.t}"] = digest(*labels, population.log_weights, *parents)
     return found
 
 
@@ -98,7 +99,8 @@ def of_smc() -> dict[str, str]:
             )
             values = []
             for state, info in filter.iterate(observations, 5):
-                values += [state.population.particles, state.population.log_weights, info.ancestors, info.ess]
+                ancestors = state.population.parents.get("ancestor", np.arange(info.n))
+                values += [state.population.particles, state.population.log_weights, ancestors, info.ess]
             found[f"{name} {resample}"] = digest(*values)
     return found
 

@@ -13,6 +13,7 @@ from canvas import crop, page, save, show, voxels
 from teaser import FEW
 
 from mstfilter.report import colour, overlay, viewpoint
+from mstfilter.scene import scaled_area
 from mstfilter.scoring import MIN_PIXELS
 from mstfilter.simulation import SimulatedScene, scene_family
 
@@ -31,7 +32,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
         truth, grid, camera = scene.truth(), family.grid(), scene.camera
         colours = {label: colour(label - 1) for label in range(1, int(truth.max()) + 1)}
         pixels = np.bincount(shot["instance"].ravel(), minlength=256)
-        hidden = [k for k in colours if pixels[k] < max(1.0, MIN_PIXELS * camera.width * camera.height / 307200)]
+        hidden = [k for k in colours if pixels[k] < scaled_area(MIN_PIXELS, camera.width * camera.height)]
         title = f"{name.upper()}: {scene.world.n_objects} objects" + (
             f", {len(hidden)} out of sight" if hidden else ""
         )

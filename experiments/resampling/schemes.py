@@ -1,4 +1,4 @@
-"""The schemes that are compared: every registered resampler."""
+"""The schemes that are compared: every registered resampler, and `KDpp`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from kdpp import KDpp
 
 from mstfilter.smc import (
     Chopthin,
@@ -15,14 +16,10 @@ from mstfilter.smc import (
     Equivalence,
     FearnheadClifford,
     Gaussian,
-    GreedyDiverse,
-    KDpp,
     KeepWeights,
     Killing,
     LargestWeights,
-    Metropolis,
     Multinomial,
-    Rejection,
     Resampler,
     Residual,
     Shuffled,
@@ -47,15 +44,12 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
         "stratified": Stratified(),
         "killing": Killing(),
         "multinomial": Multinomial(),
-        "rejection": Rejection(),
-        "metropolis": Metropolis(),
         "chopthin": Chopthin(),
         "tempered": Tempered(),
         "fearnhead_clifford": FearnheadClifford(),
         "coalesced": Coalesced(equivalence=equivalence),
         "clusters": ClusterStratified(similarity),
         "kdpp": KDpp(similarity),
-        "greedy_diverse": GreedyDiverse(similarity),
         "largest_weights": LargestWeights(),
         "keep_weights": KeepWeights(),
     }

@@ -22,8 +22,10 @@ from mstfilter.smc import (
     StateSpaceModel,
     Stratified,
     Systematic,
-    batch,
     bootstrap,
+    log_evidence,
+    mean,
+    run_many,
     run_variance,
 )
 
@@ -100,9 +102,8 @@ def rows(n: int, many: int, single: int, arms: Iterable[str] = ARMS) -> Iterator
         for arm in arms:
             scheme, trigger = ARMS[arm]
             filter = bootstrap(model, n, scheme, trigger)
-            runs = batch(filter, ys, range(many))
-            means = [s.population.weights @ s.population.particles for s in runs.states if s is not None]
-            true = {"log evidence": runs.log_evidence[:, -1].var(ddof=1), "mean": np.var(means, ddof=1)}
+            runs = run_many(filter, ys, range(many), z=log_evidence, mean=mean)
+            true = {"log evidence": runs["z"][:, -1].var(ddof=1), "mean": runs["mean"][:, -1].var(ddof=1)}
             for lag in (None, LAG):
                 found = [run_variance(filter, ys, many + k, lag) for k in range(single)]
                 estimates = {

@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mst_training.border_data import BorderSamples, targets
-from mst_training.loop import Training, calibration_error, fit_calibration
+from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
+from mstfilter.forecasts import ForecastTable
 from mstfilter.segmentation.border_network import (
     BORDER_ARCHITECTURE,
     CENTRE_UNIT,
@@ -208,15 +209,14 @@ class Tally:
         """Log loss, largest F over thresholds and calibration error of the border; foreground and centre if known."""
         step = self._EDGES[1] - self._EDGES[0]
         logit = np.append(self._EDGES - step / 2, self._EDGES[-1] + step / 2)
-        logit = calibration[0] * logit + calibration[1]
         no, yes = self.counts
-        n = max(self.counts.sum(), 1)
+        table = ForecastTable(1 / (1 + np.exp(-calibration[0] * logit - calibration[1])), no, yes)
         above_no, above_yes = (np.cumsum(part[::-1])[::-1] for part in (no, yes))
         f = 2 * above_yes / np.maximum(above_no + above_yes + yes.sum(), 1)
         result = {
-            "log_loss": float((yes * np.logaddexp(0, -logit) + no * np.logaddexp(0, logit)).sum() / n),
+            "log_loss": table.log_loss(),
             "f": float(f.max()),
-            "calibration_error": calibration_error(1 / (1 + np.exp(-logit)), yes, yes + no),
+            "calibration_error": table.reliability(20).error,
         }
         if self.apart:
             result["foreground_iou"] = float(self.overlap[0] / max(self.overlap[1], 1))

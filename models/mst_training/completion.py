@@ -21,11 +21,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mst_training.completion_data import MASK_KINDS, CompletionSamples
-from mst_training.loop import Training, calibration_error, fit_calibration
+from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
 from mst_training.shapes import HELD_OUT
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, ShapePosterior
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, to_channels
+from mstfilter.forecasts import ForecastTable
+from mstfilter.scene import Seen
+
+_OWN = Seen.SURFACE | Seen.BEHIND  # on or behind the visible surface of the object
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,11 @@ class CompletionTraining(Training):
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=self.half_precision):
             features, prior = networks["net"].encode(x)
             law: LatentLaw = networks["posterior"](features, truth.float())
-            logits = networks["net"].decode(features, law.draw(noise))
-        unknown, own = (bits & 4) == 0, ((bits & 9) > 0).sum(dim=(1, 2, 3))
+            logits = networks["net"].decode(features, law.mean + noise * law.log_std.exp())
+        unknown, own = ~Seen.FREE.among(bits), _OWN.among(bits).sum(dim=(1, 2, 3))
         loss = functional.binary_cross_entropy_with_logits(logits.float(), truth.float(), reduction="none")
         per_sample = ((loss * unknown).sum(dim=(1, 2, 3)) / (own + 50)).mean()
-        nats = law.divergence(prior).mean()
+        nats = divergence(law, prior).mean()
         total = per_sample + self.divergence * min(1.0, step / 2000) * nats
         return total, (float(per_sample.detach()), float(nats.detach()))
 
@@ -90,7 +94,7 @@ class CompletionTraining(Training):
     ) -> tuple[dict[str, Any], dict[str, float], list[dict[str, Any]]]:
         logits, outcomes = [], []
         for part, found in _logits(net, validation, device):
-            unknown = torch.from_numpy((validation.bits[part] & 4) == 0)
+            unknown = torch.from_numpy(~Seen.FREE.among(validation.bits[part]))
             logits.append(found[unknown])
             outcomes.append(torch.from_numpy(validation.truth[part])[unknown])
         calibration = fit_calibration(torch.cat(logits), torch.cat(outcomes))
@@ -101,6 +105,33 @@ class CompletionTraining(Training):
             "calibration": {"scale": calibration[0], "shift": calibration[1]},
         }
         return described, figures, rows
+
+
+def divergence(law: LatentLaw, other: LatentLaw) -> Tensor:
+    """Kullback-Leibler divergence (b,) of `law` from `other`, in nats."""
+    ratio = 2 * (law.log_std - other.log_std)
+    distance = ((law.mean - other.mean) * (-other.log_std).exp()) ** 2
+    return 0.5 * (ratio.exp() + distance - 1 - ratio).sum(dim=1)
+
+
+class ShapePosterior(nn.Module):
+    """The law of z given the input and the true shape."""
+
+    def __init__(self, width: int, latent: int) -> None:
+        super().__init__()
+        self.stem = nn.Conv3d(8, width, 3, padding=1)
+        self.down1 = nn.Conv3d(2 * width, 2 * width, 3, stride=2, padding=1)
+        self.down2 = nn.Conv3d(2 * width, 4 * width, 3, stride=2, padding=1)
+        self.law = nn.Linear(8 * width, 2 * latent)
+
+    def forward(self, features: list[Tensor], truth: Tensor) -> LatentLaw:
+        """From the features of the input, and the true shape (b, X, Y, Z) as 0 and 1."""
+        x = functional.silu(self.stem(to_channels(truth[:, None])))
+        x = functional.silu(self.down1(torch.cat([x, features[0].detach()], dim=1)))
+        x = functional.silu(self.down2(x))
+        pooled = torch.cat([x.mean(dim=(2, 3, 4)), features[2].detach().mean(dim=(2, 3, 4))], dim=1)
+        mean, log_std = self.law(pooled.float()).chunk(2, dim=1)
+        return LatentLaw(mean, log_std.clamp(-4, 2))
 
 
 def _heights() -> Tensor:
@@ -127,7 +158,7 @@ def evaluate(net: CompletionNet, samples: CompletionSamples, device: torch.devic
     """Mean IoU of the mode, and its log loss over voxels that are not free, before calibration."""
     iou, loss, n = [], 0.0, 0
     for part, logits in _logits(net, samples, device):
-        truth, unknown = torch.from_numpy(samples.truth[part]), torch.from_numpy((samples.bits[part] & 4) == 0)
+        truth, unknown = (torch.from_numpy(v) for v in (samples.truth[part], ~Seen.FREE.among(samples.bits[part])))
         iou.append(shape_iou(((logits > 0) & unknown).numpy(), truth.numpy()))
         every = functional.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
         loss, n = loss + float((every * unknown).sum()), n + int(unknown.sum())
@@ -142,7 +173,7 @@ def measure(
     The calibration error and the log loss, in nats a voxel, are of the probabilities.
     """
     scale, shift = calibration
-    unknown, truth = (samples.bits & 4) == 0, samples.truth
+    unknown, truth = ~Seen.FREE.among(samples.bits), samples.truth
     p = np.zeros(truth.shape, np.float32)
     for part, logits in _logits(net, samples, device):
         p[part] = torch.sigmoid(scale * logits + shift).numpy() * unknown[part]
@@ -160,12 +191,12 @@ def measure(
         for name, of in _groups(samples).items()
         if of.any()
     ]
-    question = unknown & (((samples.bits & 9) > 0) | (p > 0.02))
+    question = unknown & (_OWN.among(samples.bits) | (p > 0.02))
     figures = {
         "iou": float(iou["network"].mean()),
         "iou_extrude": float(iou["extrude"].mean()),
         "log_loss": float(_log_loss(p, truth, question).mean()),
-        "calibration_error": calibration_error(p[question], truth[question]),
+        "calibration_error": ForecastTable.of(np.round(p[question], 3), truth[question]).reliability(20).error,
     }
     return figures, rows
 

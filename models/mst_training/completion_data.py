@@ -28,7 +28,7 @@ from mst_training.scenes import HEIGHT, WIDTH, Samples, View, cast, displaced, d
 from mstfilter.completion import Completer, Extrude, ObservedBox, observed_box
 from mstfilter.completion.crops import EDGE, LATTICE, crop_box
 from mstfilter.completion.observed import decode_signed, encode_box, observed_again
-from mstfilter.scene import Camera, Frame, ObjectView, VoxelGrid, scene_cache
+from mstfilter.scene import Camera, Frame, ObjectView, Seen, VoxelGrid, scene_cache
 from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
 from mstfilter.simulation.sensor import DepthSensor
 from mstfilter.simulation.shapes import label_voxels
@@ -50,7 +50,7 @@ MASK_KINDS = ("whole", "part", "several")
 class CompletionSamples(Samples):
     """Samples of one or of many scenes."""
 
-    bits: np.ndarray  #: (n, 32, 32, 32) uint8, what is seen (`encode_box`)
+    bits: np.ndarray  #: (n, 32, 32, 32) uint8, flags of `Seen`
     signed: np.ndarray  #: (n, 32, 32, 32) int8
     truth: np.ndarray  #: (n, 32, 32, 32) bool
     kind: np.ndarray  #: (n,) str, kind of the shape with most pixels in the mask
@@ -65,7 +65,7 @@ class CompletionSamples(Samples):
 
     def box(self, k: int) -> ObservedBox:
         """What sample k shows, as a completer sees it."""
-        own, other, free, behind, hidden = (((self.bits[k] >> i) & 1).astype(bool) for i in range(5))
+        own, other, free, behind, hidden = (flag.among(self.bits[k]) for flag in Seen)
         height = (np.arange(EDGE) + 0.5) * LATTICE
         return ObservedBox(
             own.astype(np.int32), own, other, free, behind, hidden, decode_signed(self.signed[k]), height

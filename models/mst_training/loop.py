@@ -279,16 +279,3 @@ def fit_calibration(logits: Tensor, outcomes: Tensor) -> tuple[float, float]:
     optimiser.step(closure)
     scale, shift = values.detach().tolist()
     return float(scale), float(shift)
-
-
-def calibration_error(
-    p: np.ndarray, outcome: np.ndarray, weight: np.ndarray | None = None, n_bins: int = 20
-) -> float:
-    """Mean difference of probability and frequency over bins of equal width, weighted by their number of outcomes.
-
-    `p` and `outcome` are (n,); with numbers of outcomes `weight` (n,), `outcome` is how many of them are true.
-    """
-    weight = np.ones(len(p)) if weight is None else weight
-    index = np.minimum((p * n_bins).astype(np.int64), n_bins - 1)
-    gap = np.bincount(index, weights=p * weight - outcome, minlength=n_bins)
-    return float(np.abs(gap).sum() / max(weight.sum(), 1))

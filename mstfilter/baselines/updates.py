@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.errors import check_number
+from mstfilter.fields import NonNegativeFloat
 from mstfilter.scene import Clip, FreeSpace, Projection, log_quality
 from mstfilter.smc import Population, Update, union
 
@@ -64,13 +64,10 @@ class Union(Update):
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
-    quality_exponent: float = 3.0
+    quality_exponent: NonNegativeFloat = 3.0
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_number("quality_exponent", self.quality_exponent, at_least=0)
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip

@@ -16,10 +16,10 @@ True
     I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ.
 
 Outcomes that differ in far fewer than tau cells count as one, and those that differ in far more count as two. I_0 is
-the information without noise; I_tau decreases to 0 as tau grows. If every cell is read with an independent error of
-probability e, then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual information with the
-reading (Kolchinsky, Tracey 2017, *Estimating mixture entropy with pairwise distances*, with the Bhattacharyya
-distance).
+the information without noise; I_tau decreases to 0 as tau grows. Suppose that every cell is read with an independent
+error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual information
+with the reading (Kolchinsky, Tracey 2017, *Estimating mixture entropy with pairwise distances*, with the
+Bhattacharyya distance).
 """
 
 from __future__ import annotations

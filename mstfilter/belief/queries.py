@@ -46,7 +46,7 @@ from mstfilter.scene import (
     CommonRefinement,
     Hypothesis,
     VoxelGrid,
-    check_grid,
+    check_grids,
     common_refinement,
     project,
     render_hypothesis,
@@ -81,8 +81,7 @@ class Belief:
         particles = self.population.particles
         if not all(isinstance(h, Hypothesis) for h in particles):
             raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
-        for k, h in enumerate(particles):
-            check_grid(f"hypothesis {k}", h, self.grid)
+        check_grids("", particles, self.grid)
 
     def __repr__(self) -> str:
         weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
@@ -350,8 +349,8 @@ class Belief:
     def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
-        Default: the loss is 1 - quality (weighted coverage in the form ``objects``), so that the result is the best
-        single answer among the hypotheses if the true scene were distributed as they are.
+        Default: the loss is 1 - quality (weighted coverage in the form ``objects``). The result is then the best
+        single answer among the hypotheses, if the true scene is distributed as they are.
         """
         hypotheses, mass = self._merged
         if loss is None:

@@ -36,12 +36,6 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with _warnings_as_lines():
             _execute(given)
-    except InputError as error:
-        if debug:
-            raise
-        place = place_in_user_file(error) or ""
-        _print_error(error, *([] if not place or ": raise " in place or place in error.hints else [place]))
-        sys.exit(2)
     except SystemExit as end:
         if end.code == 130:  # Ctrl-C
             print(_interrupted(given), file=sys.stderr)
@@ -52,20 +46,25 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if debug:
             raise
-        if isinstance(error, ModuleNotFoundError) and place_in_user_file(error) is None:
-            _print_error(missing_library(error, " ".join(["mstfilter", *given[:1]])))
-            sys.exit(2)
-        if known := exhausted(error):
-            _print_error(known)
-            sys.exit(1)
-        print(f"error: {describe_error(error)}", file=sys.stderr)
-        for note in getattr(error, "__notes__", ()):
-            print(f"hint: {note}", file=sys.stderr)
-        if place_in_user_file(error) is None:
-            for component in loaded_components():
-                print(f"hint: `mstfilter check {component}` tests the component of this command", file=sys.stderr)
-        print("hint: --debug shows the traceback", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(_report(error, given))
+
+
+def _report(error: Exception, given: list[str]) -> int:
+    """Print an error; returns the exit code, 2 if the user can mend it."""
+    place = place_in_user_file(error)
+    if isinstance(error, ModuleNotFoundError) and place is None:
+        error = missing_library(error, " ".join(["mstfilter", *given[:1]]))
+    if isinstance(error, InputError):
+        tells_more = place is not None and ": raise " not in place and place not in error.hints
+        _print("error", error.message, *error.hints, *([str(place)] if tells_more else []))
+        return 2
+    if known := exhausted(error):
+        _print("error", known.message, *known.hints)
+        return 1
+    checks = [f"`mstfilter check {name}` tests the component of this command" for name in loaded_components()]
+    hints = [*getattr(error, "__notes__", ()), *(checks if place is None else []), "--debug shows the traceback"]
+    _print("error", describe_error(error), *hints)
+    return 1
 
 
 def _execute(given: list[str]) -> None:
@@ -101,18 +100,15 @@ def _warnings_as_lines() -> Iterator[None]:
             if message.message in shown:
                 return
             shown.add(message.message)
-            print(f"warning: {message.message}", file=sys.stderr)
-            for hint in message.hints:
-                print(f"hint: {hint}", file=sys.stderr)
+            _print("warning", message.message, *message.hints)
 
         warnings.showwarning = show
         yield
 
 
-def _print_error(error: InputError, *hints: str) -> None:
-    print(f"error: {error.message}", file=sys.stderr)
-    for hint in (*error.hints, *hints):
-        print(f"hint: {hint}", file=sys.stderr)
+def _print(kind: str, message: str, *hints: str) -> None:
+    for line in (f"{kind}: {message}", *(f"hint: {hint}" for hint in hints)):
+        print(line, file=sys.stderr)
 
 
 def _interrupted(given: list[str]) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mstfilter.cli.root import app
-from mstfilter.errors import InputError, missing_library
+from mstfilter.errors import InputError
 
 
 @app.command("list")
@@ -38,13 +38,10 @@ def check(
     if Path(component).is_dir():
         _check_folder(Path(component))
         return
-    from mstfilter.presets import REGISTRY
-    from mstfilter.registry import settings
+    from mstfilter.presets import REGISTRY, settings
+    from mstfilter.smc.testing import FALSE_ALARM
+    from mstfilter.testing import run_contract
 
-    try:
-        from mstfilter.testing import FALSE_ALARM, run_contract
-    except ModuleNotFoundError as error:
-        raise missing_library(error, "mstfilter check") from error
     kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
     if ".py:" not in component and kind not in REGISTRY.kinds:
         raise InputError(
@@ -79,7 +76,7 @@ def _check_folder(path: Path) -> None:
     if not runs and noted:
         damaged = [f"{path}: {wrong}" for wrong in damaged_files(path)]
     if not runs and not damaged:
-        open_recording(path).check()
+        open_recording(path, "recording").check()
     note = "" if noted else f"; {SUMS} is missing, so changes are not noticed"
     print("\n".join(f"damaged     {line}" for line in damaged) or f"sound       {path}{note}")
     if damaged:

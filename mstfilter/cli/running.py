@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +23,7 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, check_output, locked, other_files
+from mstfilter.files import atomic_folder, check_output, locked, other_files, write_csv
 from mstfilter.report.progress import progress_bar
 
 _DEMO = "occlusion"  # the family of the demo
@@ -111,19 +112,14 @@ def demo(
 def _check_earlier_demo(out: Path) -> None:
     """Raise InputError unless a folder is missing, empty, or of a demo and contains nothing else."""
     from mstfilter.formats import RECORDING_FILES, open_recording
-    from mstfilter.runs import RUN_FILES, RunFolder
+    from mstfilter.runs import RUN_FILES
 
     own = re.compile(rf"recording/({RECORDING_FILES.pattern})|run/({RUN_FILES.pattern})|report\.html")
     others = other_files(out, own)
     if not others and out.exists() and any(out.iterdir()):
-        source = open_recording(out / "recording").manifest
-        generators = (source.get("generator"), RunFolder.open(out / "run").description["recording"]["generator"])
-        if generators != (_SIMULATOR, _SIMULATOR) or dict(source.get("family", {})).get("name") != _DEMO:
+        source = open_recording(out / "recording", "recording").manifest
+        if source.get("generator") != _SIMULATOR or dict(source.get("family", {})).get("name") != _DEMO:
             others.append("recording")
-        elif (page := out / "report.html").exists() and "mstfilter" not in page.read_text(
-            encoding="utf-8", errors="replace"
-        ):
-            others.append("report.html")
     if others:
         raise InputError(
             f"{out} holds something that is not of a demo: {others[0]}", "choose another folder with --out"
@@ -165,12 +161,11 @@ def report(
             raise InputError(f"{run} is a study, only runs can be exported", f"export one of {run / 'runs'}")
         print(f"report      {write_study_report(run, out)}")
         return
-    _report(run, out)
-    if export is not None:
-        from mstfilter.report import export_run
-        from mstfilter.runs import RunFolder
+    from mstfilter.report import export_run, write_report
 
-        export_run(RunFolder.open(run), export, mesh_format, mesh_style)
+    print(f"report      {write_report(run, out)}")
+    if export is not None:
+        export_run(run, export, mesh_format, mesh_style)
         print(f"hypotheses  {export}")
 
 
@@ -247,14 +242,14 @@ def quality(
     if csv is not None:
         check_output(csv)
     from mstfilter.runs import RunFolder
-    from mstfilter.scoring import read_estimates, read_truth, score_pauses, write_scores
+    from mstfilter.scoring import read_estimates, read_truth, score_pauses
 
     volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
     known = truth if volumes else read_source(truth, format, option, "")
     estimates = RunFolder.open(run).estimates() if run.is_dir() else read_estimates(run)
     rows = score_pauses(estimates, read_truth(known))
     if csv is not None:
-        write_scores(csv, rows)
+        write_csv(csv, [asdict(row) for row in rows], float_format=".6f")
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")
     print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
     for row in rows:
@@ -291,32 +286,21 @@ def _execute_all(
     recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int, replace: bool = False
 ) -> None:
     """Run the filter without a name in `folder`, those that it is compared with in its folder ``compare``."""
+    from mstfilter.runs import filter_recording
+
     for name, config in configs.items():
-        _execute(recording, config, _compared(folder, name), seed, replace and not name)
+        with progress_bar("filter") as advance:
+            filter_recording(
+                recording,
+                config,
+                _compared(folder, name),
+                seed,
+                replace=replace and not name,
+                allow_files=True,
+                progress=lambda p, advance=advance: advance(p.done, p.total),  # type: ignore[misc]
+            )
 
 
 def _compared(folder: Path, name: str) -> Path:
     """The folder of a run that the run in `folder` is compared with; `folder` itself for no name."""
     return folder / "compare" / name.replace(" ", "-") if name else folder
-
-
-def _execute(recording: Any, config: dict[str, Any], folder: Path, seed: int, replace: bool = False) -> None:
-    from mstfilter.runs import filter_recording
-
-    with progress_bar("filter") as advance:
-        filter_recording(
-            recording,
-            config,
-            folder,
-            seed,
-            replace=replace,
-            allow_files=True,
-            progress=lambda p: advance(p.done, p.total),
-        )
-
-
-def _report(run: Path, out: Path | None) -> None:
-    from mstfilter.report import write_report
-    from mstfilter.runs import RunFolder
-
-    print(f"report      {write_report(RunFolder.open(run), out)}")

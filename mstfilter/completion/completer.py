@@ -329,6 +329,9 @@ def occupancy_of(
     return Occupancy(owner, best / total)
 
 
+_FAR = 1e9  # voxels: the distance of an object without visible surface, beyond all others
+
+
 def _break_ties(
     labels: np.ndarray,
     tied: np.ndarray,
@@ -338,28 +341,26 @@ def _break_ties(
     threshold: float,
 ) -> None:
     """Give tied voxels to the object with the nearest visible surface; at equal distance, to the smaller key."""
-    voxels = np.argwhere(tied)
-    at = tuple(voxels.T)
-    nearest = np.full(len(voxels), np.inf)
-    taken = np.zeros(len(voxels), dtype=bool)
-    for k in sorted(range(len(completions)), key=lambda k: completions[k].key):
-        one = completions[k]
-        local = voxels - one.offset
-        inside = ((local >= 0) & (local < one.probability.shape)).all(axis=1)
-        here = np.flatnonzero(inside)
-        if len(here) == 0:
-            continue
-        place = tuple(local[here].T)
-        p = one.probability[place]
-        points = np.where(p >= threshold, one.points[place], 0)
-        contends = (p >= threshold) & (p == best[at][here]) & (points == most[at][here])
-        here = here[contends]
-        if len(here) == 0:
-            continue
-        distance = np.full(len(here), np.inf)
-        if (one.points > 0).any():
-            distance, _ = cKDTree(np.argwhere(one.points > 0) + one.offset).query(voxels[here])
-        nearer = ~taken[here] | (distance < nearest[here] - 1e-9)
-        nearest[here[nearer]] = distance[nearer]
-        taken[here[nearer]] = True
-        labels[tuple(voxels[here[nearer]].T)] = k + 1
+    order = sorted(range(len(completions)), key=lambda k: completions[k].key)
+    voxels, points, p = np.argwhere(tied), most[tied], best[tied]
+    distances = [_distance_of_contender(completions[k], voxels, points, p, threshold) for k in order]
+    labels[tied] = np.array(order)[np.round(distances, 9).argmin(axis=0)] + 1
+
+
+def _distance_of_contender(
+    one: Completion, voxels: np.ndarray, points: np.ndarray, p: np.ndarray, threshold: float
+) -> np.ndarray:
+    """Distance (n,) of voxels (n, 3) from the surface of an object; infinite where it is not one of the best.
+
+    The best have as many readings as `points` (n,) and the probability `p` (n,).
+    """
+    local = voxels - one.offset
+    contends = ((local >= 0) & (local < one.probability.shape)).all(axis=1)
+    at = tuple(local[contends].T)
+    own = one.probability[at]
+    contends[contends] = (own >= threshold) & (own == p[contends]) & (one.points[at] == points[contends])
+    distance = np.full(len(voxels), np.inf)
+    surface = np.argwhere(one.points > 0) + one.offset
+    if contends.any():
+        distance[contends] = cKDTree(surface).query(voxels[contends])[0] if len(surface) else _FAR
+    return distance

@@ -21,7 +21,7 @@ from mstfilter.completion.completer import Completer, Completion, finish
 from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
 from mstfilter.completion.extrude import Extrude
 from mstfilter.completion.observed import ObservedBox, observed_in
-from mstfilter.errors import MissingLibraryError
+from mstfilter.errors import missing_library
 from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
 if TYPE_CHECKING:
@@ -49,11 +49,8 @@ class NetworkCompleter(Completer, UsesFiles):
         try:
             from mstfilter.completion.unet import load_network
         except ImportError as error:
-            raise MissingLibraryError(
-                f"torch cannot be imported: {error}",
-                "pip install torch",
-                "or complete by a rule: the preset mst_rules",
-            ) from error
+            hint = "or complete by a rule: the preset mst_rules"
+            raise missing_library(error, "the completion network", hint, library="torch") from error
         return load_network(self.weights, self.architecture)
 
     def check_files(self, recording: Recording) -> None:

@@ -30,7 +30,7 @@ from torch.nn import functional
 
 from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architecture, channels
 from mstfilter.completion.observed import ObservedBox, encode_box
-from mstfilter.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.errors import InputError, describe_error, missing_library
 from mstfilter.reading import MAX_WEIGHTS, read_bytes
 from mstfilter.trained import calibrated_network, open_model
 
@@ -38,23 +38,13 @@ ARCHITECTURE = "completion-unet"
 
 
 class LatentLaw(NamedTuple):
-    """A diagonal normal law."""
+    """The law of z: diagonal normal."""
 
     mean: Tensor  #: (b, d)
     log_std: Tensor  #: (b, d)
 
-    def draw(self, noise: Tensor) -> Tensor:
-        """A draw (b, d) from standard normal noise (b, d)."""
-        return self.mean + noise * self.log_std.exp()
 
-    def divergence(self, other: LatentLaw) -> Tensor:
-        """Kullback-Leibler divergence (b,) from `other`, in nats."""
-        ratio = 2 * (self.log_std - other.log_std)
-        distance = ((self.mean - other.mean) * (-other.log_std).exp()) ** 2
-        return 0.5 * (ratio.exp() + distance - 1 - ratio).sum(dim=1)
-
-
-def _to_channels(x: Tensor) -> Tensor:
+def to_channels(x: Tensor) -> Tensor:
     """(b, c, 2x, 2y, 2z) -> (b, 8 c, x, y, z)."""
     b, c, nx, ny, nz = x.shape
     x = x.reshape(b, c, nx // 2, 2, ny // 2, 2, nz // 2, 2)
@@ -120,7 +110,7 @@ class CompletionNet(nn.Module):
 
     def encode(self, x: Tensor) -> tuple[list[Tensor], LatentLaw]:
         """Features of an input (b, channels, X, Y, Z), and the prior of z. Edges are multiples of 8 voxels."""
-        fine = self.fine(self.stem(_to_channels(x)))
+        fine = self.fine(self.stem(to_channels(x)))
         middle = self.middle(self.down1(fine))
         coarse = self.down2(middle)
         for block in self.coarse:
@@ -144,26 +134,6 @@ class CompletionNet(nn.Module):
         """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z), with the mode of z."""
         features, prior = self.encode(x)
         return self.decode(features, prior.mean)
-
-
-class ShapePosterior(nn.Module):
-    """The law of z given the input and the true shape; used in training only."""
-
-    def __init__(self, width: int, latent: int) -> None:
-        super().__init__()
-        self.stem = nn.Conv3d(8, width, 3, padding=1)
-        self.down1 = nn.Conv3d(2 * width, 2 * width, 3, stride=2, padding=1)
-        self.down2 = nn.Conv3d(2 * width, 4 * width, 3, stride=2, padding=1)
-        self.law = nn.Linear(8 * width, 2 * latent)
-
-    def forward(self, features: list[Tensor], truth: Tensor) -> LatentLaw:
-        """From the features of the input, and the true shape (b, X, Y, Z) as 0 and 1."""
-        x = functional.silu(self.stem(_to_channels(truth[:, None])))
-        x = functional.silu(self.down1(torch.cat([x, features[0].detach()], dim=1)))
-        x = functional.silu(self.down2(x))
-        pooled = torch.cat([x.mean(dim=(2, 3, 4)), features[2].detach().mean(dim=(2, 3, 4))], dim=1)
-        mean, log_std = self.law(pooled.float()).chunk(2, dim=1)
-        return LatentLaw(mean, log_std.clamp(-4, 2))
 
 
 class TrainedNetwork:
@@ -264,9 +234,7 @@ def _open_onnx(path: Path) -> TrainedNetwork:
     try:
         import onnxruntime
     except ImportError as error:
-        raise MissingLibraryError(
-            f"a network in ONNX needs onnxruntime, which cannot be imported: {error}", "pip install 'mstfilter[onnx]'"
-        ) from error
+        raise missing_library(error, "a network in ONNX", library="onnxruntime") from error
     if not path.is_file():
         raise InputError(f"file of a network does not exist: {path}")
     data = read_bytes(path, "a network", limit=MAX_WEIGHTS)

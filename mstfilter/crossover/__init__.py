@@ -3,10 +3,8 @@
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)     # candidates, with weights
 
 =============  =========================================================================================
-`update`       `CrossoverUpdate`: free-space projection, pairs of hypotheses, and their weights
-`cross`        `Crossover`: makes one hypothesis of two
-`conflicts`    the conflict graph of two hypotheses (networkx)
-`resolution`   painting orders and merge probabilities
+`update`       `CrossoverUpdate`: all pairs, with weights; `Crossover`: makes one hypothesis of two
+`conflicts`    the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
 `mode_filter`  `ModeFilter`: smooths the result
 =============  =========================================================================================
 """

@@ -89,8 +89,8 @@ class ModeFilter(Bounded):
             inside = labels[near] == label
             count = self._window_counts(inside)
             own[near][inside] = count[inside]
-            ahead = count >= best[near]  # labels ascend, so a tie goes to the larger one
-            best[near][ahead], winner[near][ahead] = count[ahead], label
+            winner[near] = np.where(count >= best[near], label, winner[near])  # the larger label of a tie
+            best[near] = np.maximum(best[near], count)
         occupied = labels != 0
         out = np.where(occupied & (best >= own + self.margin), winner, labels)
         out[occupied & (cells - self._window_counts(occupied) > self.isolation)] = 0

@@ -3,29 +3,118 @@
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
 1. The projection onto free space clears voxels of every predicted hypothesis j, which keeps a share Q_j of them.
-2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. With weights w_i and w_j of the
-   parents and lambda = `quality_exponent`, the weight of a candidate,
+2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
 
        log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
 
-   depends on its parents only. So candidates are resampled first, and only those that are chosen are built.
+   depends on its parents only; w_i and w_j are their weights, lambda is `quality_exponent`. So candidates are
+   resampled first, and only those that are chosen are built.
 
-Without a proposal, the update is the projection with its weights: if only a thin set of states agrees with an
-observation, hardly any prediction lies in it, so every particle is projected into it (the manifold filter of Koval,
-Pollard and Srinivasa 2015; for vectors `mstfilter.smc.ProjectOnto`).
+Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
+observation, hardly any prediction lies in it, so every particle is projected into it. This is the manifold filter of
+Koval, Pollard and Srinivasa (2015; for vectors `mstfilter.smc.ProjectOnto`).
+
+One crossover (figure 5):
+
+>>> child = Crossover().cross(rng, proposed, predicted)
+
+1. `graph_of` builds the conflict graph: two objects that share voxels are in conflict.
+2. `resolve` draws, for each connected component of the graph, which objects are merged, and the order in which all
+   of them are painted. A later object covers an earlier one.
+3. `assign_labels` paints the objects. Objects without conflict are copied.
+4. `mstfilter.crossover.ModeFilter` removes the speckle that painting leaves.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.crossover.cross import Crossover
-from mstfilter.fields import NonNegativeFloat, PositiveInt
-from mstfilter.scene import Clip, FreeSpace, Hypothesis, Projection, check_grid, log_quality
+from mstfilter.crossover.conflicts import (
+    PREDICTED,
+    PROPOSED,
+    SIDES,
+    ConflictGraph,
+    ConflictResolution,
+    MergeRule,
+    OccupiedVoxels,
+    SpanningTree,
+    Structure,
+    graph_of,
+    resolve,
+)
+from mstfilter.crossover.mode_filter import ModeFilter
+from mstfilter.errors import InputError
+from mstfilter.fields import Bounded, NonNegativeFloat, PositiveInt
+from mstfilter.scene import (
+    MAX_LABEL,
+    Clip,
+    FreeSpace,
+    Hypothesis,
+    ObjectRecord,
+    Occupancy,
+    Projection,
+    as_labels,
+    check_grid,
+    check_grids,
+    log_quality,
+)
 from mstfilter.smc import Candidates, Population, Update, child, key_of, union
+
+
+@dataclass(frozen=True)
+class Crossover(Bounded):
+    """Conflict-graph crossover.
+
+    Parameters
+    ----------
+    structure : Structure
+        Painting order and candidate merges.
+    merge : {"share", "printed", "always", "never"}
+        Probability of a merge along a directed edge (`mstfilter.crossover.conflicts`).
+    mode_filter : ModeFilter
+        Smooths the painted labels.
+    drop_rule : bool
+        Reproduces a fault of the authors' program: an object without conflict is lost if its vertex number exceeds
+        that of every vertex in conflict.
+    """
+
+    structure: Structure = SpanningTree()  # noqa: RUF009 (frozen)
+    merge: MergeRule = "share"
+    mode_filter: ModeFilter = ModeFilter()  # noqa: RUF009 (frozen)
+    drop_rule: bool = False
+
+    def cross(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
+        """A hypothesis made of the objects of both parents.
+
+        If one parent has no objects, the result is the other one. An object keeps the identity of the largest
+        predicted object in it, and its motion history if its voxels are exactly those predicted.
+        """
+        check_grid("the proposed hypothesis", proposed, predicted.grid)
+        if not predicted.objects:
+            return proposed
+        if not proposed.objects:
+            return predicted
+        voxels = OccupiedVoxels.of(proposed.labels, predicted.labels)
+        graph = graph_of(voxels)
+        resolution = self.resolve(rng, graph)
+        groups, numbers = _renumbered(_painted(graph, resolution, voxels))
+        if len(groups) > MAX_LABEL:
+            raise InputError(
+                f"crossover of {len(proposed.objects)} proposed and {len(predicted.objects)} predicted objects gives "
+                f"{len(groups)}, at most {MAX_LABEL} have a label",
+                "remove objects of one or two voxels before crossover",
+            )
+        labels = self.mode_filter.apply(voxels.spread(numbers.astype(np.uint16)))
+        remaining, numbers = _renumbered(labels.reshape(-1)[voxels.at])
+        child = _Child(voxels, graph, resolution.group, groups[remaining - 1] - 1, numbers)
+        return child.hypothesis((proposed, predicted))
+
+    def resolve(self, rng: np.random.Generator, graph: ConflictGraph) -> ConflictResolution:
+        """Draw a resolution of all conflicts."""
+        return resolve(rng, graph, self.structure, self.merge, self.drop_rule)
 
 
 @dataclass(frozen=True)
@@ -45,7 +134,7 @@ class CrossoverUpdate(Update):
     """
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
-    crossover: Crossover = Crossover()  # noqa: RUF009 (frozen)
+    crossover: Crossover = Crossover()
     eta: PositiveInt = 5
     quality_exponent: NonNegativeFloat = 3.0
 
@@ -68,9 +157,8 @@ class CrossoverUpdate(Update):
 
     def _crossed(self, rng: np.random.Generator, predicted: Population, proposed: Population) -> Population:
         """Candidates of all pairs of a sample and a refined prediction."""
-        for name, population in (("predicted", predicted), ("proposed", proposed)):
-            for k, hypothesis in enumerate(population.particles):
-                check_grid(f"{name} hypothesis {k}", hypothesis, predicted.particles[0].grid)
+        check_grids("predicted", predicted.particles, predicted.particles[0].grid)
+        check_grids("proposed", proposed.particles, predicted.particles[0].grid)
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)
         key = key_of(rng)
 
@@ -96,3 +184,88 @@ def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int
     first = np.concatenate([rng.permutation(n_predicted) for _ in range(rounds)])[:n_proposed]
     i, k = np.divmod(np.arange(n_proposed * n_predicted), n_predicted)
     return i.repeat(eta), ((first[i] + k) % n_predicted).repeat(eta)
+
+
+# The child of a crossover -------------------------------------------------------------------------------------------
+
+
+def assign_labels(
+    graph: ConflictGraph, resolution: ConflictResolution, proposed: np.ndarray, predicted: np.ndarray
+) -> np.ndarray:
+    """Labels (X, Y, Z) uint16, with k + 1 for group k, from the label grids of both parents."""
+    voxels = OccupiedVoxels.of(proposed, predicted)
+    return as_labels(voxels.spread(_painted(graph, resolution, voxels)), "painted label grid")
+
+
+def _painted(graph: ConflictGraph, resolution: ConflictResolution, voxels: OccupiedVoxels) -> np.ndarray:
+    """Group + 1 of each occupied voxel (n,), 0 if its object was dropped. A later object covers an earlier one."""
+    rank = np.zeros(len(graph), np.int64)
+    rank[resolution.order] = np.arange(1, len(resolution.order) + 1)
+    groups, ranks = (
+        [graph.by_label(side, values)[voxels.labels[side]] for side in SIDES]
+        for values in (resolution.group + 1, rank)
+    )
+    return np.where(ranks[PREDICTED] > ranks[PROPOSED], groups[PREDICTED], groups[PROPOSED])
+
+
+def _renumbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The labels > 0 that occur, ascending, and the array with these labels renumbered to 1, 2, ..."""
+    present, index = np.unique(np.append(labels, 0), return_inverse=True)
+    return present[1:], index[:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Child:
+    """The labels of a child, and the objects of the parents from which they come."""
+
+    voxels: OccupiedVoxels
+    graph: ConflictGraph
+    group: np.ndarray  #: (vertices,) group of each vertex
+    groups: np.ndarray  #: (objects,) group of each object of the child
+    numbers: np.ndarray  #: (n,) object of each voxel, 1, 2, ...; 0 is free
+
+    def hypothesis(self, parents: tuple[Hypothesis, Hypothesis]) -> Hypothesis:
+        """The child with records and occupancy of the parents."""
+        labels = self.voxels.spread(self.numbers.astype(np.uint16))
+        child = Hypothesis(labels, parents[0].grid, self._records(parents))
+        if all(parent.occupancy is None for parent in parents):
+            return child
+        return replace(child, occupancy=self._occupancy(labels, parents))
+
+    def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
+        """The record of each object: that of its head. The motion history ends where the voxels are others."""
+        heads = self._heads()
+        record_of = [{record.label: record for record in parent.objects} for parent in parents]
+        kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)
+        records = [replace(record_of[side][label], label=k) for k, (side, label) in enumerate(kinds, start=1)]
+        unchanged = self._unchanged(heads).tolist()
+        return tuple(r if same else r.changed() for r, same in zip(records, unchanged, strict=True))
+
+    def _heads(self) -> np.ndarray:
+        """The head (objects,) of each group: its largest predicted vertex, else its largest proposed vertex."""
+        side, size = self.graph.side.tolist(), self.graph.size.tolist()
+        ranking = sorted(range(len(self.graph)), key=lambda v: (side[v], size[v], -v))
+        head_of = {int(self.group[v]): v for v in ranking}  # the last one of a group counts
+        return np.array([head_of[group] for group in self.groups.tolist()], np.int64)
+
+    def _unchanged(self, heads: np.ndarray) -> np.ndarray:
+        """Whether each object (objects,) has exactly the voxels of its head in the parent."""
+        side, label = self.graph.side[heads], self.graph.label[heads]
+        inside = self.numbers > 0
+        number = self.numbers[inside] - 1
+        proposed, predicted = (labels[inside] for labels in self.voxels.labels)
+        same = np.where(side[number] == PREDICTED, predicted, proposed) == label[number]
+        size, kept = (np.bincount(n, minlength=len(heads)) for n in (number, number[same]))
+        return (size == kept) & (size == self.graph.size[heads])
+
+    def _occupancy(self, labels: np.ndarray, parents: tuple[Hypothesis, Hypothesis]) -> Occupancy:
+        """The larger probability of the parents; at least one half where the child has a label, at most elsewhere."""
+        owner, p = labels.copy(), np.where(labels > 0, np.float16(0.5), np.float16(0))
+        heir = np.searchsorted(self.groups, self.group) + 1
+        heir[~np.isin(self.group, self.groups)] = 0
+        for side, parent in enumerate(parents):
+            inherited = self.graph.by_label(side, heir.astype(np.uint16))[parent.shares.owner]
+            probability = parent.shares.probability
+            more = (inherited > 0) & (probability > p) & ((labels == 0) | (inherited == labels))
+            owner[more], p[more] = inherited[more], probability[more]
+        return Occupancy(owner, np.where(labels > 0, p, np.minimum(p, np.float16(0.5))))

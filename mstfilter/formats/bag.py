@@ -20,14 +20,14 @@ import functools
 import struct
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
@@ -58,9 +58,7 @@ class BagFile:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise MissingLibraryError(
-                "bags and MCAP need rosbags, which is not installed", "pip install 'mstfilter[bags]'"
-            ) from error
+            raise missing_library(error, "a bag", library="rosbags") from error
         self.path = path
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")
@@ -161,7 +159,17 @@ def _close(reader: Any) -> None:
         reader.close()
 
 
-_COLOUR = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8", "8UC1", "8UC3", "8UC4", "yuv422", "yuv422_yuy2", "uyvy", "yuyv")
+#: Channels of a colour image and OpenCV's conversion to RGB -> encodings.
+_CONVERSIONS = {
+    (3, ""): ("rgb8",),
+    (3, "BGR2RGB"): ("bgr8", "8UC3"),
+    (4, "RGBA2RGB"): ("rgba8",),
+    (4, "BGRA2RGB"): ("bgra8", "8UC4"),
+    (1, "GRAY2RGB"): ("mono8", "8UC1"),
+    (2, "YUV2RGB_UYVY"): ("yuv422", "uyvy"),
+    (2, "YUV2RGB_YUY2"): ("yuv422_yuy2", "yuyv"),
+}
+_COLOUR = {encoding: conversion for conversion, names in _CONVERSIONS.items() for encoding in names}
 _GREY = ("mono8", "8UC1")
 _DEPTH = ("16UC1", "mono16", "32FC1")
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -186,28 +194,23 @@ def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
         image = decode_image(bytes(message.data), cv2.IMREAD_COLOR, problem)
         return np.ascontiguousarray(image[..., ::-1])
     encoding = str(message.encoding)
-    if encoding not in _COLOUR:
+    _check_encoding(encoding, _COLOUR, f"{where}: colour")
+    channels, conversion = _COLOUR[encoding]
+    pixels = _pixels(message, np.dtype(np.uint8), channels, where)
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))) if conversion else pixels
+
+
+def _check_encoding(encoding: str, known: Iterable[str], what: str) -> None:
+    if encoding not in known:
         raise InputError(
-            f"{where} has encoding {encoding!r}, which is not supported for colour",
-            f"supported: {', '.join(_COLOUR)}",
+            f"{what} has encoding {encoding!r}, which is not supported", f"supported: {', '.join(known)}"
         )
-    if encoding in _GREY:
-        return np.repeat(_pixels(message, np.dtype(np.uint8), 1, where), 3, axis=2)
-    if encoding in ("yuv422", "uyvy", "yuv422_yuy2", "yuyv"):
-        code = cv2.COLOR_YUV2RGB_UYVY if encoding in ("yuv422", "uyvy") else cv2.COLOR_YUV2RGB_YUY2
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(_pixels(message, np.dtype(np.uint8), 2, where)), code))
-    channels = 4 if encoding in ("rgba8", "bgra8", "8UC4") else 3
-    image = _pixels(message, np.dtype(np.uint8), channels, where)[..., :3]
-    return np.ascontiguousarray(image if encoding.startswith("rgb") else image[..., ::-1])
 
 
 def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) -> np.ndarray:
     """Depth image (H, W) float32 in metres, NaN without a reading."""
     encoding = image_encoding(message, compressed)
-    if encoding not in _DEPTH:
-        raise InputError(
-            f"{where} has encoding {encoding!r}, which is not supported for depth", f"supported: {', '.join(_DEPTH)}"
-        )
+    _check_encoding(encoding, _DEPTH, f"{where}: depth")
     if compressed:
         metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
     elif encoding == "32FC1":

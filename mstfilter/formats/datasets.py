@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, object_numbers
@@ -246,9 +246,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         import h5py
     except ImportError as error:
-        raise MissingLibraryError(
-            "DSR-Net data need h5py, which is not installed", "pip install 'mstfilter[h5py]'"
-        ) from error
+        raise missing_library(error, "a recording of DSR-Net", library="h5py") from error
     with reading(path, "a DSR-Net step", f"expected the arrays {', '.join(_KEYS)}"), open_regular(path):
         with h5py.File(path, "r") as file:
             if (size := sum(file[key].nbytes for key in _KEYS)) > MAX_FILE:

@@ -23,21 +23,20 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mstfilter.errors import InputError, naming
 from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
-from mstfilter.formats.video import RecordingFormat
+from mstfilter.formats.video import RecordingFormat, check_images
 from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
     Camera,
@@ -47,7 +46,6 @@ from mstfilter.scene import (
     Recording,
     VoxelGrid,
     as_labels,
-    check_depth,
     examine,
     find_world,
     read_depth,
@@ -81,6 +79,10 @@ class _Workspace(BaseModel):
     @classmethod
     def of(cls, grid: VoxelGrid) -> _Workspace:
         return cls(min=tuple(grid.origin.tolist()), max=tuple(grid.upper.tolist()), voxel=grid.voxel_size)
+
+    @property
+    def grid(self) -> VoxelGrid:
+        return VoxelGrid.from_bounds(np.array(self.min), np.array(self.max), self.voxel)
 
 
 class RecordingWriter:
@@ -172,14 +174,8 @@ class RecordingWriter:
     def close(self) -> Path:
         """Write the remaining files and rename the folder to its final name."""
         camera, grid = self._camera, self._grid
-        described: dict[str, Any] = {
-            "K": camera.K.tolist(),
-            "width": camera.width,
-            "height": camera.height,
-            "depth_scale": self._scale,
-            "T_world_camera": None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist(),
-            "workspace": None if grid is None else _Workspace.of(grid).model_dump(),
-        }
+        workspace = None if grid is None else _Workspace.of(grid)
+        described = _CameraFile.of(camera, depth_scale=self._scale, workspace=workspace).model_dump()
         manifest = {**self._manifest, "frames": self._frames}
         with self._writing(), self._open:
             (self._folder / "camera.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
@@ -265,12 +261,31 @@ def save_recording(
     return writer.path
 
 
-class _CameraFile(BaseModel):
-    K: Any  # checked by Camera, as the poses are by rigid_from_matrix
+class CameraFile(BaseModel):
+    """A camera in JSON, in recordings and runs."""
+
+    K: Any  # checked by Camera, as the pose is by rigid_from_matrix
     width: int
     height: int
-    depth_scale: float
     T_world_camera: Any = None
+
+    @classmethod
+    def of(cls, camera: Camera, **more: Any) -> Self:
+        """The entries of a camera; `more` are those of a subclass."""
+        pose = None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist()
+        size = {"width": camera.width, "height": camera.height}
+        return cls(K=camera.K.tolist(), T_world_camera=pose, **size, **more)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera. Raises InputError if its matrix or its pose cannot be used."""
+        matrix = self.T_world_camera
+        pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
+        return Camera(self.K, self.width, self.height, pose)
+
+
+class _CameraFile(CameraFile):
+    depth_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     workspace: _Workspace | None = None
 
 
@@ -283,8 +298,14 @@ class _FrameEntry(BaseModel):
 
 class _Manifest(BaseModel):
     model_config = ConfigDict(extra="allow")
-    version: int
-    frames: list[_FrameEntry]
+    version: Literal[1]
+    frames: Annotated[list[_FrameEntry], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if [entry.index for entry in self.frames] != list(range(len(self.frames))):
+            raise ValueError("frame indices are not 0, 1, 2, ...")
+        return self
 
 
 def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
@@ -324,24 +345,11 @@ def _open(path: Path, pauses: PauseRule | None) -> Recording:
         )
     manifest, manifest_data = _load(path / "manifest.json", _Manifest)
     camera_file, _ = _load(path / "camera.json", _CameraFile)
-    if manifest.version != VERSION:
-        raise InputError(f"{path / 'manifest.json'}: version is {manifest.version}, expected {VERSION}")
-    if not (math.isfinite(camera_file.depth_scale) and camera_file.depth_scale > 0):
-        raise InputError(
-            f"{path / 'camera.json'}: depth_scale is {camera_file.depth_scale}, expected metres per unit > 0"
-        )
-    entries = manifest.frames
-    if [e.index for e in entries] != list(range(len(entries))):
-        raise InputError(f"{path / 'manifest.json'}: frame indices are not 0, 1, 2, ...")
-    if not entries:
-        raise InputError(f"{path / 'manifest.json'}: there are no frames")
+    entries, scale = manifest.frames, camera_file.depth_scale
 
     with reading(path / "camera.json", "a recording"):
-        matrix = camera_file.T_world_camera
-        pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
-        camera = Camera(camera_file.K, camera_file.width, camera_file.height, pose)
-        w = camera_file.workspace
-        grid = None if w is None else VoxelGrid.from_bounds(np.array(w.min), np.array(w.max), w.voxel)
+        camera = camera_file.camera
+        grid = None if camera_file.workspace is None else camera_file.workspace.grid
     times = tuple(e.time_s for e in entries)
     marked = tuple(e.index for e in entries if e.role == "static")
     if pauses is not None:
@@ -358,18 +366,10 @@ def _open(path: Path, pauses: PauseRule | None) -> Recording:
         if e.T_world_camera is not None
     }
 
-    scale = camera_file.depth_scale
-
     def read(index: int, view: Camera) -> Frame:
         name = f"{index:06d}.png"
         rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, scale)
-        for what, image in (("rgb", rgb), ("depth", depth)):
-            if image.shape[:2] != (view.height, view.width):
-                raise InputError(
-                    f"image {path / what / name} is {image.shape[1]} x {image.shape[0]}, "
-                    f"camera.json says {view.width} x {view.height}"
-                )
-        check_depth(depth, f"depth image {path / 'depth' / name} with depth_scale {scale:g}")
+        check_images(rgb, depth, view, scale, f"frame {index} of {path}")
         robot_path = path / "robot" / name
         robot = read_labels(robot_path) > 0 if robot_path.exists() else None
         return Frame(rgb, depth, view, robot)

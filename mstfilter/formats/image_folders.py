@@ -19,7 +19,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, check_number
 from mstfilter.files import reading
-from mstfilter.formats.video import RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
+from mstfilter.formats.pauses import EveryNth
+from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
 from mstfilter.reading import read_json, read_text
 from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
 
@@ -51,9 +52,7 @@ class PairedImages(RecordingFormat):
         example = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
         with reading(path / "info.json", "pairs of images", example):
             info = read_json(path / "info.json", "pairs of images", example)
-            K, scale = np.asarray(info["K"], dtype=float), float(info["depth_scale_m"])
-        if K.shape == (4,):
-            K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
+            K, scale = _four(np.asarray(info["K"], dtype=float), by_columns=False), float(info["depth_scale_m"])
         names = [p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png")]
         present = sorted(
             names, key=lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]
@@ -64,18 +63,21 @@ class PairedImages(RecordingFormat):
             raise InputError(
                 f"no frame {missing[0]!r} in {path}", f"there are {len(present)}: {', '.join(present[:8])}, ..."
             )
-        rgb = [read_rgb(path / f"{name}_rgb.png") for name in chosen]
-        depth = [read_depth(path / f"{name}_depth.png", scale) for name in chosen]
-        for name, image in zip(chosen, rgb, strict=True):
-            if image.shape != rgb[0].shape:
-                raise InputError(f"frame {name} of {path} has shape {image.shape}, the first has {rgb[0].shape}")
-        label = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
-        made = Recording.from_arrays(np.stack(rgb), np.stack(depth), K, pauses=range(len(chosen)), name=label)
+        video = Video(
+            chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}",
+            tuple(float(k) for k in range(len(chosen))),
+            lambda index: read_rgb(path / f"{chosen[index]}_rgb.png"),
+            lambda index: read_depth(path / f"{chosen[index]}_depth.png", scale),
+            K,
+            path,
+            scale,
+        )
+        made = video.recording(EveryNth(), KnownWorld())
 
         def instance(index: int) -> np.ndarray | None:
             return self._instance(made.frames[index], path / f"{chosen[index]}_label.png")
 
-        return replace(made, path=path, depth_scale=scale, instance=instance)
+        return replace(made, instance=instance)
 
     def _instance(self, frame: Frame, file: Path) -> np.ndarray | None:
         """The true objects (H, W) of a frame; None if there is no label image."""
@@ -306,10 +308,10 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
     return K
 
 
-def _four(K: np.ndarray, by_columns: bool) -> Sequence[float]:
+def _four(K: np.ndarray, by_columns: bool) -> tuple[float, ...]:
     """fx, fy, cx, cy of 4 numbers, or of a 3 x 3 or 4 x 4 matrix, flat or not; `by_columns`: flat ones by columns."""
     if K.size == 4:
-        return [float(v) for v in K.ravel()]
+        return tuple(float(v) for v in K.ravel())
     side = {9: 3, 16: 4}.get(K.size)
     if side is None:
         raise ValueError(f"the matrix has {K.size} numbers, expected 4, 9 or 16")
@@ -318,7 +320,7 @@ def _four(K: np.ndarray, by_columns: bool) -> Sequence[float]:
     if not np.allclose(matrix[2], (0, 0, 1)):
         order = "column by column" if by_columns else "row by row: fx 0 cx, 0 fy cy, 0 0 1"
         raise ValueError(f"the matrix is {K.tolist()}, expected {order}")
-    return [float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    return tuple(float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
 
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, naming, suggestion
+from mstfilter.errors import InputError, check_integer, naming
 from mstfilter.reading import read_text
 from mstfilter.scene import PauseRule, grey_blocks
 
@@ -97,21 +97,8 @@ def pauses_from_text(text: str) -> dict[str, Any]:
     numbers = words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words)
     if numbers and (len(words) > 1 or not Path(text).is_file()):  # a long list is no path
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
-    named = text in _RULES or not Path(text).is_file()
+    named = text in _NAMES or not Path(text).is_file()
     return {"component": text} if named else {"component": "listed", "file": text}
-
-
-def pause_rule(text: str) -> PauseRule:
-    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
-    config = pauses_from_text(text)
-    name = str(config.pop("component"))
-    if name not in _RULES:
-        raise InputError(
-            f"there is no rule of pauses {name!r}",
-            *suggestion(name, _RULES),
-            "still, ends, every, frames 0,40,85, seconds 0s,4.2s, or the path of a file that lists them",
-        )
-    return _RULES[name](**config)
 
 
 _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if the block never rests
@@ -205,4 +192,4 @@ class Still(PauseRule):
         return bounded
 
 
-_RULES: dict[str, type[PauseRule]] = {"still": Still, "ends": Ends, "every": EveryNth, "at": At, "listed": Listed}
+_NAMES = ("still", "ends", "every", "at", "listed")  # a file of such a name is not read as a list of pauses

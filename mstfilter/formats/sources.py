@@ -20,7 +20,7 @@ from mstfilter.errors import InputError
 from mstfilter.formats.pauses import pauses_from_text
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.registry import Registry, settings
-from mstfilter.scene import Recording
+from mstfilter.scene import PauseRule, Recording
 
 _REGISTRY = Registry(formats)
 
@@ -55,6 +55,12 @@ def open_recording(
         raise InputError(f"recording does not exist: {path}")
     reader: RecordingFormat = _REGISTRY.make(cls, fields, "", allow_files)
     return reader.open(path)
+
+
+def pause_rule(text: str) -> PauseRule:
+    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
+    rule: PauseRule = _REGISTRY.build("pauses", pauses_from_text(text))
+    return rule
 
 
 def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:

@@ -209,17 +209,21 @@ class Video:
 
     def _frame(self, index: int, camera: Camera, source: np.ndarray | None) -> Frame:
         rgb, depth = self.read_rgb(index), self.read_depth(index)
-        where = f"frame {index} of {self.path}"
-        (h, w), (dh, dw) = rgb.shape[:2], depth.shape[:2]
-        if (h, w) != (dh, dw):
-            raise InputError(
-                f"{where} has depth of {dw} x {dh}, colour of {w} x {h}: depth is not registered to colour",
-                "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
-            )
-        if (h, w) != (camera.height, camera.width):
-            raise InputError(f"{where} is {w} x {h}, the first is {camera.width} x {camera.height}")
-        check_depth(depth, f"depth of {where} with {self.depth_scale:g} m per unit")
+        check_images(rgb, depth, camera, self.depth_scale, f"frame {index} of {self.path}")
         return Frame(_undistort(rgb, source, smooth=True), _undistort(depth, source, np.nan), camera)
+
+
+def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: float, where: str) -> None:
+    """Raise InputError unless colour and depth (metres, `scale` per stored unit) have the size of the camera."""
+    sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (rgb, depth)]
+    if rgb.shape[:2] != depth.shape[:2]:
+        raise InputError(
+            f"{where} has depth of {sizes[1]}, colour of {sizes[0]}: depth is not registered to colour",
+            "align depth to colour when recording (each depth pixel must belong to the colour pixel above it)",
+        )
+    if rgb.shape[:2] != (camera.height, camera.width):
+        raise InputError(f"{where} is {sizes[0]}, the camera has {camera.width} x {camera.height}")
+    check_depth(depth, f"depth of {where} with {scale:g} m per unit")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, observed_box
-from mstfilter.errors import check_choice
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import (
     Clip,
@@ -90,9 +89,6 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     measured: BoundaryModel = field(default_factory=ColourDepthBoundary)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
-
-    def __post_init__(self) -> None:
-        check_choice("form", self.form, ("crisp", "cleaned"))
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32; the frame must be at a pause."""

@@ -21,6 +21,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.registry import nested_components
 from mstfilter.scene import Frame, Recording
 
 Need = Literal["voxels", "instance", "poses"]
@@ -127,11 +128,7 @@ class UsesTruth:
 
 def uses_truth(component: Any) -> list[str]:
     """Class names of a component and its components that use the truth, in order."""
-    found = [type(component).__name__] if isinstance(component, UsesTruth) else []
-    for value in _components(component).values():
-        for inner in value if isinstance(value, tuple) else (value,):
-            found.extend(uses_truth(inner))
-    return found
+    return [type(part).__name__ for part in nested_components(component) if isinstance(part, UsesTruth)]
 
 
 def bind_truth(component: T, recording: Recording) -> T:

@@ -5,8 +5,7 @@
 
 =============  =========================================================================================
 `update`       `PartitionUpdate`: partitions of the image are drawn, shapes completed from all views
-`cells`        the common refinement of partitions, and draws of partitions by its pairs of cells
-`pairs`        how likely two cells belong to one object
+`cells`        the common refinement of partitions, odds of pairs of cells, and draws of partitions by them
 `association`  which segment of the image continues which predicted object
 =============  =========================================================================================
 """

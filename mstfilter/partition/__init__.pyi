@@ -1,4 +1,10 @@
 from mstfilter.partition.association import ConflictComponent as ConflictComponent, Overlaps as Overlaps
-from mstfilter.partition.cells import Alternatives as Alternatives, Cells as Cells, Readings as Readings
-from mstfilter.partition.pairs import PairEvidence as PairEvidence, PairOdds as PairOdds, PairTerms as PairTerms
+from mstfilter.partition.cells import (
+    Alternatives as Alternatives,
+    Cells as Cells,
+    PairEvidence as PairEvidence,
+    PairOdds as PairOdds,
+    PairTerms as PairTerms,
+    Readings as Readings,
+)
 from mstfilter.partition.update import PartitionUpdate as PartitionUpdate

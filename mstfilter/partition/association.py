@@ -5,17 +5,21 @@
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
 A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one:
-an edge of the conflict graph (paper, section IV-D, where edges join objects that share voxels). An object to which
-no segment belongs mainly is in no conflict if it has very few readings: those are readings of other objects that lie
-at it. In each connected component, a predicted object is continued by at most one segment:
+an edge of the conflict graph (paper, section IV-D, where edges join objects that share voxels). The *main object* of
+a segment is the one with which it shares most readings. An object that is the main object of no segment and has very
+few readings is in no conflict: these are readings of other objects that lie near it. In each connected component, a
+predicted object is continued by at most one segment:
 
-- An object that overlaps one segment only, which overlaps no other object, is continued by it if they share more than
-  half of the readings.
-- Else it is continued by the segment that has more than 80 % of its readings. Only the segments count that mainly
-  show this object, if one of them has as much.
+- by the segment that has more than 80 % of those of its readings that lie in segments with this main object (readings
+  at which another object now occludes it do not count);
+- without such a segment, by the one that has more than 80 % of all its readings.
+
+If a segment and an object are in conflict with each other only, more than 50 % is enough. It follows:
+
 - An object that is *split* into segments of which none has as much is continued by none of them. Its track ends, and
   the segments are new objects.
-- A segment that continues several objects is their *merge*. A segment that continues none is a new object.
+- If several objects are *merged* into one segment, the segment continues all of them.
+- A segment that continues no object is a new object.
 
 An object without conflict is *occluded*: practically no reading belongs to it.
 """

@@ -15,9 +15,12 @@ estimated anew from all that was seen of it.
    paper crosses each sample with each prediction.
 3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments
    and predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
-   (`mstfilter.partition.association`). The paper draws which conflicts end in a merge; here the partition decides.
+   (`mstfilter.partition.association`). An object that is split into several segments is continued by the one with
+   more than 80 % of its readings, or by none; the other segments are new objects. The paper draws which conflicts end
+   in a merge; here the partition decides.
 4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
-   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free.
+   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free. It is
+   completed from its views alone, and removed if the frame refutes all of them.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
    completed from its readings in this frame and from the views of the objects that it continues. Evidence is
    remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on.
@@ -39,8 +42,7 @@ import numpy as np
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, Share
 from mstfilter.partition.association import Overlaps
-from mstfilter.partition.cells import Cells, Readings
-from mstfilter.partition.pairs import PairEvidence, PairOdds
+from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
 from mstfilter.scene import (
     Clip,
     Evidence,
@@ -49,9 +51,8 @@ from mstfilter.scene import (
     ObjectRecord,
     ObjectView,
     Projection,
-    check_grid,
+    check_grids,
     log_quality,
-    scored,
 )
 from mstfilter.smc import Population, Systematic, Update, child
 
@@ -134,7 +135,8 @@ class PartitionUpdate(Update):
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
         """Candidates. Without a proposal, the predictions after free-space projection."""
-        _check_grids(predicted, proposed, observation)
+        check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
+        check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
         readings = Readings.of(observation.after, observation.grid)
         if predicted is None:
             assert proposed is not None
@@ -278,15 +280,12 @@ class PartitionUpdate(Update):
         notes: Mapping[str, object],
     ) -> Population:
         """The candidates, weighted by evidence."""
-        total, scores = scored(self.evidence, built, clip)
+        total, scores = np.zeros(len(built)), {}
+        for k, term in enumerate(self.evidence):
+            name, score = type(term).__name__, term.log_score(built, clip)
+            scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
+            total += score
         return Population(built, log_weights + total, parents, {**notes, "scores": scores})
-
-
-def _check_grids(predicted: Population | None, proposed: Population | None, clip: Clip) -> None:
-    """Raise InputError unless all hypotheses are on the grid of the clip."""
-    for name, population in (("predicted", predicted), ("proposed", proposed)):
-        for k, hypothesis in enumerate(population.particles if population else ()):
-            check_grid(f"{name} hypothesis {k}", hypothesis, clip.grid)
 
 
 def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:

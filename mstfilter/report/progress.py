@@ -14,28 +14,8 @@ from typing import Any
 
 
 @contextlib.contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
-    """A progress bar; yields ``advance(done, total)``, where `total` is None if it is not known."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bars = Progress(*columns, console=Console(stderr=True))
-    task = bars.add_task(what, total=None)
-
-    def advance(done: int, total: int | None) -> None:
-        bars.start()  # not before the first call, so that an earlier error is printed without a bar
-        bars.update(task, completed=done, total=total)
-
-    try:
-        yield advance
-    finally:
-        bars.stop()
-
-
-@contextlib.contextmanager
-def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Bars of a study: one for all jobs and one for every running job; yields the function for its events."""
+def _bars(description: str, remaining: bool = False) -> Iterator[Any]:
+    """Bars with a description and the elapsed time, and the remaining time if asked for."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -46,37 +26,51 @@ def study_bars() -> Iterator[Callable[[Any], None]]:
         TimeRemainingColumn,
     )
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    bars = Progress(*columns, console=Console(stderr=True))
-    overall: dict[str, Any] = {}
-    running: dict[str, Any] = {}
-
-    def update(p: Any) -> None:
-        bars.start()
-        if p.what not in overall:
-            overall[p.what] = bars.add_task(p.what, total=p.total)
-        failed = f", {p.failed} failed" if p.failed else ""
-        bars.update(overall[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
-        if p.event is None:
-            return
-        if p.event.kind == "started":
-            running[p.name] = bars.add_task(f"  {p.name}", total=None)
-        elif p.event.kind == "step" and p.name in running:
-            bars.update(running[p.name], completed=p.event.done, total=p.event.total)
-        elif p.event.kind in ("ended", "lost") and p.name in running:
-            bars.remove_task(running.pop(p.name))
-        if p.event.kind == "lost":
-            bars.console.print(f"a worker died in {p.name}")
-        elif p.event.outcome is not None and p.event.outcome.status != "done":
-            bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
-
+    columns = [TextColumn(description), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
+    bars = Progress(*columns, *([TimeRemainingColumn()] if remaining else []), console=Console(stderr=True))
     try:
-        yield update
+        yield bars
     finally:
         bars.stop()
+
+
+@contextlib.contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
+    """A progress bar; yields ``advance(done, total)``, where `total` is None if it is not known."""
+    with _bars("{task.description:<12}") as bars:
+        task = bars.add_task(what, total=None)
+
+        def advance(done: int, total: int | None) -> None:
+            bars.start()  # not before the first call, so that an earlier error is printed without a bar
+            bars.update(task, completed=done, total=total)
+
+        yield advance
+
+
+@contextlib.contextmanager
+def study_bars() -> Iterator[Callable[[Any], None]]:
+    """Bars of a study: one for all jobs and one for every running job; yields the function for its events."""
+    overall: dict[str, Any] = {}
+    running: dict[str, Any] = {}
+    with _bars("{task.description}", remaining=True) as bars:
+
+        def update(p: Any) -> None:
+            bars.start()
+            if p.what not in overall:
+                overall[p.what] = bars.add_task(p.what, total=p.total)
+            failed = f", {p.failed} failed" if p.failed else ""
+            bars.update(overall[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
+            if p.event is None:
+                return
+            if p.event.kind == "started":
+                running[p.name] = bars.add_task(f"  {p.name}", total=None)
+            elif p.event.kind == "step" and p.name in running:
+                bars.update(running[p.name], completed=p.event.done, total=p.event.total)
+            elif p.event.kind in ("ended", "lost") and p.name in running:
+                bars.remove_task(running.pop(p.name))
+            if p.event.kind == "lost":
+                bars.console.print(f"a worker died in {p.name}")
+            elif p.event.outcome is not None and p.event.outcome.status != "done":
+                bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
+
+        yield update

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError, missing_library
 from mstfilter.files import atomic_path, check_output, write_text
 from mstfilter.report.pictures import colour, data_uri, hexadecimal, jpeg_bytes
 from mstfilter.report.scenes import ShownHypothesis, ShownPause, scenes_of_recording, scenes_of_run
@@ -198,11 +198,8 @@ def import_rerun() -> Any:
         import rerun
         import rerun.blueprint  # noqa: F401
     except ImportError as error:
-        raise MissingLibraryError(
-            f"the viewer needs the library rerun-sdk, which cannot be imported ({error})",
-            'install it: pip install "mstfilter[viewer]"',
-            "--html FILE writes a page that any browser opens, without rerun",
-        ) from error
+        hint = "--html FILE writes a page that any browser opens, without rerun"
+        raise missing_library(error, "the viewer", hint, library="rerun-sdk") from error
     return rerun
 
 

@@ -1,7 +1,7 @@
 """One run: a recording is opened, filtered, and kept in a folder.
 
 >>> from mstfilter.presets import load_config
->>> from mstfilter.runs import filter_recording, RunFolder
+>>> from mstfilter.runs import filter_recording
 >>> from mstfilter.scoring import read_truth, score_pauses
 >>> recording = mstfilter.open_recording("recordings/mine")                        # any format
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)

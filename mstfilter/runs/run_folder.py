@@ -47,6 +47,7 @@ from mstfilter.files import (
     write_sums,
     write_text,
 )
+from mstfilter.formats.folder import CameraFile
 from mstfilter.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.scene import (
     Camera,
@@ -55,9 +56,9 @@ from mstfilter.scene import (
     as_labels,
     decode_hypotheses,
     encode_hypotheses,
+    memo,
     read_labels,
     read_rgb,
-    rigid_from_matrix,
     write_image,
 )
 from mstfilter.scoring import FORMS, PauseEstimate, Questions, weighted_coverage
@@ -126,7 +127,6 @@ class _InfoFile(BaseModel):
     ess: float
     resampled: bool
     unique_ancestors: int | None
-    ancestors: list[int] | None
     parents: dict[str, list[int]]
     weights: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
     quality: dict[str, list[float]] | None
@@ -148,11 +148,8 @@ class _InfoFile(BaseModel):
         return self
 
 
-class _CameraFile(BaseModel):
-    K: Any
-    width: int
-    height: int
-    T_world_camera: Any
+class _PosedCamera(CameraFile):
+    T_world_camera: list[list[float]]
 
 
 class _SecondsFile(RootModel[dict[str, float]]):
@@ -281,36 +278,19 @@ class RunFolder:
             write_image(folder / "rgb.png", clip.after.rgb)
             if instance is not None:
                 write_image(folder / "instance.png", instance)
-            write_json(
-                folder / "camera.json",
-                {
-                    "K": camera.K,
-                    "width": camera.width,
-                    "height": camera.height,
-                    "T_world_camera": camera.pose.as_matrix(),
-                },
-            )
+            write_json(folder / "camera.json", CameraFile.of(camera.at(camera.pose)).model_dump())
             save_state(folder / "state.npz", state, HypothesisCodec(), compress=True, run=self.key)
             quality: dict[str, list[float]] | None = None
             if truth is not None:
                 pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
                 np.savez_compressed(folder / "truth.npz", labels=truth, questions=pairs.astype(np.int32))
                 quality = {form: [weighted_coverage(h.labels, truth, form) for h in hypotheses] for form in FORMS}
-            record = {
-                "t": info.t,
-                "n": info.n,
-                "n_frames": len(clip),
-                "n_candidates": info.n_candidates,
-                "ess": info.ess,
-                "resampled": info.resampled,
-                "unique_ancestors": info.unique_ancestors,
-                "ancestors": info.ancestors,
-                "parents": info.parents,
-                "log_weights": info.log_weights,
-                "weights": state.population.weights,
-                "quality": quality,
-                "notes": info.notes,
+            population = state.population
+            record = {name: getattr(info, name) for name in ("t", "n", "n_candidates", "ess", "resampled")}
+            record |= {
+                name: getattr(population, name) for name in ("unique_ancestors", "parents", "log_weights", "weights")
             }
+            record |= {"n_frames": len(clip), "quality": quality, "notes": info.notes}
             write_json(folder / "info.json", record)
             write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)
@@ -386,10 +366,8 @@ class RunFolder:
     def camera(self, t: int) -> Camera:
         """Camera at a pause."""
         path = self.pause(t) / "camera.json"
-        data = self._read(path, _CameraFile)
         with reading(path, "a run folder"):
-            pose = rigid_from_matrix(data["T_world_camera"])
-            return Camera(data["K"], data["width"], data["height"], pose)
+            return _PosedCamera.model_validate(self._read(path, _PosedCamera)).camera
 
     def truth(self, t: int) -> np.ndarray | None:
         """True labels (X, Y, Z) at a pause; None if unknown."""
@@ -419,8 +397,15 @@ class RunFolder:
         return tuple(population.particles)
 
     def state(self, t: int) -> State:
-        """The state after pause `t`, from which the run is resumed."""
-        return load_state(self.pause(t) / "state.npz", HypothesisCodec(), limit=MAX_FILE)[0]
+        """The state after pause `t`, from which the run is resumed.
+
+        It is kept in `scene_cache`: a report asks for it many times.
+        """
+        path = self.pause(t) / "state.npz"
+        with reading(path, "a pause of a run"):
+            now = path.stat()
+        version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
+        return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE)[0])
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, to be scored by `mstfilter.scoring.score_pauses`."""

@@ -23,7 +23,6 @@ from mstfilter.scene.evidence import (
     NoFreeSpace as NoFreeSpace,
     Projection as Projection,
     log_quality as log_quality,
-    scored as scored,
 )
 from mstfilter.scene.frame import (
     Clip as Clip,
@@ -79,5 +78,6 @@ from mstfilter.scene.voxels import (
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
     check_grid as check_grid,
+    check_grids as check_grids,
     occupied_box as occupied_box,
 )

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass
 from numbers import Real
 from typing import Annotated, Any
 
@@ -31,19 +31,21 @@ from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 _SMALLEST_QUALITY = 1e-3
 
 
-def _check_projected(self: Projection, found: tuple[Any, float], hypothesis: Any, frame: Frame) -> tuple[Any, float]:
-    check_pair(found, "a hypothesis", "a share")
-    projected, share = found
-    check_type(projected, type(hypothesis), f"a {type(hypothesis).__name__}")
-    if not isinstance(share, Real) or not 0 <= share <= 1 + 1e-9:
+Projected = tuple[Hypothesis, float]  #: a hypothesis, and the share of voxels that it has kept
+
+
+def _check_projected(self: Projection, found: Projected, hypothesis: Hypothesis, frame: Frame) -> Projected:
+    projected, share = check_pair(found, "a hypothesis", "a share")
+    check_type(projected, Hypothesis, "a Hypothesis")
+    if not isinstance(share, Real) or not 0 <= float(share) <= 1 + 1e-9:
         raise InputError(f"returns the share {describe_value(share)}, expected a number from 0 to 1")
     return projected, float(share)
 
 
-def _check_refined(self: Projection, found: Any, hypotheses: Sequence[Any], clip: Clip) -> Any:
-    check_pair(found, "hypotheses", "shares")
+def _check_refined(self: Projection, found: Any, hypotheses: Sequence[Hypothesis], clip: Clip) -> Any:
     n = len(hypotheses)
-    return tuple(check_list(found[0], n, object, "hypotheses")), check_array(found[1], (n,), "iuf", 0, 1)
+    refined, shares = check_pair(found, "hypotheses", "shares")
+    return tuple(check_list(refined, n, Hypothesis, "hypotheses")), check_array(shares, (n,), "iuf", 0, 1)
 
 
 class Projection(Checked, ABC):
@@ -51,11 +53,11 @@ class Projection(Checked, ABC):
 
     @returns(_check_projected)
     @abstractmethod
-    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+    def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
         """The nearest hypothesis that agrees with a frame, and the share of voxels that it keeps, in [0, 1]."""
 
     @returns(_check_refined)
-    def refine(self, hypotheses: Sequence[Any], clip: Clip) -> tuple[tuple[Any, ...], np.ndarray]:
+    def refine(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
         """Project hypotheses about the end of a clip onto its last frame; also returns the shares of voxels (n,)."""
         pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
@@ -65,7 +67,7 @@ class Projection(Checked, ABC):
 class NoFreeSpace(Projection):
     """Leaves every hypothesis unchanged, with quality 1."""
 
-    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
+    def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
         return hypothesis, 1.0
 
 
@@ -116,28 +118,15 @@ class FreeSpace(Projection):
         free[:, :, below] = True
         return free
 
-    def project(self, hypothesis: Any, frame: Frame) -> tuple[Any, float]:
-        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1.
-
-        `hypothesis` is a `Hypothesis`, or any dataclass with ``labels`` (X, Y, Z), 0 is free, and their ``grid``.
-        """
+    def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
+        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1."""
+        free = self.known_free(frame, hypothesis.grid)
         occupied = hypothesis.labels != 0
-        hit = occupied & self.known_free(frame, hypothesis.grid)
-        n_hit = int(hit.sum())
-        if isinstance(hypothesis, Hypothesis) and hypothesis.occupancy is not None:
-            hit = (hypothesis.occupancy.probability > 0) & self.known_free(frame, hypothesis.grid)
-        if not hit.any():
+        possible = occupied if hypothesis.occupancy is None else hypothesis.occupancy.probability > 0
+        if not (possible & free).any():
             return hypothesis, 1.0
-        labels = np.where(hit, 0, hypothesis.labels).astype(hypothesis.labels.dtype)
-        quality = 1.0 - n_hit / max(int(occupied.sum()), 1)
-        if isinstance(hypothesis, Hypothesis):
-            return hypothesis.without(hit), quality
-        if not is_dataclass(hypothesis) or isinstance(hypothesis, type):
-            raise InputError(
-                f"a particle is a {type(hypothesis).__name__}, and free space cannot clear it",
-                "it takes a Hypothesis, or a dataclass with fields labels and grid",
-            )
-        return replace(hypothesis, labels=labels), quality
+        quality = 1.0 - int((occupied & free).sum()) / max(int(occupied.sum()), 1)
+        return hypothesis.without(possible & free), quality
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:
@@ -155,15 +144,3 @@ class Evidence(Checked, ABC):
     @abstractmethod
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
         """Log score (n,) of hypotheses about the end of a clip, in nats, finite, up to a common constant."""
-
-
-def scored(
-    evidence: Sequence[Evidence], hypotheses: tuple[Hypothesis, ...], clip: Clip
-) -> tuple[np.ndarray, dict[str, list[float]]]:
-    """The sum (n,) of all terms of evidence in nats, and the score of each term by name."""
-    total, scores = np.zeros(len(hypotheses)), {}
-    for k, term in enumerate(evidence):
-        name, score = type(term).__name__, term.log_score(hypotheses, clip)
-        scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
-        total += score
-    return total, scores

@@ -28,6 +28,7 @@ from mstfilter.scene.geometry import SupportPlane, fit_support_plane
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
+_ASPECTS, _ANY = (0.8, 1.25), (-np.inf, np.inf)  # ratio of the focal lengths; warning
 _OFF_CENTRE = (0.2, 0.4)  # of the image size: principal point from the middle; warning and stop
 _VOXELS, _POSSIBLE_VOXELS = (0.001, 0.05), (0.0002, 0.3)  # metres; warning and stop
 _DISTANCES = (0.25, 2.0)  # metres from the camera to the table; warning
@@ -40,11 +41,8 @@ _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the 
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
 _TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
-_DRIFT = (
-    2.0,
-    0.02,
-    0.015,
-)  # degrees, metres, metres: tilt, height and shift of the camera between pauses; twice: stop
+# Tilt in degrees, height and shift in metres of the camera between pauses: warning; twice: stop.
+_DRIFT = (2.0, 0.02, 0.015)
 _MIN_MOVED = 15  # matched corners that agree with a moved camera
 _PEAK, _EXCESS, _ORDER = 0.15, 0.2, 0.015  # of the rank of colour edges below depth edges: see `_registration`
 _SHIFTS = 16  # pixels of an image of 320 columns
@@ -57,6 +55,20 @@ class Finding:
     stop: bool  #: whether the result cannot be right
     message: str
     hints: tuple[str, ...]
+
+
+def _stop(message: str, *hints: str) -> Finding:
+    return Finding(True, message, hints)
+
+
+def _warning(message: str, *hints: str) -> Finding:
+    return Finding(False, message, hints)
+
+
+_CHECK_POSE = "check the pose: z of the world is up, the table is at z = 0"
+_CHECK_SCALE = "check the depth scale: millimetres need 0.001, TUM images 0.0002, RealSense L515 0.00025"
+_GIVE_POSE = "give the pose T_world_camera of the camera over the table"
+_GIVE_WORKSPACE = "give a workspace around the objects, or none: it is then placed around the objects on the table"
 
 
 def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
@@ -88,16 +100,13 @@ def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[F
     raised = grid.contains(grid.index_of(points)) & (points[..., 2] > 2 * _MIN_HEIGHT)
     if raised.mean() > 0.005 and not any(h.n_objects for h in hypotheses):
         text = f"no hypothesis has an object, but {raised.mean():.1%} of the pixels show readings above the table"
-        hints = "check the depth scale and the pose", "objects of a few voxels need smaller voxels: give a workspace"
-        return [Finding(False, text, hints)]
+        return [_warning(text, _CHECK_SCALE, _CHECK_POSE, "objects of a few voxels need smaller voxels")]
     largest = max((max(h.volumes().values(), default=0) for h in hypotheses), default=0)
-    if largest > 0.1 * np.prod(grid.shape):
-        text = f"an object has {largest} voxels, {largest / np.prod(grid.shape):.0%} of the workspace"
-        hints = (
-            "is it the table? check that the camera stands still and that the table is at z = 0",
-            "is it a wall or a person? give a workspace around the objects",
-        )
-        return [Finding(False, text, hints)]
+    share = largest / np.prod(grid.shape)
+    if share > 0.1:
+        text = f"an object has {largest} voxels, {share:.0%} of the workspace"
+        table = "is it the table? check that the camera stands still and that the table is at z = 0"
+        return [_warning(text, table, f"is it a wall or a person? {_GIVE_WORKSPACE}")]
     return []
 
 
@@ -171,8 +180,13 @@ def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
     return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
 
 
-def _outside(value: float, limits: tuple[float, float]) -> bool:
-    return not limits[0] <= value <= limits[1]
+_Limits = tuple[float, float]
+
+
+def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
+    """A finding if a value is outside of its usual limits; it stops the run if the value is not possible."""
+    if not usual[0] <= value <= usual[1]:
+        yield Finding(not possible[0] <= value <= possible[1], text, hints)
 
 
 def _intrinsics(camera: Camera) -> Iterator[Finding]:
@@ -181,15 +195,10 @@ def _intrinsics(camera: Camera) -> Iterator[Finding]:
     width, height = camera.width, camera.height
     hint = "check K: it is in pixels of these images; scale it if they were resized"
     angle = float(np.degrees(2 * np.arctan(width / (2 * fx))))
-    if _outside(angle, _FIELDS):
-        text = (
-            f"a focal length of {fx:.4g} pixels gives images of {width} pixels a field of view of {angle:.3g} degrees"
-        )
-        yield Finding(_outside(angle, _POSSIBLE_FIELDS), text, (hint,))
-    elif _outside(fx / fy, (0.8, 1.25)):
-        yield Finding(
-            False, f"the focal lengths are {fx:.4g} and {fy:.4g} pixels, expected nearly equal ones", (hint,)
-        )
+    text = f"a focal length of {fx:.4g} pixels gives images of {width} pixels a field of view of {angle:.3g} degrees"
+    yield from _limited(angle, _FIELDS, _POSSIBLE_FIELDS, text, hint)
+    text = f"the focal lengths are {fx:.4g} and {fy:.4g} pixels, expected nearly equal ones"
+    yield from _limited(fx / fy, _ASPECTS, _ANY, text, hint)
     x, y = cx / width - 0.5, cy / height - 0.5
     off = max(abs(x), abs(y))
     if off > _OFF_CENTRE[0]:
@@ -201,47 +210,42 @@ def _intrinsics(camera: Camera) -> Iterator[Finding]:
 
 def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
     size = grid.voxel_size
-    if _outside(size, _VOXELS):
-        text = f"the voxels have edges of {size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m"
-        hint = "check the workspace: its bounds and its voxel size are in metres"
-        yield Finding(_outside(size, _POSSIBLE_VOXELS), text, (hint,))
+    text = f"the voxels have edges of {size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m"
+    hint = "check the workspace: its bounds and its voxel size are in metres"
+    yield from _limited(size, _VOXELS, _POSSIBLE_VOXELS, text, hint)
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
     """Images that show nothing; `which` names the frame."""
-    depth, masked = (
-        frame.depth[np.isfinite(frame.depth)],
-        0.0 if frame.robot_mask is None else frame.robot_mask.mean(),
-    )
+    depth = frame.depth[np.isfinite(frame.depth)]
+    masked = 0.0 if frame.robot_mask is None else frame.robot_mask.mean()
     if masked > 0.95 or not frame.valid.any():
         text = f"the robot mask of {which} covers {masked:.0%} of the image, and all or most of its depth"
-        yield Finding(True, text, ("is the mask inverted? True is the robot",))
+        yield _stop(text, "is the mask inverted? True is the robot")
     elif np.ptp(depth) < 1e-6:
         text = f"all depth readings of {which} are {depth[0]:.3g} m"
-        yield Finding(True, text, ("check that the depth images are those of the camera, in metres",))
+        yield _stop(text, "check that the depth images are those of the camera, in metres")
     elif frame.rgb.mean(axis=2).std() < 4:
         text = f"the colour image of {which} is uniform"
-        yield Finding(False, text, ("check that the colour images are 8-bit RGB, 0 to 255, and not covered",))
+        yield _warning(text, "check that the colour images are 8-bit RGB, 0 to 255, and not covered")
 
 
 def _support(first: Look) -> Iterator[Finding]:
     """A pose, intrinsics or a support plane that contradict the readings at the first pause."""
-    free, camera = first.plane(np.ones(len(first.points), bool)), first.frame.camera
+    free, camera, table = first.plane(np.ones(len(first.points), bool)), first.frame.camera, first.table
     hints = (
-        "check the pose: z of the world is up, the table is at z = 0; without a pose it is found from the table",
+        f"{_CHECK_POSE}; without a pose it is found from the table",
         "T_world_camera maps points of the camera to the world; is this the inverse?",
         f"check K: its focal length is {camera.K[0, 0] / camera.width:.3g} of the width of the images",
-        "check the depth scale",
+        _CHECK_SCALE,
     )
-    table = first.table
     if table is not None and (table[0] > _MAX_TILT or abs(table[1]) > _MAX_HEIGHT):
         text = f"the table in the depth image is tilted by {table[0]:.1f} degrees and at z = {table[1]:.3f} m"
-        yield Finding(table[0] > 2 * _MAX_TILT or abs(table[1]) > 2 * _MAX_HEIGHT, f"{text}, expected z = 0", hints)
+        impossible = table[0] > 2 * _MAX_TILT or abs(table[1]) > 2 * _MAX_HEIGHT
+        yield Finding(impossible, f"{text}, expected z = 0", hints)
     elif table is None and free is not None and (first.on_table.mean() < _MIN_ON_TABLE or free[0] > 150):
-        text = (
-            f"no table is at z = 0: the largest plane is tilted by {free[0]:.0f} degrees and at z = {free[1]:.3f} m"
-        )
-        yield Finding(True, f"{text}, expected z = 0", hints)
+        text = f"the largest plane is tilted by {free[0]:.0f} degrees and at z = {free[1]:.3f} m, expected z = 0"
+        yield _stop(f"no table is at z = 0: {text}", *hints)
     else:
         yield from _other_support(first)
 
@@ -258,42 +262,31 @@ def _other_support(first: Look) -> Iterator[Finding]:
         return
     tilt, height, normal = plane
     heights = first.points[raised, 2]
-    hints = (
-        "give the pose T_world_camera of the camera over the table",
-        "or remove the depth readings beyond the table (NaN or 0), or turn the camera towards the table",
-    )
-    if tilt < 15 and height > _TALL:
-        share = float(raised.mean() * (np.abs(heights - height) < _ON_TABLE).mean())
-        if share > _MIN_ON_TABLE:
-            yield Finding(
-                True, f"the floor is taken for the table: a second plane is {height:.2f} m above z = 0", hints
-            )
+    hint = "or remove the depth readings beyond the table (NaN or 0), or turn the camera towards the table"
+    on_plane = raised.mean() * (np.abs(heights - height) < _ON_TABLE).mean()
+    if tilt < 15 and height > _TALL and on_plane > _MIN_ON_TABLE:
+        text = f"the floor is taken for the table: a second plane is {height:.2f} m above z = 0"
+        yield _stop(text, _GIVE_POSE, hint)
     up = first.frame.camera.pose.rotation.inv().apply([0.0, 0.0, 1.0])
     if 60 < tilt < 120 and np.percentile(heights, 98) > _TALL and up[1] > -0.1 and -normal[1] > _UPRIGHT:
-        yield Finding(True, f"a wall is taken for the table: another plane is tilted by {tilt:.0f} degrees", hints)
+        text = f"a wall is taken for the table: another plane is tilted by {tilt:.0f} degrees"
+        yield _stop(text, _GIVE_POSE, hint)
 
 
 def _scale(first: Look) -> Iterator[Finding]:
     """Distances that are not those of a camera over a table."""
     z, size = first.distance, first.grid.voxel_size
-    hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002, RealSense L515 0.00025"
-    if _outside(z, _DISTANCES):
-        near, far = z < _VOXELS_IN_DISTANCE * size, depth_sigma(z) > _NOISE_IN_VOXELS * size
-        text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
-        right = f"if the distance is right, give a workspace with {'larger' if far else 'smaller'} voxels"
-        yield Finding(bool(near or far), text, (hint, right))
+    possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
+    text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
+    voxels = "larger" if z > possible[1] else "smaller"
+    right = f"if the distance is right, give a workspace with {voxels} voxels"
+    yield from _limited(z, _DISTANCES, possible, text, _CHECK_SCALE, right)
     raised = first.in_columns & (first.points[:, 2] > _MIN_HEIGHT)
     above = first.points[raised, 2] > first.grid.upper[2]
     if raised.sum() >= _MIN_READINGS and above.mean() > 0.5:
         text = f"most readings above the table are above the workspace, which ends at z = {first.grid.upper[2]:.2f} m"
-        yield Finding(
-            False,
-            text,
-            (
-                "check the depth scale: objects on a table are not metres high; or give a higher workspace",
-                "is the plane of the table found on the floor or on a wall? then give the pose T_world_camera",
-            ),
-        )
+        floor = f"is the plane of the table found on the floor or on a wall? {_GIVE_POSE}"
+        yield _warning(text, _CHECK_SCALE, "or give a higher workspace", floor)
 
 
 def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
@@ -308,16 +301,10 @@ def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
     grid, texts = looks[0].grid, []
     for low, high in ((grid.origin, grid.upper), (spans[:, 0].min(axis=0), spans[:, 1].max(axis=0))):
         texts.append(", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True)))
-    yield Finding(
-        True,
-        "the workspace has no reading above the table, so no object can be found: "
-        f"it spans {texts[0]} m, depth readings span {texts[1]} m",
-        (
-            "give a workspace around the objects, or none: it is then placed around the objects on the table",
-            "check the pose: z of the world is up, the table is at z = 0",
-            "check the depth scale, and that the images show objects on a table and not only a wall",
-        ),
-    )
+    text = f"it spans {texts[0]} m, depth readings span {texts[1]} m"
+    images = "check that the images show objects on a table and not only a wall"
+    text = f"the workspace has no reading above the table, so no object can be found: {text}"
+    yield _stop(text, _GIVE_WORKSPACE, _CHECK_POSE, _CHECK_SCALE, images)
 
 
 class _Corners:
@@ -381,9 +368,8 @@ def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
         size = max(value / limit for value, limit in zip(found, _DRIFT, strict=True))
         if size > 1:
             text = f"the camera moves from frame {looks[0].index} to {look.index}, but not its pose: the table is "
-            text += "tilted by {:.1f} degrees and {:.3f} m higher, still corners are shifted by {:.3f} m".format(
-                *found
-            )
+            text += f"tilted by {found[0]:.1f} degrees and {found[1]:.3f} m higher, still corners are shifted by "
+            text += f"{found[2]:.3f} m"
             hints = (
                 "fix the camera, or give its pose in every frame: T_world_camera of shape (T, 4, 4)",
                 "poses of the camera map its points to the world, in metres; check that they belong to these frames",
@@ -458,22 +444,21 @@ def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
         return
     if rise > _ORDER:
         text = "edges of the depth images agree better with the colour images of other pauses than with their own"
-        yield Finding(False, text, ("check that colour and depth have the same order, and the same clock",))
+        yield _warning(text, "check that colour and depth have the same order, and the same clock")
     elif lost > _EXCESS and max(map(abs, shift)) > 2:
-        scale = 100 / looks[0].edges.depth.shape[1]
+        down, right = (100 * s / looks[0].edges.depth.shape[1] for s in shift)
         text = (
-            f"depth is not registered to colour: edges agree best {scale * shift[1]:.1f} % of the image width further"
+            f"edges agree best {right:.1f} % of the image width further right and {down:.1f} % further down in colour"
         )
-        text += f" right and {scale * shift[0]:.1f} % further down in colour"
-        hints = ("align depth to colour when recording: each depth pixel belongs to the colour pixel above it",)
-        yield Finding(False, text, hints)
+        hint = "align depth to colour when recording: each depth pixel belongs to the colour pixel above it"
+        yield _warning(f"depth is not registered to colour: {text}", hint)
 
 
 def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
     """Pauses that all show one image."""
     if len(looks) > 1 and len({content_key(look.frame.rgb, look.frame.depth) for look in looks}) == 1:
         text = f"the images of all {len(looks)} pauses are identical, which no camera gives"
-        yield Finding(False, text, ("check that every frame is read from its own file",))
+        yield _warning(text, "check that every frame is read from its own file")
 
 
 def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
@@ -483,7 +468,7 @@ def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Findi
     change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))
     if (np.abs(change - np.median(change)) > 20).mean() > 0.01:
         text = f"there is one pause in {len(frames)} frames, but the scene changes: the video is not used"
-        yield Finding(False, text, ("give a pause before and after each action: pauses=(0, 40, 85)",))
+        yield _warning(text, "give a pause before and after each action: pauses=(0, 40, 85)")
 
 
 def _warn(message: str, *hints: str) -> None:

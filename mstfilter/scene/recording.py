@@ -47,7 +47,7 @@ class PauseRule(ABC):
         """
 
 
-_rule_of_text = late("mstfilter.formats.pauses:pause_rule", "The rule of a text.")
+_rule_of_text = late("mstfilter.formats.sources:pause_rule", "The rule of a text.")
 
 
 class LazyFrames(Sequence[Frame]):
@@ -231,12 +231,8 @@ class Recording:
         if not chosen or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
-        if len(masks) != n or any(m is not None and m.shape != (height, width) for m in masks):
-            found = sorted({np.shape(m) for m in masks if m is not None})
-            raise InputError(
-                f"there are {len(masks)} robot masks of shape {found}, expected {n} of {(height, width)}",
-                "one mask per frame, of the size of the images",
-            )
+        if len(masks) != n:
+            raise InputError(f"there are {len(masks)} robot masks for {n} frames of {name}")
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
         posed, grid = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:

@@ -14,7 +14,7 @@ at z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from functools import cached_property
@@ -444,3 +444,9 @@ def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
             "all hypotheses of a run share the workspace of its clips",
             "parts of one session: open the later part with later.in_world_of(first)",
         )
+
+
+def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
+    """Raise InputError if one of several hypotheses of a side, such as "predicted", has another grid."""
+    for k, hypothesis in enumerate(hypotheses):
+        check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)

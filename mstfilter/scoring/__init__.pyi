@@ -24,7 +24,6 @@ from mstfilter.scoring.pauses import (
     read_estimates as read_estimates,
     read_truth as read_truth,
     score_pauses as score_pauses,
-    write_scores as write_scores,
 )
 from mstfilter.scoring.quality import (
     FORMS as FORMS,

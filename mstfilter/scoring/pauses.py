@@ -17,14 +17,14 @@ forms.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import reading, write_csv, writing
+from mstfilter.files import reading
 from mstfilter.reading import read_arrays
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring.log_loss import score_belief
@@ -264,17 +264,3 @@ def _same_grid(a: VoxelGrid, b: VoxelGrid) -> bool:
 
 def _grid_text(grid: VoxelGrid) -> str:
     return f"{' x '.join(map(str, grid.shape))} at {np.round(grid.origin, 4).tolist()} of {grid.voxel_size:g} m"
-
-
-def write_scores(path: Path, rows: Sequence[PauseScore]) -> None:
-    """Write scores as a CSV table.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    if not path.parent.is_dir():
-        raise InputError(f"cannot write {path}: its folder does not exist")
-    with writing(str(path)):
-        write_csv(path, [asdict(row) for row in rows], float_format=".6f")

@@ -10,6 +10,7 @@ from mstfilter.simulation.recorder import (
     POSE_TOLERANCE as POSE_TOLERANCE,
     SimulatedScene as SimulatedScene,
     cache_folder as cache_folder,
+    cached_path as cached_path,
     cached_recording as cached_recording,
     recipe_key as recipe_key,
     record_scene as record_scene,

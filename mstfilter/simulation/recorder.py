@@ -234,6 +234,11 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
     return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def cached_path(family: SceneFamily, seed: int, folder: Path) -> Path:
+    """Where `cached_recording` keeps a recording in a folder; it need not exist."""
+    return folder / f"{family.name}-{seed}-{recipe_key(family, seed)}"
+
+
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
     """The folder of a simulated recording, which is simulated if it does not exist or has changed on the disk.
 
@@ -250,7 +255,7 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
         )
     chosen = replace(chosen, **overrides)
     _check_seed(seed)
-    target = (folder or cache_folder() / "recordings") / f"{chosen.name}-{seed}-{recipe_key(chosen, seed)}"
+    target = cached_path(chosen, seed, folder or cache_folder() / "recordings")
     check_private(target.parent)
     if (target / "manifest.json").is_file() and (damage := damaged_files(target)):
         warnings.warn(InputWarning(f"cached recording {target}: {damage[0]}", "it is simulated again"), stacklevel=2)

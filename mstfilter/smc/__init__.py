@@ -17,17 +17,20 @@
 `diverse_resampling`    schemes that keep different particles, with unequal weights
 `transport_resampling`  wrappers of schemes, sorted particles, transport
 `components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
-`streams`               random streams named by seed, step, slot and index
-`batching`              many runs of a filter at once
+`streams`               random streams named by seed, step, slot and index; generators of many runs
+`history`               collectors: quantities of a run, recorded at every step
+`running`               `run_many`: several filters, seeds and data sets
+`batching`              the runs of a filter together, as arrays
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
-`exact`                 linear-Gaussian and finite models with exact answers, Rao-Blackwellised filters
+`exact`                 linear-Gaussian and finite models with exact answers
+`gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; adapters for those of scipy and torch
-`smoothing`             states given all observations, paths of states by conditional SMC
+`smoothing`             states given all observations
+`conditional`           paths of states by conditional SMC, one at a time
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
-`diagnostics`           quantities of a run, energy distances, comparison of filters
-`evaluation`            coalescence and variance of a run
+`diagnostics`           energy distances, coalescence and variance of a run, scores against the truth
 `export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """
@@ -57,14 +60,10 @@ __components__ = {
         "systematic": "Systematic",
         "ssp": "Ssp",
         "killing": "Killing",
-        "rejection": "Rejection",
-        "metropolis": "Metropolis",
         "largest_weights": "LargestWeights",
         "fearnhead_clifford": "FearnheadClifford",
         "chopthin": "Chopthin",
         "clusters": "ClusterStratified",
-        "kdpp": "KDpp",
-        "greedy_diverse": "GreedyDiverse",
         "ensemble_transform": "EnsembleTransform",
         "coalesced": "Coalesced",
         "tempered": "Tempered",

@@ -1,8 +1,3 @@
-from mstfilter.smc.batching import (
-    Batch as Batch,
-    batch as batch,
-    batched_slots as batched_slots,
-)
 from mstfilter.smc.checkpoint import ArrayCodec as ArrayCodec, load_state as load_state, save_state as save_state
 from mstfilter.smc.components import (
     Always as Always,
@@ -19,20 +14,18 @@ from mstfilter.smc.components import (
     Reweight as Reweight,
     first_seen as first_seen,
 )
+from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.diagnostics import (
-    History as History,
+    Coalescence as Coalescence,
     Measured as Measured,
-    collect as collect,
+    RunVariance as RunVariance,
+    coalescence as coalescence,
     energy_distance as energy_distance,
-    ess as ess,
-    log_evidence as log_evidence,
-    mean as mean,
-    n_particles as n_particles,
-    resampled as resampled,
-    run_many as run_many,
+    log_score as log_score,
+    pit as pit,
+    run_variance as run_variance,
     selection_distance as selection_distance,
-    unique_ancestors as unique_ancestors,
-    weight_entropy as weight_entropy,
+    set_energy_score as set_energy_score,
 )
 from mstfilter.smc.distributions import (
     Bernoulli as Bernoulli,
@@ -50,33 +43,35 @@ from mstfilter.smc.diverse_resampling import (
     ClusterStratified as ClusterStratified,
     FearnheadClifford as FearnheadClifford,
     Gaussian as Gaussian,
-    GreedyDiverse as GreedyDiverse,
-    KDpp as KDpp,
-)
-from mstfilter.smc.evaluation import (
-    Coalescence as Coalescence,
-    RunVariance as RunVariance,
-    coalescence as coalescence,
-    log_score as log_score,
-    pit as pit,
-    run_variance as run_variance,
-    set_energy_score as set_energy_score,
 )
 from mstfilter.smc.exact import (
-    ConditionallyLinear as ConditionallyLinear,
     Kalman as Kalman,
-    Linear as Linear,
     Marginals as Marginals,
-    ekf_proposal as ekf_proposal,
     forward_backward as forward_backward,
     hidden_markov as hidden_markov,
     kalman_filter as kalman_filter,
     linear_gaussian as linear_gaussian,
+)
+from mstfilter.smc.filter import ParticleFilter as ParticleFilter
+from mstfilter.smc.gaussian import (
+    ConditionallyLinear as ConditionallyLinear,
+    Linear as Linear,
+    ekf_proposal as ekf_proposal,
     nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
     ukf_proposal as ukf_proposal,
 )
-from mstfilter.smc.filter import ParticleFilter as ParticleFilter
+from mstfilter.smc.history import (
+    History as History,
+    collect as collect,
+    ess as ess,
+    log_evidence as log_evidence,
+    mean as mean,
+    n_particles as n_particles,
+    resampled as resampled,
+    unique_ancestors as unique_ancestors,
+    weight_entropy as weight_entropy,
+)
 from mstfilter.smc.inference import (
     Chains as Chains,
     TemperedSample as TemperedSample,
@@ -131,28 +126,23 @@ from mstfilter.smc.programs.sites import (
 from mstfilter.smc.resampling import (
     Killing as Killing,
     LargestWeights as LargestWeights,
-    Metropolis as Metropolis,
     Multinomial as Multinomial,
-    Rejection as Rejection,
     Residual as Residual,
     Ssp as Ssp,
     Stratified as Stratified,
     Systematic as Systematic,
 )
+from mstfilter.smc.running import run_many as run_many
 from mstfilter.smc.smoothing import (
     Record as Record,
     backward_paths as backward_paths,
-    conditional_path as conditional_path,
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
     paris as paris,
-    path_log_prob as path_log_prob,
 )
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,
-    GuidedInitial as GuidedInitial,
-    GuidedTransition as GuidedTransition,
     Prior as Prior,
     PriorityLookahead as PriorityLookahead,
     RandomWalkMove as RandomWalkMove,

@@ -32,7 +32,6 @@ from mstfilter.files import atomic_path, writing
 from mstfilter.reading import read_arrays
 from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
-from mstfilter.smc.programs.sites import Trace
 from mstfilter.smc.streams import Key
 
 _FORMAT = 1
@@ -82,7 +81,7 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
             raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
         particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
         population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
-        key = Key(int(head["seed"]), tuple(int(part) for part in head["path"]))
+        key = Key(int(head["seed"]), tuple(head["path"]))
         return State(int(head["t"]), population, key, bool(head["properly_weighted"])), head
 
 
@@ -279,15 +278,17 @@ class ArrayCodec(Codec):
         if any(type(p) is not kind for p in particles):
             names = sorted({type(p).__qualname__ for p in particles})
             raise InputError(f"particles of several types cannot be stored: {', '.join(names)}", _HINT)
-        if kind is Trace:
-            rows, form = [dict(p) for p in particles], {"kind": "traces"}
-        elif dataclasses.is_dataclass(kind):
+        if dataclasses.is_dataclass(kind):
             rows = [{f.name: getattr(p, f.name) for f in dataclasses.fields(kind)} for p in particles]
             form = {"kind": "dataclass", "type": f"{kind.__module__}:{kind.__qualname__}"}
             if self.particle is not kind:
                 _find(form["type"], kind)
         else:
-            raise InputError(f"particles of type {kind.__qualname__} cannot be stored", _HINT)
+            from mstfilter.smc.programs.sites import Trace  # the language of programs is imported for programs only
+
+            if kind is not Trace:
+                raise InputError(f"particles of type {kind.__qualname__} cannot be stored", _HINT)
+            rows, form = [dict(p) for p in particles], {"kind": "traces"}
         # Resampled particles are references: each object is stored once.
         first: dict[int, int] = {}
         index: list[int] = []
@@ -314,12 +315,15 @@ class ArrayCodec(Codec):
             return arrays["x"]
         if form["kind"] == "mapping":
             return {name: arrays[f"x/{name}"] for name in form["names"]}
-        make: Any = Trace
+        make: Any
         if form["kind"] == "dataclass":
             cls = self.particle or _find(form["type"])
 
             def make(row: dict[str, Any]) -> Any:
                 return cls(**row)
+
+        else:
+            from mstfilter.smc.programs.sites import Trace as make
 
         made = []
         for k, fields in enumerate(form["rows"]):

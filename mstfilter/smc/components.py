@@ -29,11 +29,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_integer, check_number
+from mstfilter.errors import InputError, check_integer
+from mstfilter.fields import Bounds, PositiveFloat, PositiveInt
 from mstfilter.smc.interfaces import Equivalence, Size, Transition, Trigger, Update
 from mstfilter.smc.population import Population, as_matrix, union
 
@@ -111,15 +112,12 @@ class CrossVectors(Update):
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
-    share: float = 0.5
+    share: PositiveFloat = 0.5
     among: bool = False
 
     #: The density of children is not known.
     properly_weighted: ClassVar[bool] = False
     step_functions: ClassVar = {"log_likelihood": 2}
-
-    def __post_init__(self) -> None:
-        check_number("share", self.share, above=0)
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
@@ -171,12 +169,8 @@ class Branching(Transition):
     """
 
     inner: Transition
-    branches: int = 4
+    branches: PositiveInt = 4
     step_functions: ClassVar = {"inner": None}
-
-    def __post_init__(self) -> None:
-        check_component("inner", self.inner, Transition)
-        check_integer("branches", self.branches)
 
     @property
     def properly_weighted(self) -> bool:
@@ -191,16 +185,18 @@ class Branching(Transition):
         return moved.labelled({**moved.parents, "previous": index}, moved.notes)
 
 
+_HINT_SHARE = (
+    "share is relative to the number of particles: 0.5 resamples below half of them; see also the triggers Always "
+    "and Never"
+)
+
+
 @dataclass(frozen=True)
 class EssBelow(Trigger):
     """Resample if the effective sample size is below a `share`, in (0, 1], of the number of particles."""
 
-    share: float = 0.5
+    share: Annotated[float, Bounds(above=0, at_most=1, hint=_HINT_SHARE)] = 0.5
     batched: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        hint = "share is relative to the number of particles: 0.5 resamples below half of them"
-        check_number("share", self.share, f"{hint}; see also the triggers Always and Never", above=0, at_most=1)
 
     def wants(self, population: Population, t: int) -> bool:
         return population.ess < self.share * population.log_weights.shape[-1]
@@ -230,11 +226,8 @@ class Never(Trigger):
 class EveryKth(Trigger):
     """Resample at every k-th step."""
 
-    k: int = 2
+    k: PositiveInt = 2
     batched: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_integer("resampling at every k-th step: k", self.k)
 
     def wants(self, population: Population, t: int) -> bool:
         return t % self.k == 0
@@ -244,10 +237,7 @@ class EveryKth(Trigger):
 class Fixed(Size):
     """A fixed number of particles `n`."""
 
-    n: int = 100
-
-    def __post_init__(self) -> None:
-        check_integer("n", self.n)
+    n: PositiveInt = 100
 
     def choose(self, population: Population) -> int:
         return self.n
@@ -276,10 +266,7 @@ class ExactEquality(Equivalence):
 class Bins(Equivalence):
     """Array particles in the same cell of a regular grid; `width` is the side of a cell, in their units."""
 
-    width: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("width", self.width, above=0, unit="side of a cell")
+    width: Annotated[float, Bounds(above=0, unit="side of a cell")] = 1.0
 
     def classes(self, particles: Any) -> np.ndarray:
         cells = np.floor(as_matrix(particles) / self.width)
@@ -311,16 +298,12 @@ class Kld(Size):
     """
 
     equivalence: Equivalence = Bins()
-    epsilon: float = 0.05
-    delta: float = 0.01
-    n_min: int = 10
+    epsilon: Annotated[float, Bounds(above=0, unit="distance in nats")] = 0.05
+    delta: Annotated[float, Bounds(above=0, below=1, unit="probability")] = 0.01
+    n_min: PositiveInt = 10
     n_max: int = 100_000
 
     def __post_init__(self) -> None:
-        check_component("equivalence", self.equivalence, Equivalence)
-        check_number("epsilon", self.epsilon, above=0, unit="distance in nats")
-        check_number("delta", self.delta, above=0, below=1, unit="probability")
-        check_integer("n_min", self.n_min)
         check_integer("n_max", self.n_max, f"n_min is {self.n_min}", at_least=self.n_min)
 
     def choose(self, population: Population) -> int:

@@ -24,16 +24,17 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Distribution
+from mstfilter.smc.resampling import draw_rows, search
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _FLOAT64 = np.dtype(np.float64)
@@ -51,21 +52,65 @@ def hypothetical() -> Iterator[None]:
         _HYPOTHETICAL.reset(token)
 
 
+class Range(NamedTuple):
+    """The numbers that a parameter may take."""
+
+    expected: str
+    low: float = -math.inf
+    high: float = math.inf
+    open: bool = True  #: whether the ends are out of range
+
+    def contains(self, value: np.ndarray) -> np.ndarray:
+        """Whether each number is in the range; NaN is not."""
+        return (value > self.low) & (value < self.high) if self.open else (value >= self.low) & (value <= self.high)
+
+    def surely_contains(self, value: Any) -> bool:
+        """Whether all numbers of a float or float64 array are known to be in the range, by their sum and minimum."""
+        if type(value) is float:
+            return self.low < value < self.high
+        if self.high < math.inf or not _is_finite(value):
+            return False
+        return self.low == -math.inf or np.minimum.reduce(value, axis=None, initial=math.inf) > self.low
+
+
+FINITE = Range("a finite number")
+POSITIVE = Range("a positive number", 0.0)
+
+
 class _Checked(Distribution):
-    """A distribution that checks its parameters, which are fields."""
+    """A distribution that checks its parameters, which are fields.
+
+    Numbers are checked when it is made. So are arrays, unless they are `lazy`, as the log density at a value out of
+    range is NaN: these are checked when it is sampled.
+    """
 
     draws_numbers = True
+    ranges: ClassVar[Mapping[str, Range]] = {}
+    lazy: ClassVar[bool] = False
 
-    def _check(self, name: str, expected: str, inside: Callable[[np.ndarray], np.ndarray]) -> None:
-        """Raise InputError at the first entry of a parameter that is not `inside`; `hypothetical` makes it NaN."""
+    def __post_init__(self) -> None:
+        for name in self.ranges:
+            if not (self.lazy and type(getattr(self, name)) is np.ndarray):
+                self._check(name, self.ranges[name])
+
+    def check_parameters(self) -> None:
+        for name, parameters in self.ranges.items():
+            self._check(name, parameters)
+
+    def _check(self, name: str, allowed: Range) -> None:
+        """Raise InputError at the first entry of a parameter that is out of range; `hypothetical` makes it NaN."""
         value = getattr(self, name)
+        if allowed.surely_contains(value):  # a third of the time of the rest
+            return
         array = np.asarray(value)
         if array.dtype.kind not in "fiub":
             raise InputError(
-                f"{name} of a {type(self).__name__} is {value!r}"[:200] + f", expected {expected}",
+                f"{name} of a {type(self).__name__} is {value!r}"[:200] + f", expected {allowed.expected}",
                 *(["None stands for a missing observation, or for previous at the first step"] * (value is None)),
             )
-        wrong = ~inside(array)
+        self._check_rows(name, array, ~allowed.contains(array), allowed.expected)
+
+    def _check_rows(self, name: str, array: np.ndarray, wrong: np.ndarray, expected: str) -> None:
         if not wrong.any():
             return
         array = np.broadcast_to(array, wrong.shape)
@@ -75,15 +120,6 @@ class _Checked(Distribution):
         first = tuple(int(i) for i in np.argwhere(wrong)[0])
         row = f" in row {first[0]} ({int(wrong.sum())} of {array.size})" if first else ""
         raise InputError(f"{name} of a {type(self).__name__} is {array[first]}{row}, expected {expected}")
-
-    def _check_finite(self, name: str) -> None:
-        if not _is_finite(getattr(self, name)):
-            self._check(name, "a finite number", np.isfinite)
-
-    def _check_positive(self, name: str) -> None:
-        value = getattr(self, name)
-        if not (_is_finite(value) and (value > 0 if type(value) is float else _minimum(value) > 0)):
-            self._check(name, "a positive number", lambda a: (a > 0) & (a < np.inf))
 
 
 class _Independent(_Checked):
@@ -111,10 +147,6 @@ def _is_finite(value: Any) -> bool:
     if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
         return math.isfinite(np.add.reduce(value, axis=None))
     return type(value) is float and math.isfinite(value)
-
-
-def _minimum(value: np.ndarray) -> float:
-    return np.minimum.reduce(value, axis=None, initial=np.inf)
 
 
 def _impossible(value: np.ndarray) -> Any:
@@ -165,14 +197,12 @@ class Normal(_Independent):
     loc: Any = 0.0
     scale: Any = 1.0
 
+    ranges: ClassVar = {"loc": FINITE, "scale": POSITIVE}
+    lazy: ClassVar = True
+
     def __post_init__(self) -> None:
-        loc, scale = self.loc, self.scale
-        if type(scale) is float and 0.0 < scale < math.inf and type(loc) is np.ndarray:
-            return  # the usual case
-        if type(loc) is not np.ndarray:
-            self._check_finite("loc")
-        if type(scale) is not np.ndarray:
-            self._check_positive("scale")
+        if not (type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray):
+            super().__post_init__()  # not in the usual case
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -180,15 +210,9 @@ class Normal(_Independent):
             return self.loc.shape
         return super().parameter_shape
 
-    def check_parameters(self) -> None:
-        if not _is_finite(self.loc):
-            self._check_finite("loc")
-        if type(self.scale) is not float:
-            self._check_positive("scale")
-
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         loc, scale = self.loc, self.scale
-        if not (type(scale) is float and _is_finite(loc)):
+        if not (type(scale) is float and _is_finite(loc)):  # the usual case, whose scale was checked
             self.check_parameters()
         z = rng.standard_normal(self.value_shape(size))
         z *= scale
@@ -219,14 +243,8 @@ class Student(_Independent):
     loc: Any = 0.0
     scale: Any = 1.0
 
-    def __post_init__(self) -> None:
-        if np.ndarray not in (type(self.df), type(self.loc), type(self.scale)):
-            self.check_parameters()
-
-    def check_parameters(self) -> None:
-        self._check_positive("df")
-        self._check_finite("loc")
-        self._check_positive("scale")
+    ranges: ClassVar = {"df": POSITIVE, "loc": FINITE, "scale": POSITIVE}
+    lazy: ClassVar = True
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         self.check_parameters()
@@ -251,10 +269,13 @@ class Uniform(_Independent):
     low: Any = 0.0
     high: Any = 1.0
 
+    ranges: ClassVar = {"low": FINITE, "high": Range("a finite number above low")}
+
     def __post_init__(self) -> None:
-        self._check_finite("low")
+        super().__post_init__()
         _broadcast_shape(self.low, self.high)
-        self._check("high", "a finite number above low", lambda a: (np.asarray(self.low) < a) & (a < np.inf))
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        self._check_rows("high", high, ~(low < high), "a finite number above low")
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         u = rng.random(self.value_shape(size))
@@ -276,9 +297,7 @@ class Gamma(_Independent):
     shape: Any
     rate: Any = 1.0
 
-    def __post_init__(self) -> None:
-        self._check_positive("shape")
-        self._check_positive("rate")
+    ranges: ClassVar = {"shape": POSITIVE, "rate": POSITIVE}
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.standard_gamma(self.shape, self.value_shape(size)) / self.rate
@@ -331,8 +350,10 @@ class MultivariateNormal(_Checked):
     loc: Any
     cov: Any
 
+    ranges: ClassVar = {"loc": FINITE}
+
     def __post_init__(self) -> None:
-        self._check_finite("loc")
+        super().__post_init__()
         root = _cholesky(np.asarray(self.cov, dtype=np.float64))
         loc = np.shape(self.loc)
         if loc and loc[-1] != root.shape[-1] and (len(loc), loc[-1]) != (2, 1):
@@ -380,9 +401,7 @@ class Poisson(_Independent):
 
     rate: Any
     discrete = True
-
-    def __post_init__(self) -> None:
-        self._check("rate", "a number of at least 0", lambda a: (a >= 0) & (a < np.inf))
+    ranges: ClassVar = {"rate": Range("a number of at least 0", 0.0, np.finfo(float).max, open=False)}
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.poisson(self.rate, self.value_shape(size))
@@ -409,9 +428,7 @@ class Bernoulli(_Independent):
 
     p: Any
     discrete = True
-
-    def __post_init__(self) -> None:
-        self._check("p", "a probability from 0 to 1", lambda a: (a >= 0) & (a <= 1))
+    ranges: ClassVar = {"p": Range("a probability from 0 to 1", 0.0, 1.0, open=False)}
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         return rng.random(self.value_shape(size)) < self.p
@@ -462,14 +479,7 @@ class Categorical(Distribution):
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw; a category of probability zero is never drawn."""
         u = rng.random(self.value_shape(size))
-        cumulative = np.cumsum(self.probs, axis=-1)
-        if self.probs.ndim == 1:
-            index = np.searchsorted(cumulative, u * cumulative[-1], side="right")
-            last = np.flatnonzero(self.probs)[-1]
-            return np.minimum(index, last)
-        index = (cumulative <= (u * cumulative[:, -1])[:, None]).sum(axis=1)
-        last = self.probs.shape[1] - 1 - np.argmax(self.probs[:, ::-1] > 0, axis=1)
-        return np.minimum(index, last)
+        return search(self.probs, u) if self.probs.ndim == 1 else draw_rows(self.probs, u)
 
     def log_prob(self, value: Any) -> np.ndarray:
         k = np.asarray(value)

@@ -1,10 +1,10 @@
 """Resampling that keeps different particles, with unequal output weights.
 
-`FearnheadClifford` and `Chopthin` need only the weights. The other schemes compare the particles by a `Similarity`.
-All but `Chopthin` and `ClusterStratified` need more candidates than particles to select.
+`FearnheadClifford` and `Chopthin` need only the weights; `ClusterStratified` compares particles by a `Similarity`.
+`FearnheadClifford` needs more candidates than particles to select.
 
 >>> import numpy as np
->>> from mstfilter.smc import ClusterStratified, Gaussian, GreedyDiverse, KDpp, Population
+>>> from mstfilter.smc import ClusterStratified, Gaussian, Population
 >>> rng = np.random.default_rng(0)
 >>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
 
@@ -15,26 +15,10 @@ weight-based schemes lose it most of the time. Exact in expectation.
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
 (9.0, array([0.9, 0.1]))
-
-`KDpp` draws a set A of n particles with probability proportional to det L_A, L_ij = sqrt(w_i w_j) S_ij, S the
-similarity: heavy particles that differ from each other. Equal particles are never selected together. A selected
-particle gets the weight w_i / pi_i, pi_i its probability of being selected, which makes the selection unbiased.
-
->>> twins = Population(np.array([0.0, 0.01, 5.0]), np.log([4.0, 4.0, 1.0]))
->>> KDpp(similarity=Gaussian(1.0)).resample(rng, twins, 2).particles.round()
-array([0., 5.])
-
-`GreedyDiverse` maximises det L_A greedily and draws nothing. It is not properly weighted: the weight of a particle
-that is not selected moves to the most similar selected one.
-
-References: Kulesza and Taskar (2011), "k-DPPs: fixed-size determinantal point processes"; (2012), "Determinantal
-point processes for machine learning", sections 2.4 and 5.2; Chen, Zhang, Zhou (2018), "Fast greedy MAP inference for
-determinantal point process".
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -43,7 +27,7 @@ import numpy as np
 from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.smc.interfaces import Resampler, Similarity, WeightResampler
 from mstfilter.smc.population import Population, as_matrix, log_mean_exp
-from mstfilter.smc.resampling import Systematic, certain_copies, check_scheme, checked_weights, systematic_ancestors
+from mstfilter.smc.resampling import Systematic, check_scheme, checked_weights, inverse_cdf, systematic_copies
 
 
 @dataclass(frozen=True)
@@ -79,7 +63,7 @@ class FearnheadClifford(WeightResampler):
         log_out = np.where(heavy, lw[positive], lw.max() + np.log(c))
         chosen = heavy
         scaled = w[light] / w[light].max()  # avoids underflow
-        chosen[light[systematic_ancestors(np.cumsum(scaled), n - int(heavy.sum()), rng.random())]] = True
+        chosen[light[inverse_cdf(scaled, rng.random(1), n - int(heavy.sum()))]] = True
         # Adding log(n / m) keeps the log mean of the weights.
         return positive[chosen], log_out[chosen] + np.log(n / len(lw))
 
@@ -138,9 +122,7 @@ class Chopthin(WeightResampler):
         order = positive[np.argsort(~light, kind="stable")]
         light, w = np.sort(light)[::-1], weights[order]
         expected = np.where(light, w / a, np.maximum(1.0, w * (2 / (self.ratio * a))))
-        copies, fractions, rest = certain_copies(expected, n)
-        if rest > 0:
-            copies += np.bincount(systematic_ancestors(np.cumsum(fractions), rest, rng.random()), minlength=len(w))
+        copies = systematic_copies(rng, expected, n)
         log_out = np.where(light, lw.max() + np.log(a), lw[order] - np.log(np.maximum(copies, 1)))
         # Adding log(n / m) keeps the log mean of the weights.
         return np.repeat(order, copies), np.repeat(log_out, copies) + np.log(n / len(lw))
@@ -173,19 +155,10 @@ class Gaussian(Similarity):
         check_number("scale", self.scale, above=0, unit="distance")
 
     def matrix(self, particles: Any) -> np.ndarray:
+        from scipy.spatial.distance import cdist
+
         x = as_matrix(particles) / self.scale
-        small = len(x) ** 2 * x.shape[1] < 1e7
-        squares = ((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2) if small else _squared_distances(x)
-        return np.exp(-0.5 * squares)
-
-
-def _squared_distances(x: np.ndarray) -> np.ndarray:
-    """(n, n) ``|x_i|^2 + |x_j|^2 - 2 x_i x_j``, without an (n, n, d) array; centred to keep rounding errors small."""
-    x = x - x.mean(axis=0)
-    norms = (x * x).sum(axis=1)
-    squares = np.maximum(norms[:, None] + norms[None, :] - 2 * (x @ x.T), 0.0)
-    np.fill_diagonal(squares, 0.0)
-    return (squares + squares.T) / 2
+        return np.exp(-0.5 * cdist(x, x, "sqeuclidean"))
 
 
 #: Similarities of more particles than this are not computed: the matrix alone would take gigabytes.
@@ -281,12 +254,7 @@ class ClusterStratified(Resampler):
             masses[kept] = np.exp(log_masses) * (len(mass) / len(kept))
             return counts, masses
         share = _shares(mass, sure, n)
-        counts = np.floor(share * (1 + 1e-13)).astype(np.int64)
-        rest = n - int(counts.sum())
-        if rest > 0:
-            with np.errstate(divide="ignore"):
-                extra, _ = Systematic().select(rng, np.log(np.clip(share - counts, 0.0, None)), rest)
-            counts += np.bincount(extra, minlength=len(mass))
+        counts = systematic_copies(rng, share, n)
         return counts, np.where(share < 1, mass / share, mass)
 
 
@@ -319,179 +287,3 @@ def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
         c = np.where(left > 0, heavy / left, np.inf)
     share = mass / c[np.flatnonzero(np.append(np.inf, ordered) >= c)[-1]]
     return np.where(sure, np.maximum(1.0, share), share)
-
-
-@dataclass(frozen=True)
-class KDpp(Resampler):
-    """n heavy particles that differ from each other, with weights w_i / pi_i.
-
-    ``notes["kdpp"]`` holds the rank of L, and ``"fallback"`` if `scheme` was used.
-
-    Parameters
-    ----------
-    similarity : Similarity
-        Compares particles. It is made positive semidefinite by dropping negative eigenvalues.
-    scheme : Resampler
-        Selects instead if fewer than n particles differ from each other (rank of L below n).
-    """
-
-    similarity: Similarity = Gaussian()
-    scheme: Resampler = FearnheadClifford()
-
-    exact_size: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_component("similarity", self.similarity, Similarity)
-        check_scheme(self.scheme)
-
-    @property
-    def properly_weighted(self) -> bool:
-        return self.scheme.properly_weighted
-
-    def likelihood(self, population: Population) -> np.ndarray:
-        """(p, p) L of the particles with positive weight, in units of the largest weight."""
-        weights = checked_weights(population.log_weights, 1)
-        positive = weights > 0
-        root = np.sqrt(weights[positive])
-        S = checked_similarity(self.similarity, population)[np.ix_(positive, positive)]
-        try:
-            np.linalg.cholesky(S + 1e-12 * np.eye(len(S)))  # a fraction of the time of eigenvalues
-        except np.linalg.LinAlgError:
-            values, vectors = np.linalg.eigh(S)
-            S = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        return root[:, None] * S * root[None, :]
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        positive = np.flatnonzero(checked_weights(population.log_weights, n) > 0)
-        population = population.realised()
-        spectrum = Spectrum.of(self.likelihood(population), min(n, len(positive)))
-        if spectrum.rank < n:
-            chosen = self.scheme.resample(rng, population, n)
-            return chosen.labelled(chosen.parents, {**chosen.notes, "kdpp": f"rank {spectrum.rank} of {n}: fallback"})
-        items = sample_kdpp(rng, spectrum, n)
-        ancestors = positive[items]
-        log_weights = population.log_weights[ancestors] - np.log(inclusion(spectrum, n)[items])
-        log_weights += np.log(n / len(population))
-        change = log_mean_exp(log_weights) - log_mean_exp(population.log_weights)
-        return population.select(
-            ancestors, log_weights, kdpp=f"rank {spectrum.rank} of {n}", log_mean_weight_change=change
-        )
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Eigenvalues and eigenvectors of a likelihood matrix L, and its elementary symmetric polynomials."""
-
-    values: np.ndarray  #: (r,) positive eigenvalues, scaled to maximum 1
-    vectors: np.ndarray  #: (m, r) orthonormal columns
-    log_e: np.ndarray  #: (r + 1, k + 1) row j, column l: log e_l of the first j values
-
-    @classmethod
-    def of(cls, L: np.ndarray, k: int) -> Spectrum:
-        """Decompose a symmetric matrix; eigenvalues that are negative, or zero up to rounding, are dropped."""
-        values, vectors = np.linalg.eigh(L)
-        keep = values > values[-1] * len(values) * np.finfo(np.float64).eps
-        values, vectors = values[keep] / values[-1], vectors[:, keep]
-        return cls(values, vectors, _log_polynomials(values, k))
-
-    @property
-    def rank(self) -> int:
-        """Number of eigenvalues."""
-        return len(self.values)
-
-
-def _log_polynomials(values: np.ndarray, k: int) -> np.ndarray:
-    """Row j, column l: log of the l-th elementary symmetric polynomial of the first j values.
-
-    e_l(v_1 .. v_{j+1}) = e_l(v_1 .. v_j) + v_{j+1} e_{l-1}(v_1 .. v_j).
-    """
-    table = np.full((len(values) + 1, k + 1), -np.inf)
-    table[:, 0] = 0.0
-    for j, log_value in enumerate(np.log(values)):
-        table[j + 1, 1:] = np.logaddexp(table[j, 1:], log_value + table[j, :-1])
-    return table
-
-
-def inclusion(spectrum: Spectrum, k: int) -> np.ndarray:
-    """(m,) probability of each item to be in a set of k.
-
-    pi_i = sum_j v_ij^2 P(eigenvector j is used), P = value_j e_{k-1}(all values but j) / e_k. The polynomial without
-    value j is the convolution of those of the values before j and after j, a sum of positive terms.
-    """
-    before = spectrum.log_e[:-1, :k]
-    after = _log_polynomials(spectrum.values[::-1], k)[::-1][1:, :k]
-    terms = before + after[:, ::-1]
-    top = terms.max(axis=1)
-    finite = np.where(np.isneginf(top), 0.0, top)
-    log_without = finite + np.log(np.maximum(np.exp(terms - finite[:, None]).sum(axis=1), np.finfo(np.float64).tiny))
-    log_without[np.isneginf(top)] = -np.inf  # fewer than k - 1 other values: the polynomial is zero
-    used = np.exp(np.log(spectrum.values) + log_without - spectrum.log_e[-1, k])
-    return np.minimum(spectrum.vectors**2 @ used, 1.0)
-
-
-def sample_kdpp(rng: np.random.Generator, spectrum: Spectrum, k: int) -> np.ndarray:
-    """(k,) ascending items: k eigenvectors drawn by the polynomials, then items one by one by projection."""
-    log_values, log_e, left, used = np.log(spectrum.values).tolist(), spectrum.log_e.tolist(), k, []
-    uniforms = rng.random(spectrum.rank).tolist()
-    for j in range(spectrum.rank, 0, -1):
-        if left == 0:
-            break
-        log_take = log_values[j - 1] + log_e[j - 1][left - 1] - log_e[j][left]
-        if left == j or uniforms[j - 1] < math.exp(min(log_take, 0.0)):
-            used.append(j - 1)
-            left -= 1
-    V = spectrum.vectors[:, used]
-    norms = (V * V).sum(axis=1)
-    rows, items = np.zeros((len(V), k)), np.empty(k, np.int64)
-    for step in range(k):
-        cumulative = norms.cumsum()
-        i = int(cumulative.searchsorted(rng.random() * cumulative[-1], side="right"))
-        items[step] = i = min(i, int(cumulative.searchsorted(cumulative[-1])))
-        # Gram-Schmidt: subtract from all items their component along item i.
-        rows[:, step] = (V @ V[i] - rows[:, :step] @ rows[i, :step]) / np.sqrt(norms[i])
-        norms = np.maximum(norms - rows[:, step] ** 2, 0.0)
-        norms[items[: step + 1]] = 0.0
-    return np.sort(items)
-
-
-@dataclass(frozen=True)
-class GreedyDiverse(Resampler):
-    """Adds one by one the particle that increases det L of the selected set most.
-
-    The first is the heaviest; each next one maximises w_i times the squared norm of its component orthogonal to the
-    selected ones. If no different particle is left, the heaviest of the others follow. The total weight stays.
-    """
-
-    similarity: Similarity = Gaussian()
-
-    properly_weighted: ClassVar[bool] = False
-    exact_size: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_component("similarity", self.similarity, Similarity)
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        weights = checked_weights(population.log_weights, n)
-        population = population.realised()
-        S = checked_similarity(self.similarity, population)
-        n = min(n, int((weights > 0).sum()))
-        gain = weights * np.diag(S)
-        rows, items = np.zeros((len(weights), n)), np.empty(n, np.int64)
-        for step in range(n):
-            i = int(np.argmax(gain))
-            if gain[i] <= 1e-12 * weights.max():  # all others resemble the selected ones
-                rest = weights.copy()
-                rest[items[:step]] = 0.0
-                items[step:] = np.argsort(-rest, kind="stable")[: n - step]
-                break
-            items[step] = i
-            root = np.sqrt(weights[i] * weights)
-            rows[:, step] = (root * S[i] - rows[:, :step] @ rows[i, :step]) / np.sqrt(gain[i])
-            gain = np.maximum(gain - rows[:, step] ** 2, 0.0)
-            gain[items[: step + 1]] = 0.0
-        items = np.sort(items)
-        nearest = np.argmax(S[:, items], axis=1)
-        nearest[items] = np.arange(n)
-        mass = np.bincount(nearest, weights, minlength=n)
-        log_weights = np.log(mass) + population.log_weights.max() + np.log(n / len(weights))
-        return population.select(items, log_weights)

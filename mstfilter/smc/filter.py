@@ -23,7 +23,6 @@ function of a `State`, so a run can be stopped, stored and resumed at any step.
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,12 +31,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning, check_choice, check_component, check_integer
+from mstfilter.errors import InputError
+from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
-from mstfilter.smc.inputs import AtStep, split_input
+from mstfilter.smc.inputs import AtStep, check_observations, split_input
 from mstfilter.smc.interfaces import (
-    ARRAY_BYTES,
     Codec,
     Component,
     Info,
@@ -53,21 +52,14 @@ from mstfilter.smc.interfaces import (
     Trigger,
     Update,
 )
-from mstfilter.smc.population import Population, check_observations, identity
+from mstfilter.smc.population import Population, identity
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.streams import Key, step_generator
+from mstfilter.smc.streams import Key
 
-_INTERFACES: dict[str, type] = {
-    "initial": Proposal,
-    "transition": Transition,
-    "proposal": Proposal,
-    "update": Update,
-    "resampler": Resampler,
-    "trigger": Trigger,
-    "lookahead": Lookahead,
-    "rejuvenation": Rejuvenation,
-    "size": Size,
-}
+_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "lookahead", "rejuvenation", "size")
+_WITHOUT_STEP = ("resampler", "trigger", "size")  # they see the population only
+#: For components that draw no random numbers. Saves the time to make a stream.
+_UNUSED = Key(0).child("unused").generator()
 
 
 @dataclass(frozen=True)
@@ -114,23 +106,15 @@ class ParticleFilter(AtStep):
     lookahead: Lookahead | None = None
     rejuvenation: Rejuvenation | None = None
     size: Size | None = None
-    n: int = 100
-    n_proposed: int = 0
+    n: PositiveInt = 100
+    n_proposed: NonNegativeInt = 0
     resample: Literal["after", "before"] = "before"
 
-    #: A resampler sees weights only: it does not depend on the step.
-    step_functions: ClassVar = {
-        name: None for name, kind in _INTERFACES.items() if issubclass(kind, Component) and kind is not Resampler
-    }
+    step_functions: ClassVar = {slot: None for slot in _SLOTS if slot not in _WITHOUT_STEP}
 
     def __post_init__(self) -> None:
-        check_integer("n", self.n)
-        check_integer("n_proposed", self.n_proposed, at_least=0)
-        for name, interface in _INTERFACES.items():
-            check_component(name, getattr(self, name), interface, optional=name not in ("resampler", "trigger"))
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
-        check_choice("resample", self.resample, ("after", "before"))
         if self.lookahead is not None and self.resample == "after":
             raise InputError(
                 'a lookahead needs the next observation, which is not known yet if resample="after"',
@@ -138,7 +122,7 @@ class ParticleFilter(AtStep):
             )
 
     def __repr__(self) -> str:
-        parts = {slot: type(getattr(self, slot)).__name__ for slot in _INTERFACES if getattr(self, slot) is not None}
+        parts = {slot: type(getattr(self, slot)).__name__ for slot in _SLOTS if getattr(self, slot) is not None}
         lines = [f"ParticleFilter(n={self.n}, n_proposed={self.n_proposed}, resample={self.resample!r})"]
         return "\n  ".join([*lines, ", ".join(f"{slot} {name[:24]}" for slot, name in parts.items())])
 
@@ -152,7 +136,7 @@ class ParticleFilter(AtStep):
         """
         if self.proposal is not None:
             return False
-        components = (getattr(self, slot) for slot in _INTERFACES)
+        components = (getattr(self, slot) for slot in _SLOTS)
         return all(c.properly_weighted for c in components if isinstance(c, Component))
 
     def start(self, seed: int | Key = 0) -> State:
@@ -212,30 +196,22 @@ class ParticleFilter(AtStep):
         checkpoint: str | Path | None = None,
         codec: Codec | None = None,
         observer: Observer | None = None,
-        keep_arrays: bool | None = None,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
 
         ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
 
-        If the run continues from a checkpoint, it returns the infos of the later steps only. The infos hold some (n,)
-        arrays of each step, so memory grows with n times the number of steps. By default, if the sum of their sizes
-        exceeds 268 MB, they are removed from all infos (see `Info.without_arrays`), with an `InputWarning`.
-        ``keep_arrays=True`` always keeps them, ``keep_arrays=False`` never. `collect` keeps what it is asked for.
+        If the run continues from a checkpoint, it returns the infos of the later steps only. To keep weights or
+        particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
         """
         total = len(observations) if isinstance(observations, Sized) else None
         observations, state, store = self._begin(observations, seed, checkpoint, codec)
-        infos, n_bytes = Infos(), 0
+        infos = Infos()
         with progress_of(progress, "filter") as advance:
             advance(state.t, total)
-            for current, info in self._steps(observations, state, store, observer):
-                state = current
-                infos.append(info.without_arrays() if keep_arrays is False else info)
-                if keep_arrays is None and (n_bytes := n_bytes + info.n_bytes) > ARRAY_BYTES:
-                    infos.remove_arrays()
-                    keep_arrays = False
-                    warnings.warn(_without_arrays(len(infos)), stacklevel=2)
+            for state, info in self._steps(observations, state, store, observer):  # noqa: B020
+                infos.append(info)
                 advance(state.t, total)
         return state, infos
 
@@ -277,7 +253,7 @@ class _Step:
 
     def rng(self, slot: str) -> np.random.Generator:
         """The random stream of a component in this step."""
-        return step_generator(self.state.key, self.state.t, slot)
+        return self.state.key.child(slot, self.state.t).generator()
 
     def select_before(self) -> tuple[Population | None, bool]:
         """Select: the particles x_{t-1} to move, and whether they were resampled."""
@@ -358,7 +334,7 @@ class _Step:
             assert fused is not None
             return fused
         with self.slot("update"):
-            rng = self.rng("update") if update.draws else _unused_generator()
+            rng = self.rng("update") if update.draws else _UNUSED
             fused = _checked(update.update(rng, predicted, proposed, self.observation), update)
             self.slot.record(fused.notes)
         return fused
@@ -425,9 +401,6 @@ class _Step:
             n_candidates=len(fused),
             ess=ess,
             resampled=resampled_before or resampled_after,
-            ancestors=chosen.parents["ancestor"] if resampled_after else identity(len(chosen)),
-            parents=population.parents,
-            log_weights=population.log_weights,
             notes=self.slot.notes,
             seconds=self.slot.seconds,
         )
@@ -496,13 +469,6 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
     return priority
 
 
-def _without_arrays(steps: int) -> InputWarning:
-    return InputWarning(
-        f"the infos of the run do not keep arrays, which exceed {ARRAY_BYTES / 1e6:.0f} MB after {steps} steps",
-        "keep_arrays=True keeps them, keep_arrays=False removes them without a warning; `collect` keeps values",
-    )
-
-
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
     """Free one large block, once per process.
@@ -512,9 +478,3 @@ def keep_freed_memory() -> None:
     million. The memory of the block itself is never touched. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)
-
-
-@lru_cache(maxsize=1)
-def _unused_generator() -> np.random.Generator:
-    """A generator for components that draw no random numbers. Saves the time to make a stream."""
-    return Key(0).child("unused").generator()

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -32,15 +33,16 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer, check_number
-from mstfilter.smc.batching import RunFilters, batched_slots, run_batch
+from mstfilter.smc.batching import NotTogether, RunFilters, run_together
+from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.export import Table, draws_tree, flat_columns
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
-from mstfilter.smc.population import Particles, Population
+from mstfilter.smc.population import Particles, Population, take
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.smoothing import conditional_path
-from mstfilter.smc.state_space import accept_moves, choose_rows
+from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key, rows_of
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
@@ -121,57 +123,55 @@ class _Posterior:
     observations: Sequence[Any]
     log_prior: Callable[[np.ndarray], float]
     batched: bool = False
-    paired: bool = False
     n_sweeps: int = 0
-    singly: bool = False  #: whether the filters of a sweep differ from single ones
 
-    def __call__(
-        self, rng: np.random.Generator, thetas: np.ndarray, chains: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(R,) log densities and (R,) log evidences of (R, d) parameters, those of the given chains (default all)."""
-        seeds = rng.integers(2**63, size=len(thetas)).tolist()
-        log_prior = np.array([float(self.log_prior(theta)) for theta in thetas])
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """``theta`` (R, d) with ``log_density`` and ``log_evidence`` (R,)."""
+        seeds = rng.integers(2**63, size=len(theta))
+        log_prior = np.array([float(self.log_prior(row)) for row in theta])
         if np.isnan(log_prior).any():
-            raise InputError(f"the log prior of {thetas[np.isnan(log_prior)][0].tolist()} is NaN")
-        evidence = np.full(len(thetas), -np.inf)
-        rows = np.flatnonzero(log_prior > -np.inf).tolist()
-        if rows:
-            chains = np.arange(len(thetas)) if chains is None else chains
-            data = [self.observations[chains[r]] for r in rows] if self.paired else [self.observations]
-            evidence[rows] = self._estimates(thetas[rows], [list(ys) for ys in data], [seeds[r] for r in rows])
-        return log_prior + evidence, evidence
+            raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
+        evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
+        if possible.any():
+            evidence[possible] = self._estimates(theta[possible], seeds[possible].tolist())
+        return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
-    def _estimates(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
-        if self.batched and not self.singly:
-            return self._in_one_sweep(thetas, data, seeds)
-        found = []
-        for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
-            filter = self.filter_of(theta)
-            if not filter.properly_weighted:
-                raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
+    def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
+        """Log evidences of filters in one sweep, or one by one if this is impossible."""
+        if self.batched:
             try:
-                state, _ = filter.run(data[r % len(data)], seed, keep_arrays=False)
-                found.append(state.log_evidence)
-            except LostRunError:
-                found.append(-np.inf)
-        return np.array(found, np.float64)
+                return self._in_one_sweep(thetas, seeds)
+            except NotTogether as why:
+                self.batched = False
+                warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=5)
+        return self._one_by_one(thetas, seeds)
 
-    def _in_one_sweep(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _filter(self, theta: np.ndarray) -> ParticleFilter:
+        filter = self.filter_of(theta)
+        if not filter.properly_weighted:
+            raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
+        return filter
+
+    def _one_by_one(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
+        found = np.full(len(thetas), -np.inf)
+        for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
+            with suppress(LostRunError):
+                state, _ = self._filter(theta).run(list(self.observations), seed)
+                found[r] = state.log_evidence
+        return found
+
+    def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """The estimates of a batch whose components hold the parameters of each row.
 
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
         """
-        first = self.filter_of(thetas[0])
-        if not first.properly_weighted:
-            raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
-        slots = batched_slots(first) or ()
-        if any(
-            getattr(first, slot) is not None and slot not in slots for slot in ("initial", "transition", "update")
-        ):
-            raise InputError(
-                "with batched=True the initial, transition and update of the filter must be batched",
-                "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes them so",
-            )
+        first = self._filter(thetas[0])
+        for slot in ("initial", "transition", "update"):
+            if getattr(first, slot) is not None and getattr(first, slot).batched is False:
+                raise InputError(
+                    f"with batched=True the {slot} of the filter must be batched",
+                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes it so",
+                )
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:
@@ -180,12 +180,10 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_batch(filters, data, seeds, check=check, rounding=True, warn=False)
-        if runs.single:
-            self.singly = True
-            slot, reason = next(iter(runs.single.items()))
-            warnings.warn(f"the filters are run one by one: {slot}: {reason}", stacklevel=5)
-        return runs.log_evidence[:, -1]
+        runs = run_together(
+            filters, [list(self.observations)], seeds, {"z": log_evidence}, check=check, rounding=True
+        )
+        return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
 
 def pmmh(
@@ -198,7 +196,6 @@ def pmmh(
     seed: int = 0,
     *,
     batched: bool = False,
-    paired: bool = False,
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
@@ -220,8 +217,6 @@ def pmmh(
         chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
         parameters; some are compared. If they differ, InputError, or a warning and single runs.
-    paired : bool
-        Chain r gets the data set ``observations[r]``.
 
     Raises
     ------
@@ -231,43 +226,39 @@ def pmmh(
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    if paired and len(observations) != len(theta):
-        raise InputError(f"there are {len(observations)} data sets for {len(theta)} chains")
-    posterior = _Posterior(filter_of, observations, log_prior, batched, paired)
+    posterior = _Posterior(filter_of, observations, log_prior, batched)
     key = Key(seed).child("pmmh")
-    density, evidence = _start(posterior, key.child("start"), theta)
-    shape = (n_iterations, len(theta))
-    thetas, evidences, densities = np.empty((*shape, theta.shape[1])), np.empty(shape), np.empty(shape)
-    accepted = np.zeros(len(theta))
+
+    def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        new = posterior(rng, now["theta"] + rng.standard_normal(theta.shape) @ root.T)
+        return new, new["log_density"] - now["log_density"]
+
+    state, steps = _start(posterior, key.child("start"), theta), []
     for i in range(n_iterations):
-        rng = key.child(i).generator()
-        proposed = theta + rng.standard_normal(theta.shape) @ root.T
-        new_density, new_evidence = posterior(rng, proposed)
-        yes = accept_moves(rng, new_density - density)
-        theta, density = choose_rows(yes, proposed, theta), np.where(yes, new_density, density)
-        evidence = np.where(yes, new_evidence, evidence)
-        thetas[i], evidences[i], densities[i] = theta, evidence, density
-        accepted += yes
-    return Chains(thetas, evidences, densities, accepted / n_iterations)
+        [(state, accepted)] = metropolis(key.child(i).generator(), state, propose)
+        steps.append({**state, "accepted": accepted})
+    found = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
+    return Chains(found["theta"], found["log_evidence"], found["log_density"], found["accepted"].mean(axis=0))
 
 
-def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log densities and evidences of the first parameters; estimates that are lost are drawn again."""
-    density, evidence = posterior(key.generator(), theta)
+def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
+    """The first parameters with their estimates; those that are lost are drawn again."""
+    state = posterior(key.generator(), theta)
     for attempt in range(1, _N_STARTS + 1):
-        lost = np.flatnonzero(~np.isfinite(density))
+        lost = np.flatnonzero(~np.isfinite(state["log_density"]))
         if not len(lost):
-            return density, evidence
+            break
         impossible = [r for r in lost if posterior.log_prior(theta[r]) == -np.inf]
         if impossible or attempt == _N_STARTS:
             r = (impossible or lost)[0]
             what = "the log prior is -inf" if impossible else f"{_N_STARTS} estimates of the evidence are 0"
             raise InputError(
-                f"the start {theta[r].tolist()} of chain {r} has log density {density[r]}: {what}",
+                f"the start {theta[r].tolist()} of chain {r} has log density {state['log_density'][r]}: {what}",
                 "start where the prior and the likelihood are positive, or take more particles",
             )
-        density[lost], evidence[lost] = posterior(key.child(attempt).generator(), theta[lost], lost)
-    return density, evidence
+        for name, values in posterior(key.child(attempt).generator(), theta[lost]).items():
+            state[name][lost] = values
+    return state
 
 
 def _step_root(scale: Any, d: int) -> np.ndarray:
@@ -320,7 +311,8 @@ def ensemble(
     rng = Key(seed).child("ensemble").generator()
 
     def log_density(thetas: np.ndarray) -> np.ndarray:
-        return np.stack(posterior(rng, thetas), axis=1)
+        found = posterior(rng, thetas)
+        return np.stack([found["log_density"], found["log_evidence"]], axis=1)
 
     sampler = emcee.EnsembleSampler(*theta.shape, log_density, moves=moves, vectorize=True)
     own = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))  # emcee draws from the legacy generator
@@ -430,25 +422,22 @@ def smc_sampler(
     if waste_free and n % (steps + 1):
         raise InputError(f"n is {n}, expected a multiple of steps + 1 = {steps + 1}, as waste_free is True")
     target, key = _Target(as_distribution(prior), log_likelihood), Key(seed).child("tempering")
-    theta = target.prior.sample(key.child("initial").generator(), n)
-    population, logs = Population(theta), target.logs(theta)
-    reached, accepted = [0.0], []
+    state = target.scored(target.prior.sample(key.child("initial").generator(), n))
+    population, reached, accepted = Population(state["theta"]), [0.0], []
     while reached[-1] < 1:
-        streams = key.child(len(reached))
-        now = planned[len(reached) - 1] if planned else _next_temperature(population, logs[1], reached[-1], share * n)
-        population = population.reweighted((now - reached[-1]) * logs[1])
-        root = _spread(population) if scale is None else _step_root(scale, theta[0].size)
-        chosen = resampler.resample(
-            streams.child("resampler").generator(), population, n // (steps + 1) if waste_free else n
-        )
-        logs = logs[:, chosen.parents["ancestor"]]
-        rng = streams.child("move").generator()
-        states, taken = target.moved(rng, chosen.particles, logs, now, root, steps)
+        streams, log_l = key.child(len(reached)), state["log_likelihood"]
+        now = planned[len(reached) - 1] if planned else _next_temperature(population, log_l, reached[-1], share * n)
+        population = population.reweighted((now - reached[-1]) * log_l)
+        root = _spread(population) if scale is None else _step_root(scale, state["theta"][0].size)
+        rng = streams.child("resampler").generator()
+        chosen = resampler.resample(rng, population, n // (steps + 1) if waste_free else n)
+        start = take(state, chosen.parents["ancestor"])
+        states, share_of_moves = target.moved(streams.child("move").generator(), start, now, root, steps)
         kept = states if waste_free else states[-1:]
-        theta, logs = np.concatenate([x for x, _ in kept]), np.concatenate([values for _, values in kept], axis=1)
-        population = Population(theta, np.tile(chosen.log_weights, len(kept)))
+        state = {name: np.concatenate([values[name] for values in kept]) for name in start}
+        population = Population(state["theta"], np.tile(chosen.log_weights, len(kept)))
         reached.append(now)
-        accepted.append(taken)
+        accepted.append(share_of_moves)
     return TemperedSample(population, np.array(reached), np.array(accepted))
 
 
@@ -459,43 +448,36 @@ class _Target:
     prior: Distribution
     log_likelihood: Callable[[np.ndarray], np.ndarray]
 
-    def logs(self, theta: np.ndarray) -> np.ndarray:
-        """(2, n) log prior and log likelihood, which is not evaluated where the prior is zero."""
+    def scored(self, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """`theta` with its log prior and log likelihood, which is not evaluated where the prior is zero."""
         log_prior, log_l = np.asarray(self.prior.log_prob(theta), np.float64), np.full(len(theta), -np.inf)
         inside = log_prior > -np.inf
         if inside.any():
-            log_l[inside] = _log_values(self.log_likelihood, theta[inside])
-        return np.stack([log_prior, log_l])
+            log_l[inside] = self._checked_log_likelihood(theta[inside])
+        return {"theta": theta, "log_prior": log_prior, "log_likelihood": log_l}
+
+    def _checked_log_likelihood(self, theta: np.ndarray) -> np.ndarray:
+        found = np.asarray(self.log_likelihood(theta), np.float64)
+        if found.shape != (len(theta),) or not (found < np.inf).all():
+            raise InputError(
+                f"log likelihood has shape {found.shape} and maximum {found.max()}, expected ({len(theta)},) numbers "
+                "below infinity"
+            )
+        return found
 
     def moved(
-        self,
-        rng: np.random.Generator,
-        theta: np.ndarray,
-        logs: np.ndarray,
-        temperature: float,
-        root: np.ndarray,
-        steps: int,
-    ) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
-        """States after 0 to `steps` Metropolis steps with their `logs`, and the share of accepted moves."""
-        states, taken = [(theta, logs)], 0.0
-        for _ in range(steps):
-            new = theta + (rng.standard_normal((len(theta), len(root))) @ root.T).reshape(theta.shape)
-            found = self.logs(new)
-            yes = accept_moves(rng, found[0] - logs[0] + temperature * (found[1] - logs[1]))
-            theta, logs = choose_rows(yes, new, theta), np.where(yes, found, logs)
-            states.append((theta, logs))
-            taken += yes.mean() / steps
-        return states, taken
+        self, rng: np.random.Generator, start: dict[str, np.ndarray], temperature: float, root: np.ndarray, steps: int
+    ) -> tuple[list[dict[str, np.ndarray]], float]:
+        """States after 0 to `steps` Metropolis steps, and the share of accepted moves."""
 
+        def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+            step = rng.standard_normal((len(now["theta"]), len(root))) @ root.T
+            new = self.scored(now["theta"] + step.reshape(now["theta"].shape))
+            gain = new["log_likelihood"] - now["log_likelihood"]
+            return new, new["log_prior"] - now["log_prior"] + temperature * gain
 
-def _log_values(log_likelihood: Callable[[np.ndarray], np.ndarray], theta: np.ndarray) -> np.ndarray:
-    found = np.asarray(log_likelihood(theta), np.float64)
-    if found.shape != (len(theta),) or not (found < np.inf).all():
-        raise InputError(
-            f"log likelihood has shape {found.shape} and maximum {found.max()}, expected ({len(theta)},) numbers "
-            "below infinity"
-        )
-    return found
+        chain = list(metropolis(rng, start, propose, steps))
+        return [start, *(state for state, _ in chain)], float(np.mean([accepted for _, accepted in chain]))
 
 
 def _next_temperature(population: Population, log_l: np.ndarray, now: float, target: float) -> float:

@@ -1,4 +1,4 @@
-"""Time and inputs of models: what a step gives to the functions of its components besides the observation.
+"""Observations, time and inputs: what a step gives to the functions of its components.
 
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
@@ -18,10 +18,13 @@ inputs.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar, Self
+
+import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fields import Bounded
@@ -44,6 +47,31 @@ def split_input(observation: Any) -> tuple[Any, Any]:
     if isinstance(observation, WithInput):
         return observation.y, observation.u
     return observation, None
+
+
+def check_observations(observations: Iterable[Any], where: str = "") -> Any:
+    """The same observations; InputError for a table, a mapping or a text, and for one that is NaN in every entry.
+
+    Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
+    """
+    if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
+        raise InputError(
+            f"{where}observations are a {type(observations).__name__}, expected one observation for each step",
+            "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
+        )
+    if isinstance(observations, (list, tuple, np.ndarray)):
+        for t, y in enumerate(observations):
+            if (isinstance(y, float) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y)):
+                raise InputError(
+                    f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
+                )
+    return observations
+
+
+def _all_nan(y: np.ndarray) -> bool:
+    if not y.size or y.dtype.kind != "f" or not math.isnan(y.item(0)):  # the usual case
+        return False
+    return bool(np.isnan(y).all())
 
 
 @dataclass(frozen=True)

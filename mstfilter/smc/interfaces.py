@@ -16,7 +16,7 @@ work on whole populations, so a component can share work between particles.
 ...         return Population(population.particles + step, population.log_weights)
 
 A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
-to the log weights (`mstfilter.smc.GuidedTransition` does so for any model with densities).
+to the log weights (`mstfilter.smc.Dynamics` does so for any model with densities).
 
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`; most have a `Transition` and
 an `Update`. Optional are `Size` (number of particles), `Lookahead` (auxiliary filter), `Rejuvenation`
@@ -28,8 +28,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -77,8 +76,8 @@ class Component(AtStep, ABC):
     def batched(self) -> bool | None:
         """Whether the component treats each particle by itself, so that those of several runs can be given together.
 
-        True states so. With None, a batch tries it, and calls the component once for each run if the results differ
-        (see `mstfilter.smc.batching`). Default: False, then it is called once for each run.
+        True states so. With None, `run_many` tries it, and makes runs one by one if the results differ (see
+        `mstfilter.smc.batching`). Default: False, then runs are made one by one.
         """
         return False
 
@@ -387,18 +386,13 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Record of a step."""
+    """Record of a step: numbers whose size does not depend on n. Weights and parents are those of the `State`."""
 
     t: int  #: index of the observation, from 0
     n: int  #: particles after the step
     n_candidates: int  #: particles after the update, before the resampling that follows it
     ess: float  #: effective sample size after the update, before the resampling that follows it
     resampled: bool  #: whether the step resampled
-    #: (n,) int, index among the candidates of each particle, if the step resampled after the update; else 0 .. n-1.
-    ancestors: np.ndarray
-    #: ``"previous"`` and ``"proposed"`` parents of the particles after the step, if known.
-    parents: Mapping[str, np.ndarray]
-    log_weights: np.ndarray  #: (n,) after the step
     notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  #: notes of the components, by slot
     seconds: Mapping[str, float] = field(default_factory=dict)  #: wall time by slot. Not reproducible
 
@@ -410,27 +404,6 @@ class Info:
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
-    @cached_property
-    def unique_ancestors(self) -> int:
-        """Number of particles of the previous population that have descendants."""
-        previous = self.parents.get("previous")
-        return 0 if previous is None else len(np.unique(previous[previous >= 0]))
-
-    def without_arrays(self) -> Info:
-        """The same record with empty `ancestors`, `parents` and `log_weights`: its size does not depend on n."""
-        none = np.zeros(0, np.int64)
-        light = replace(self, ancestors=none, parents={}, log_weights=np.zeros(0))
-        light.__dict__["unique_ancestors"] = self.unique_ancestors
-        return light
-
-    @property
-    def n_bytes(self) -> int:
-        """Bytes of the arrays that `without_arrays` removes. Infos may share them: then they count for each."""
-        return self.ancestors.nbytes + self.log_weights.nbytes + sum([a.nbytes for a in self.parents.values()])
-
-
-ARRAY_BYTES = 1 << 28  #: most bytes of arrays that the infos of a run keep by default
-
 
 class Infos(list[Info], Table):
     """The records of the steps of a run: a list that can be read as a table.
@@ -439,19 +412,12 @@ class Infos(list[Info], Table):
     >>> infos.to_pandas()                   # or polars.DataFrame(infos.columns())
     """
 
-    removed = False  #: whether the arrays of the infos were removed because they exceeded `ARRAY_BYTES`
-
-    def remove_arrays(self) -> None:
-        """Replace all infos by those of `Info.without_arrays`."""
-        self[:], self.removed = [info.without_arrays() for info in self], True
-
     def rows(self) -> list[dict[str, Any]]:
         """One row for each step: its numbers, and the wall time in seconds of the step and of each slot."""
         slots = dict.fromkeys(slot for info in self for slot in info.seconds)
         return [
             {
                 **{name: getattr(info, name) for name in ("t", "n", "n_candidates", "ess", "resampled")},
-                "unique_ancestors": info.unique_ancestors,
                 "seconds": sum(info.seconds.values()),
                 **{f"{slot}_seconds": info.seconds.get(slot, 0.0) for slot in slots},
             }
@@ -468,7 +434,6 @@ class Infos(list[Info], Table):
             return "Infos: no steps"
         ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
-        found = f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
-        return f"{found}, without arrays (above {ARRAY_BYTES / 1e6:.0f} MB)" if self.removed else found
+        return f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
 
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

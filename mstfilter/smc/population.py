@@ -19,7 +19,7 @@ write to an array after a population was made from it; pass ``array.copy()`` if 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -192,31 +192,6 @@ def _within(index: np.ndarray, n: int) -> np.ndarray:
     return index
 
 
-def check_observations(observations: Iterable[Any], where: str = "") -> Any:
-    """The same observations; InputError for a table, a mapping or a text, and for one that is NaN in every entry.
-
-    Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
-    """
-    if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
-        raise InputError(
-            f"{where}observations are a {type(observations).__name__}, expected one observation for each step",
-            "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
-        )
-    if isinstance(observations, (list, tuple, np.ndarray)):
-        for t, y in enumerate(observations):
-            if (isinstance(y, float) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y)):
-                raise InputError(
-                    f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
-                )
-    return observations
-
-
-def _all_nan(y: np.ndarray) -> bool:
-    if not y.size or y.dtype.kind != "f" or not math.isnan(y.item(0)):  # the usual case
-        return False
-    return bool(np.isnan(y).all())
-
-
 @dataclass(frozen=True, eq=False)
 class Population(Table):
     """Weighted particles and their parents.
@@ -231,7 +206,7 @@ class Population(Table):
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
         proposed particles, -1 for none; the filter numbers both, an update takes the numbers over. ``"mate"``: the
         second parent of a particle that two previous ones made. A resampler adds ``"ancestor"``, the index before the
-        resampling, which is in `Info.ancestors` after the step.
+        resampling; a population after a step has it if the step resampled after its update.
     notes : mapping
         Values that a component records: plain numbers, strings and lists.
     """
@@ -337,6 +312,12 @@ class Population(Table):
         return self.__dict__["_both"]
 
     @property
+    def unique_ancestors(self) -> int:
+        """Number of particles of the previous population that have descendants; 0 if it is not known."""
+        previous = self.parents.get("previous", np.zeros(0, np.int64))
+        return len(np.unique(previous[previous >= 0]))
+
+    @property
     def best(self) -> Any:
         """The particle of largest weight; the first, if several have equal weights."""
         index = int(np.argmax(self.log_weights))
@@ -383,9 +364,9 @@ class Population(Table):
         """The same particles, with parents traced through a resampling before the prediction.
 
         ``parents["previous"]`` and ``parents["mate"]`` are indices into `resampled`; they become indices into the
-        population that was resampled, if it is known. ``parents["ancestor"]`` and the notes are dropped.
+        population that was resampled, if it is known. The notes are dropped.
         """
-        parents = {name: index for name, index in self.parents.items() if name != "ancestor"}
+        parents = dict(self.parents)
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         for name in ("previous", "mate"):
             if ancestors is not None and name in parents:

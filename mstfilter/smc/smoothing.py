@@ -17,31 +17,25 @@ They are valid for any filter with proper weights: guided, auxiliary, with moves
 
 `paris` yields smoothed means of sums over the path while observations arrive, in constant memory.
 
-`conditional_path` draws one path by a Markov kernel that leaves the smoothing distribution invariant, for any number
-of particles and also for programs (conditional SMC; Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint
-log density of a path and the observations.
+`mstfilter.smc.conditional` draws single paths, also of programs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
-from mstfilter.smc.distributions import as_distribution
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import split_input
-from mstfilter.smc.interfaces import DensityTransition, State, Transition
-from mstfilter.smc.population import Particles, Population, check_observations, count_particles, take
-from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
-from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, ScoreHandler, Site
-from mstfilter.smc.programs.sites import PerParticle
-from mstfilter.smc.resampling import Multinomial, independent_draws
-from mstfilter.smc.state_space import Dynamics, GuidedInitial, GuidedTransition, Prior
-from mstfilter.smc.streams import Key, child
+from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.interfaces import DensityTransition, State
+from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.resampling import draw_rows, independent_draws
+from mstfilter.smc.state_space import metropolis
+from mstfilter.smc.streams import Key
 
 BackwardMethod = Literal["exact", "mcmc", "rejection"]
 #: Pairs of particles per call of `log_prob`.
@@ -131,7 +125,7 @@ def backward_paths(
     Parameters
     ----------
     transition : DensityTransition
-        That of the model, ``Dynamics(model)``. A guided transition cannot be used: its density is that of its
+        That of the model, ``Dynamics(model)``. One with a proposal cannot be used: its density is that of the
         proposal.
     method : "exact", "mcmc" or "rejection"
         "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
@@ -151,16 +145,15 @@ def backward_paths(
     log_bound : float
         For "rejection": an upper bound of ``transition.log_prob``. InputError if a density exceeds it.
     """
-    check_component("transition", transition, DensityTransition)
     check_integer("n", n)
-    kernel = _Backward(method, steps, log_bound)
+    kernel = _Backward(transition, method, steps, log_bound)
     last = record.populations[-1].realised()
     index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
-        population, (y, u) = record.populations[t].realised(), split_input(record.observations[t + 1])
+        population = record.populations[t].realised()
         parents = record.parents(t + 1)[index] if method == "mcmc" else None
-        move = _Move(population, path[-1].particles, transition.at_step(t + 1, u), y, t)
+        move = kernel.move(population, path[-1].particles, record.observations[t + 1], t)
         index = kernel.draw(rng, move, parents, 1)[:, 0]
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
@@ -196,21 +189,22 @@ class _Move:
             density = self.log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
             log_weights = self.population.log_weights + density.reshape(-1, m)
             for k in range(n_draws):
-                index[begin : begin + block, k] = _drawn(rng, log_weights, self.t)
+                index[begin : begin + block, k] = draw_log(rng, log_weights, self.t)
         return index
 
     def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int, n_draws: int) -> np.ndarray:
         """(n, n_draws) states of chains that start at the parents, every `steps` steps."""
-        index, density, draws = parents, self.log_density(parents), []
+        density = self.log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
-        for _ in range(n_draws):
-            for _ in range(steps):
-                new = _by_weight(rng, self.population, len(index))
-                found = self.log_density(new)
-                yes = found - density > -rng.standard_exponential(len(new))  # minus the log of a uniform
-                index, density = np.where(yes, new, index), np.where(yes, found, density)
-            draws.append(index)
+
+        def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
+            index = _by_weight(rng, self.population, len(parents))
+            density = self.log_density(index)
+            return {"index": index, "density": density}, density - now["density"]
+
+        chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * n_draws)
+        draws = [state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0]
         return np.stack(draws, axis=1)
 
     def rejected(self, rng: np.random.Generator, n: int, log_bound: float) -> np.ndarray:
@@ -237,15 +231,22 @@ class _Move:
 class _Backward:
     """Draws predecessors of later particles; the fields are arguments of `backward_paths`."""
 
+    transition: DensityTransition
     method: BackwardMethod
     steps: int
     log_bound: float | None
 
     def __post_init__(self) -> None:
+        check_component("transition", self.transition, DensityTransition)
         check_choice("method", self.method, get_args(BackwardMethod))
         check_integer("steps", self.steps)
         if self.method == "rejection":
             check_number("log_bound", self.log_bound)
+
+    def move(self, population: Population, later: Particles, observation: Any, t: int) -> _Move:
+        """The moves from a population at time `t` to the particles after `observation`."""
+        y, u = split_input(observation)
+        return _Move(population, later, self.transition.at_step(t + 1, u), y, t)
 
     def draw(self, rng: np.random.Generator, move: _Move, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
         """(n, n_draws) indices; `parents` (n,) of the later particles are for "mcmc"."""
@@ -292,17 +293,15 @@ def paris(
     ------
     float64 scalar or (k,)
     """
-    check_component("transition", transition, DensityTransition)
     check_integer("n_draws", n_draws)
     if not filter.properly_weighted:
         raise InputError("a component of the filter is not properly weighted: its smoothed means have another limit")
-    kernel = _Backward(method, steps, log_bound)
+    kernel = _Backward(transition, method, steps, log_bound)
     past: Population | None = None
     statistic = np.zeros(0)
     state = filter.start(seed)
     for t, observation in enumerate(observations):
         state, _ = filter.step(state, observation)
-        y, u = split_input(observation)
         assert state.population is not None
         now = state.population.realised()
         if past is None:
@@ -310,7 +309,7 @@ def paris(
         else:
             rng = Key(seed).child("paris", t).generator()
             parents = known_parents(now, t) if method == "mcmc" else None
-            move = _Move(past, now.particles, transition.at_step(t, u), y, t - 1)
+            move = kernel.move(past, now.particles, observation, t - 1)
             index = kernel.draw(rng, move, parents, n_draws).ravel()
             later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
             statistic = statistic[index] + functional(t, take(past.particles, index), later)
@@ -326,16 +325,12 @@ def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.n
     return index
 
 
-def _drawn(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = None) -> np.ndarray:
+def draw_log(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = None) -> np.ndarray:
     """Draw one index per row of (n, m) log weights."""
     top = log_weights.max(axis=1, keepdims=True)
     if not np.isfinite(top).all():
         raise _impossible(t)
-    cumulative = np.cumsum(np.exp(log_weights - top), axis=1)
-    points = rng.random((len(cumulative), 1)) * cumulative[:, -1:]
-    # The index is the number of entries at or below the point; "at" skips weights of zero.
-    index = (cumulative <= points).sum(axis=1)
-    return np.minimum(index, (cumulative < cumulative[:, -1:]).sum(axis=1))
+    return draw_rows(np.exp(log_weights - top), rng.random(len(log_weights)))
 
 
 def _impossible(t: int | None) -> InputError:
@@ -344,242 +339,3 @@ def _impossible(t: int | None) -> InputError:
         f"{where}a particle has no possible predecessor, or a density is NaN or +inf",
         "backward paths need the density of the transition that moved the particles",
     )
-
-
-def conditional_path(
-    filter: ParticleFilter, observations: Sequence[Any], seed: int | Key = 0, path: Particles | None = None
-) -> Particles:
-    """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
-
-    One particle follows `path`, the others are drawn as usual, and one of the final particles is traced back.
-    Ancestors are multinomial at every step: `resampler` and `trigger` of the filter are not used. The particle that
-    follows the path draws its ancestors, too, if the density of the transition is known; a program must then keep
-    nothing but its sites.
-
-    Parameters
-    ----------
-    filter : ParticleFilter
-        Bootstrap or guided filter of a model or a program, with at least two particles.
-    path : T particles, optional
-        The present path: row t is the particle at time t. Without it the path is drawn by an ordinary filter.
-
-    Returns
-    -------
-    array (T, ...), mapping of such, or tuple of T objects
-    """
-    _check_conditional(filter)
-    ys = list(observations)
-    if not ys or (path is not None and count_particles(path) != len(ys)):
-        states = "" if path is None else f" for a path of {count_particles(path)} states"
-        raise InputError(f"there are {len(ys)} observations{states}")
-    key = seed if isinstance(seed, Key) else Key(seed)
-    rng = key.child("ancestors").generator()
-    populations: list[Population] = []
-    parents: list[np.ndarray] = []
-    past: Population | None = None
-    for t, observation in enumerate(ys):
-        y, u = split_input(observation)
-        now = filter.at_step(t, u)
-        given = None if path is None else take(path, np.array([t]))
-        if past is not None:
-            others, _ = Multinomial().select(rng, past.log_weights, filter.n - 1)
-            index = np.append(_ancestor(rng, now.transition, past, given, y), others)
-            parents.append(index)
-            past = Population(take(past.particles, index))
-        past = _moved(now, key.child("step", t), past, given, y)
-        if now.update is not None and y is not None:
-            update_rng = key.child("step", t, "update").generator() if now.update.draws else rng
-            past = now.update.update(update_rng, past, None, y)
-        populations.append(past)
-    rows = [int(_drawn(rng, populations[-1].log_weights[None])[0])]
-    for index in reversed(parents):
-        rows.append(int(index[rows[-1]]))
-    chosen = zip(populations, reversed(rows), strict=True)
-    return _joined([take(p.realised().particles, np.array([row])) for p, row in chosen])
-
-
-def _check_conditional(filter: ParticleFilter) -> None:
-    for slot in ("proposal", "lookahead", "rejuvenation", "size"):
-        if getattr(filter, slot) is not None:
-            raise InputError(
-                f"conditional SMC does not know a filter with `{slot}`", "use a bootstrap or guided filter"
-            )
-    if not filter.properly_weighted:
-        raise InputError("a component of the filter is not properly weighted: its paths have another law")
-    check_integer("n", filter.n, "one particle follows the present path", at_least=2)
-
-
-def _ancestor(
-    rng: np.random.Generator, transition: Transition | None, past: Population, given: Particles | None, y: Any
-) -> int:
-    """Index of the parent of particle 0, which follows the given path."""
-    if given is None:
-        return int(_drawn(rng, past.log_weights[None])[0])
-    density = _log_density(transition, past.particles, take(given, np.zeros(len(past), np.int64)), y)
-    if density is None:
-        return 0
-    # Lindsten, Jordan, Schön (2014), equation 16.
-    return int(_drawn(rng, (past.log_weights + density)[None])[0])
-
-
-def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
-    """(n,) log f(new | old), for programs with log p(y | new, old); None if it is not known."""
-    if isinstance(transition, ProgramTransition):
-        if isinstance(transition.model, PerParticle):
-            return None
-        handler = ScoreHandler(dict(new))
-        particles, density = run_program(transition.model, handler, old, y, count_particles(old))
-        # A value that the program returns is a function of the previous particle, and has no density.
-        return density if {site.name for site in handler.sites} == set(particles) else None
-    if isinstance(transition, Dynamics | GuidedTransition):
-        found = transition.model.log_transition
-        return None if found is None else np.asarray(found(old, new), np.float64)
-    if isinstance(transition, DensityTransition):
-        return np.asarray(transition.log_prob(old, new, y), np.float64)
-    return None
-
-
-def _moved(
-    filter: ParticleFilter, streams: Key, past: Population | None, given: Particles | None, y: Any
-) -> Population:
-    """The particles of a step before the update; particle 0 is the given one, with its weight."""
-    component: Any
-    slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
-    rng = streams.child(slot).generator()
-    if given is not None and isinstance(component, ProgramInitial | ProgramTransition):
-        return Population(*_program_step(rng, component, past, given, y, filter.n))
-    if past is None:
-        moved = component.sample(rng, y, filter.n)
-    else:
-        moved = past if component is None else component.predict(rng, past, y)
-    if len(moved) != filter.n:
-        raise InputError(f"{slot} made {len(moved)} particles of {filter.n}: conditional SMC needs one for each")
-    if given is None:
-        return moved
-    log_weights = np.array(moved.log_weights)
-    if isinstance(component, GuidedTransition) and past is not None:
-        old = take(past.particles, np.array([0]))
-        log_weights[0] = (
-            component.model.density("log_transition")(old, given)[0] - component.log_prob(old, given, y)[0]
-        )
-    elif isinstance(component, GuidedInitial):
-        if y is not None:
-            q = as_distribution(component.proposal(y))
-            log_weights[0] = component.model.density("log_initial")(given)[0] - q.log_prob(given)[0]
-    elif log_weights.any():
-        raise InputError(
-            f"{slot} is a {type(component).__name__} that weights its particles, so the weight of a given "
-            "particle is not known",
-            "use Prior, Dynamics, GuidedInitial, GuidedTransition or a Program",
-        )
-    return Population(_with_first(moved.particles, given), log_weights)
-
-
-def _with_first(particles: Particles, first: Particles) -> Particles:
-    """The particles with another one at index 0."""
-    if isinstance(particles, Mapping):
-        return {name: _with_first(a, first[name]) for name, a in particles.items()}
-    if not isinstance(particles, np.ndarray):
-        return (first[0], *tuple(particles)[1:])
-    particles = np.array(particles)
-    particles[0] = first[0]
-    return particles
-
-
-def _joined(rows: list[Particles]) -> Particles:
-    """Particles of all times, from one particle each; values that a program does not have at a time are NaN or 0."""
-    if isinstance(rows[0], np.ndarray):
-        return np.concatenate(rows)
-    if not isinstance(rows[0], Mapping):
-        return tuple(row[0] for row in rows)
-    examples = {name: a for row in rows for name, a in row.items()}
-    blank = {name: np.full_like(a, np.nan if a.dtype.kind == "f" else 0) for name, a in examples.items()}
-    return {name: np.concatenate([row.get(name, blank[name]) for row in rows]) for name in examples}
-
-
-class _GivenSamples(SampleHandler):
-    """Draws every site, except that particle 0 has given values."""
-
-    def __init__(self, rng: np.random.Generator, given: Particles) -> None:
-        super().__init__(rng)
-        self.given = given
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        value, gain = super().value(site)
-        return _given_value(site, value, self.given), gain
-
-    def row(self, index: int) -> SampleHandler:
-        inner = super().row(index)
-        return inner if index else _GivenSamples(inner.rng, self.given)
-
-
-class _GivenGuide(GuideHandler):
-    """As `_GivenSamples`, for a guide."""
-
-    def __init__(self, rng: np.random.Generator, n: int, given: Particles) -> None:
-        super().__init__(rng, n)
-        self.given = given
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        value, gain = super().value(site)
-        value = _given_value(site, value, self.given)
-        self.log_q[site.name][site.index] = site.distribution.log_prob(value)
-        return value, gain
-
-    def row(self, index: int) -> GuideHandler:
-        if index == 0:
-            self.rows.append(_GivenGuide(child(self.rng, "particle", index), 1, self.given))
-            return self.rows[-1]
-        return super().row(index)
-
-
-def _given_value(site: Site, value: np.ndarray, given: Particles) -> np.ndarray:
-    """The values of a site, with the given one in the row of particle 0, if that reaches the site."""
-    if site.rows is not None and (not len(site.rows) or site.rows[0] != 0):
-        return value
-    value = np.array(value)
-    value[0] = given[site.name][0] if isinstance(given, Mapping) else given[0][site.name]
-    return value
-
-
-def _program_step(
-    rng: np.random.Generator, component: Any, past: Population | None, given: Particles, y: Any, n: int
-) -> tuple[Particles, np.ndarray]:
-    """Particles and log weights of a step of a program; particle 0 has given values."""
-    previous = None if past is None else past.particles
-    if component.guide is None or y is None:
-        return run_program(component.model, _GivenSamples(rng, given), previous, y, n)
-    guide = _GivenGuide(rng, n, given)
-    run_program(component.guide, guide, previous, y, n)
-    return run_program(component.model, ReplayHandler(guide), previous, y, n)
-
-
-def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Particles) -> float:
-    """log p(x_0 .. x_T, y_0 .. y_T) of a path of `conditional_path`, by the model or the program of a filter.
-
-    The filter is made from a `StateSpaceModel` with its log densities or from a `Program`.
-    """
-    total, previous = 0.0, None
-    for t, observation in enumerate(observations):
-        y, u = split_input(observation)
-        row = take(path, np.array([t]))
-        total += _step_log_prob(filter.at_step(t, u), previous, row, y)
-        previous = row
-    return total
-
-
-def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Particles, y: Any) -> float:
-    """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
-    component = filter.initial if previous is None else filter.transition
-    if isinstance(component, ProgramInitial | ProgramTransition):
-        if isinstance(component.model, PerParticle):
-            raise InputError("the density of a path of a per_particle program is not available")
-        values = row if isinstance(row, Mapping) else row[0]
-        _, gain = run_program(component.model, ScoreHandler(values), previous, y, 1)
-        return float(gain[0])
-    if not isinstance(component, Prior | GuidedInitial | Dynamics | GuidedTransition):
-        raise InputError("the filter is not made from a StateSpaceModel or a Program: its densities are not known")
-    model = component.model
-    density = model.density("log_initial" if previous is None else "log_transition")
-    found = density(row) if previous is None else density(previous, row)
-    return float(found[0]) + (0.0 if y is None else float(model.log_likelihood(row, y)[0]))

@@ -12,13 +12,16 @@
 
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
+
+`metropolis` is the Metropolis-Hastings kernel of all chains of this package: of particles (`RandomWalkMove`, and
+`ProgramMove` for programs), of parameters (`pmmh`, `smc_sampler`) and of the ancestors of `backward_paths`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -39,6 +42,8 @@ from mstfilter.smc.interfaces import (
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Rows
+
+_Chains = TypeVar("_Chains")  # states of Markov chains
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class StateSpaceModel(AtStep):
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
     batched : bool or None
         Whether the functions treat each particle by itself, so that they can be called with the particles of many
-        runs (see `mstfilter.smc.batching`). None: a batch tries it.
+        runs (see `mstfilter.smc.batching`). None: `run_many` tries it.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -140,86 +145,68 @@ def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     return distribution.log_prob(y)
 
 
-@dataclass(frozen=True)
-class Prior(Proposal):
-    """Draws of the initial state of a model."""
+class _OfModel(AtStep):
+    """A component that draws from a model, or from a proposal of it."""
 
     model: StateSpaceModel
-    step_functions: ClassVar = {"model": None}
+    proposal: Callable[..., Any] | None
 
     @property
     def batched(self) -> bool | None:
-        return self.model.batched
-
-    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return Population(self.model.sample_initial(rng, n))
+        """That of the model; a batch tries whether a proposal treats each particle by itself."""
+        return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
 @dataclass(frozen=True)
-class Dynamics(DensityTransition):
-    """Moves by the transition of the model."""
+class Prior(_OfModel, Proposal):
+    """First particles from p(x_0), or from a proposal q(x_0 | y_0) with weights p(x_0) / q.
 
-    model: StateSpaceModel
-    step_functions: ClassVar = {"model": None}
-
-    @property
-    def batched(self) -> bool | None:
-        return self.model.batched
-
-    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        return population.moved(self.model.sample_transition(rng, population.particles))
-
-    def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        return self.model.density("log_transition")(previous, new)
-
-
-@dataclass(frozen=True)
-class GuidedInitial(Proposal):
-    """First particles from q(x_0 | y_0), weighted by p(x_0) / q; from the prior if y_0 is missing.
-
-    ``proposal(y)`` is the distribution q; the model needs its `log_initial`.
+    Parameters
+    ----------
+    model : StateSpaceModel
+        With `log_initial` if there is a proposal.
+    proposal : callable, optional
+        ``y -> distribution`` q. If y_0 is missing, p(x_0) is drawn.
     """
 
     model: StateSpaceModel
-    proposal: Callable[..., Any]
+    proposal: Callable[..., Any] | None = None
     step_functions: ClassVar = {"model": None, "proposal": 1}
 
-    @property
-    def batched(self) -> bool | None:
-        return None if self.model.batched else self.model.batched
-
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        if observation is None:
+        if self.proposal is None or observation is None:
             return Population(self.model.sample_initial(rng, n))
         q = as_distribution(self.proposal(observation))
         x = q.sample(rng, n)
         return Population(x, self.model.density("log_initial")(x) - q.log_prob(x))
 
+    def log_weight(self, new: Any, observation: Any) -> np.ndarray:
+        """(n,) log p(x_0) - log q(x_0 | y_0) of given particles; 0 without a proposal."""
+        if self.proposal is None or observation is None:
+            return np.zeros(count_particles(new))
+        return self.model.density("log_initial")(new) - as_distribution(self.proposal(observation)).log_prob(new)
+
 
 @dataclass(frozen=True)
-class GuidedTransition(DensityTransition):
-    """Moves by q(x_t | x_{t-1}, y_t) and adds log f - log q to the log weights; by f if y_t is missing.
+class Dynamics(_OfModel, DensityTransition):
+    """Moves by f(x_t | x_{t-1}), or by a proposal q(x_t | x_{t-1}, y_t) with weights f / q.
 
     Parameters
     ----------
     model : StateSpaceModel
-        With `log_transition`.
-    proposal : callable
+        With `log_transition` if there is a proposal.
+    proposal : callable, optional
         ``(particles, y) -> distribution`` of x_t, one row per particle. Its tails must not be lighter than those of
-        f(x_t | x_{t-1}) p(y_t | x_t).
+        f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
     """
 
     model: StateSpaceModel
-    proposal: Callable[..., Any]
+    proposal: Callable[..., Any] | None = None
     step_functions: ClassVar = {"model": None, "proposal": 2}
-
-    @property
-    def batched(self) -> bool | None:
-        return None if self.model.batched else self.model.batched
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         old = population.particles
-        if observation is None:
+        if self.proposal is None or observation is None:
             return population.moved(self.model.sample_transition(rng, old))
         q = as_distribution(self.proposal(old, observation))
         new = q.sample(rng, len(population))
@@ -227,10 +214,16 @@ class GuidedTransition(DensityTransition):
         return Population(new, population.log_weights + gain, population.parents)
 
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """Log density of the move: q, or f if the observation is missing."""
-        if observation is None:
+        """(n,) log density of the move: q, or f without a proposal or observation."""
+        if self.proposal is None or observation is None:
             return self.model.density("log_transition")(previous, new)
         return as_distribution(self.proposal(previous, observation)).log_prob(new)
+
+    def log_weight(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
+        """(n,) log f - log q of given moves; 0 without a proposal."""
+        if self.proposal is None or observation is None:
+            return np.zeros(count_particles(new))
+        return self.model.density("log_transition")(previous, new) - self.log_prob(previous, new, observation)
 
 
 @dataclass(frozen=True)
@@ -283,18 +276,15 @@ class RandomWalkMove(Rejuvenation):
                 prior = self.model.density("log_transition")(previous.particles, x)
             return prior if observation is None else prior + self.model.log_likelihood(x, observation)
 
-        x, taken = population.particles, 0
-        current = log_target(x)
-        for _ in range(self.steps):
-            new = self._step(rng, x)
+        def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
+            x = self._step(rng, now["x"])
             with hypothetical():
-                proposed = log_target(new)
-            with np.errstate(invalid="ignore"):
-                yes = accept_moves(rng, proposed - current)
-            x, current = choose_rows(yes, new, x), np.where(yes, proposed, current)
-            taken += int(yes.sum())
-        share = taken / (self.steps * len(population))
-        return Population(x, population.log_weights, population.parents, {"accepted": share})
+                log_p = log_target(x)
+                return {"x": x, "log_p": log_p}, log_p - now["log_p"]
+
+        start = {"x": population.particles, "log_p": log_target(population.particles)}
+        state, share = moved(rng, start, propose, self.steps)
+        return Population(state["x"], population.log_weights, population.parents, {"accepted": share})
 
     def _step(self, rng: np.random.Generator, x: Particles) -> Particles:
         if isinstance(x, np.ndarray):
@@ -302,16 +292,58 @@ class RandomWalkMove(Rejuvenation):
         return {name: self._step(rng, a) for name, a in x.items()}
 
 
-def accept_moves(rng: np.random.Generator, log_ratio: np.ndarray) -> np.ndarray:
-    """(n,) bool: Metropolis-Hastings decisions; a ratio of NaN (both states impossible) is rejected."""
-    return np.log1p(-rng.random(len(log_ratio))) < log_ratio
+def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
+    """Rows of `new` where `accepted` is True, else of `old`: arrays, or mappings of such."""
+    if isinstance(old, Mapping):
+        return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
+    return np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
 
-def choose_rows(accepted: np.ndarray, new: Particles, old: Particles) -> Particles:
-    """Rows of `new` where `accepted` is True, else of `old`."""
-    if isinstance(old, np.ndarray):
-        return np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-    return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
+def metropolis(
+    rng: np.random.Generator,
+    state: _Chains,
+    propose: Callable[[np.random.Generator, _Chains], tuple[_Chains, np.ndarray]],
+    steps: int = 1,
+    choose: Callable[[np.ndarray, _Chains, _Chains], _Chains] = choose_rows,
+) -> Iterator[tuple[_Chains, np.ndarray]]:
+    """Metropolis-Hastings steps of n chains.
+
+    Parameters
+    ----------
+    state
+        One row per chain: an array, or a mapping of arrays. It also holds the log densities, so that those of the
+        present state are not evaluated again.
+    propose : callable
+        ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
+        q(new | old)). A ratio of NaN (both states are impossible) is rejected.
+    choose : callable
+        ``(accepted, new, old) -> state`` of new and old rows.
+
+    Yields
+    ------
+    state, accepted
+        After each step, and (n,) bool whether its proposal was accepted.
+    """
+    for _ in range(steps):
+        new, log_ratio = propose(rng, state)
+        accepted = np.log1p(-rng.random(len(log_ratio))) < log_ratio
+        state = choose(accepted, new, state)
+        yield state, accepted
+
+
+def moved(
+    rng: np.random.Generator,
+    state: _Chains,
+    propose: Callable[[np.random.Generator, _Chains], tuple[_Chains, np.ndarray]],
+    steps: int,
+    choose: Callable[[np.ndarray, _Chains, _Chains], _Chains] = choose_rows,
+) -> tuple[_Chains, float]:
+    """The state after `steps` steps of `metropolis`, and the share of accepted proposals."""
+    shares = []
+    for after, accepted in metropolis(rng, state, propose, steps, choose):
+        state = after
+        shares.append(accepted.mean())
+    return state, float(np.mean(shares))
 
 
 def bootstrap(
@@ -353,8 +385,8 @@ def guided(
     """
     return replace(
         bootstrap(model, n),
-        initial=Prior(model) if initial is None else GuidedInitial(model, initial),
-        transition=GuidedTransition(model, proposal),
+        initial=Prior(model, initial),
+        transition=Dynamics(model, proposal),
         **components,
     )
 
@@ -383,8 +415,8 @@ def auxiliary(
     """
     return replace(
         bootstrap(model, n),
-        initial=Prior(model) if initial is None else GuidedInitial(model, initial),
-        transition=Dynamics(model) if proposal is None else GuidedTransition(model, proposal),
+        initial=Prior(model, initial),
+        transition=Dynamics(model, proposal),
         lookahead=PriorityLookahead(log_priority),
         **components,
     )

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mstfilter.errors import InputError, InputWarning, MissingLibraryError
+from mstfilter.errors import InputError, InputWarning, missing_library
 from mstfilter.study.executors import Event, Executor, Tell, times
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
@@ -75,10 +75,7 @@ class Cluster(Executor):
         try:
             from distributed import Client
         except ImportError as error:
-            raise MissingLibraryError(
-                f"the cluster needs dask.distributed, which cannot be imported: {error}",
-                "pip install 'mstfilter[dask]'",
-            ) from error
+            raise missing_library(error, "the cluster", library="dask.distributed") from error
         try:
             client = Client(self.address, timeout=self.connect_s, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:

@@ -24,7 +24,7 @@ from mstfilter.reading import check_private, read_json
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Event, Executor, Local, Tell
-from mstfilter.study.plan import Plan, StudyRun, make_plan
+from mstfilter.study.plan import Plan, StudyRun, StudyScene, make_plan
 from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
 
 _LEAST_FREE_GB = 0.5
@@ -93,43 +93,115 @@ def run_study(
     recalibration = _read_recalibration(plan)
     cache = (cache or cache_folder()).absolute()
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
-        for target in (path, cache):
-            _check_free_space(target)
-        for part in ("recordings", "work"):
-            check_private(cache / part)
-        with writing(f"study folder {path}", "choose another with --out"):
-            write_json(path / "study.json", {**_description(plan), "recalibration": recalibration})
-            for part in ("runs", "logs"):
-                (path / part).mkdir(exist_ok=True)
-        _rename_done_runs(plan, folder)
+        _prepare(plan, folder, cache, {**_description(plan), "recalibration": recalibration})
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
-        n_before = len(plan.runs) - len(waiting)
-        failed_scenes = _record_scenes(waiting, cache, plan.config, executor, report)
-        failed = {run.name: failed_scenes[run.scene.key] for run in waiting if run.scene.key in failed_scenes}
-        for run in waiting:
-            if run.name in failed:
-                _write_failure(folder, run, failed[run.name])
-        waiting = [run for run in waiting if run.name not in failed]
-        names = [run.name for run in waiting]
-        count = _counter(report, "runs", names, n_before, len(plan.runs), len(failed))
-
-        def tell(event: Event) -> None:
-            run = waiting[event.job]
-            if event.kind == "lost":
-                sweep(path / "runs", run.folder)
-            if event.outcome is not None and event.outcome.status != "done":
-                _write_failure(folder, run, event.outcome)
-            count(event)
-
-        outcomes = executor.run(_run_jobs(plan, waiting, folder, cache, allow_files), tell)
-        for run, outcome in zip(waiting, outcomes, strict=True):
-            if outcome.status != "done":
-                failed[run.name] = outcome
-                _write_failure(folder, run, outcome)  # repeated, because the disk may have been full before
+        call = _Call(plan, folder, cache, executor, report, allow_files)
+        failed = call.record_scenes(waiting)
+        failed |= call.filter_scenes([run for run in waiting if run.name not in failed], len(failed))
         folder = StudyFolder.open(path)
         with writing(f"the tables of {path}", "free disk space and repeat the command"):
             folder.write_tables()
-    return StudyResult(folder, len(plan.runs) - len(failed), n_before, tuple(failed.items()))
+    n = len(plan.runs)
+    return StudyResult(folder, n - len(failed), n - len(waiting), tuple(failed.items()))
+
+
+def _prepare(plan: Plan, folder: StudyFolder, cache: Path, description: dict[str, Any]) -> None:
+    """Check the folders and write study.json; done runs are renamed to their present names."""
+    for target in (folder.path, cache):
+        _check_free_space(target)
+    for part in ("recordings", "work"):
+        check_private(cache / part)
+    with writing(f"study folder {folder.path}", "choose another with --out"):
+        write_json(folder.path / "study.json", description)
+        for part in ("runs", "logs"):
+            (folder.path / part).mkdir(exist_ok=True)
+    _rename_done_runs(plan, folder)
+
+
+@dataclass(frozen=True)
+class _Call:
+    """One call of `run_study`: its jobs are given to the executor, and failures are recorded."""
+
+    plan: Plan
+    folder: StudyFolder
+    cache: Path
+    executor: Executor
+    report: Callable[[StudyProgress], None]
+    allow_files: bool
+
+    def record_scenes(self, runs: Sequence[StudyRun]) -> dict[str, JobOutcome]:
+        """Simulate the recordings that are missing; name of a run that lacks its recording -> why."""
+        recordings = self.cache / "recordings"
+        scenes = {run.scene.key: run.scene for run in runs if "family" in run.scene.source}
+        missing = [scene for scene in scenes.values() if not _is_recorded(scene.source, recordings)]
+        jobs = [self._job("record", scene.name, scene, {"recordings": str(recordings)}) for scene in missing]
+        if not jobs:
+            return {}
+        outcomes = self.executor.run(jobs, self._counter("recordings", jobs, 0, len(jobs), 0))
+        why = {scene.key: one for scene, one in zip(missing, outcomes, strict=True) if one.status != "done"}
+        failed = [run for run in runs if run.scene.key in why]
+        for run in failed:
+            _write_failure(self.folder, run, why[run.scene.key])
+        return {run.name: why[run.scene.key] for run in failed}
+
+    def filter_scenes(self, runs: Sequence[StudyRun], n_failed: int) -> dict[str, JobOutcome]:
+        """Do some runs; name of a run that failed -> why. `n_failed` is the number of runs that failed before."""
+        total = len(self.plan.runs)
+        jobs = [self._run_job(run) for run in runs]
+        count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
+
+        def tell(event: Event) -> None:
+            run = runs[event.job]
+            if event.kind == "lost":
+                sweep(self.folder.path / "runs", run.folder)
+            if event.outcome is not None and event.outcome.status != "done":
+                _write_failure(self.folder, run, event.outcome)
+            count(event)
+
+        outcomes = self.executor.run(jobs, tell)
+        failed = [(run, outcome) for run, outcome in zip(runs, outcomes, strict=True) if outcome.status != "done"]
+        for run, outcome in failed:
+            _write_failure(self.folder, run, outcome)  # repeated, because the disk may have been full before
+        return {run.name: outcome for run, outcome in failed}
+
+    def _job(self, kind: str, name: str, scene: StudyScene, more: dict[str, Any]) -> Job:
+        """A job for `mstfilter.study.jobs`, as plain values."""
+        limits = {"tries": self.plan.config.tries, "timeout_s": self.plan.config.timeout_s}
+        return {"kind": kind, "name": name, "share": scene.key, "source": scene.source, **limits, **more}
+
+    def _run_job(self, run: StudyRun) -> Job:
+        plan = self.plan
+        libraries = "".join(f" {name}={version}" for name, version in library_versions().items())
+        work = {
+            "folder": str(self.cache / "work"),
+            "limit_bytes": int(plan.config.cache_gb * 1e9),
+            "version": plan.code + libraries,
+        }
+        more = {
+            "folder": str(self.folder.run(run.folder).absolute()),
+            "identity": run.identity,
+            "code": plan.code,
+            "config": {**run.arm.config, "description": run.arm.name},
+            "seed": run.seed,
+            "keep": plan.config.keep,
+            "allow_files": self.allow_files,
+            "recordings": str(self.cache / "recordings"),
+            "work": work if plan.config.cache_gb and run.arm.known_code else None,
+        }
+        return self._job("run", run.name, run.scene, more)
+
+    def _counter(self, what: str, jobs: Sequence[Job], done: int, total: int, failed: int) -> Tell:
+        """A function that turns the events of jobs into progress."""
+
+        def count(event: Event) -> None:
+            nonlocal done, failed
+            if event.outcome is not None:
+                done += event.outcome.status == "done"
+                failed += event.outcome.status != "done"
+            self.report(StudyProgress(what, event, jobs[event.job]["name"], done, failed, total))
+
+        self.report(StudyProgress(what, None, "", done, failed, total))
+        return count
 
 
 @contextlib.contextmanager
@@ -235,84 +307,8 @@ def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> N
         folder.write_failure(run.folder, run.identity, outcome)
 
 
-def _record_scenes(
-    runs: Sequence[StudyRun],
-    cache: Path,
-    config: StudyConfig,
-    executor: Executor,
-    progress: Callable[[StudyProgress], None],
-) -> dict[str, JobOutcome]:
-    """Simulate the recordings that are missing; key of a scene -> outcome, of those that failed."""
-    recordings = cache / "recordings"
-    scenes = {run.scene.key: run.scene for run in runs if "family" in run.scene.source}
-    missing = [scene for scene in scenes.values() if not _is_recorded(scene.source, recordings)]
-    jobs: list[Job] = [
-        {
-            "kind": "record",
-            "name": scene.name,
-            "share": scene.key,
-            "source": scene.source,
-            "recordings": str(recordings),
-            "tries": config.tries,
-            "timeout_s": config.timeout_s,
-        }
-        for scene in missing
-    ]
-    if not jobs:
-        return {}
-    outcomes = executor.run(jobs, _counter(progress, "recordings", [s.name for s in missing], 0, len(jobs), 0))
-    return {scene.key: outcome for scene, outcome in zip(missing, outcomes, strict=True) if outcome.status != "done"}
-
-
 def _is_recorded(source: dict[str, Any], recordings: Path) -> bool:
-    from mstfilter.simulation import recipe_key, scene_family
+    from mstfilter.simulation import cached_path, scene_family
 
     family = replace(scene_family(source["family"]), **source["set"])
-    name = f"{family.name}-{source['seed']}-{recipe_key(family, source['seed'])}"
-    return (recordings / name / "manifest.json").is_file()
-
-
-def _run_jobs(plan: Plan, runs: Sequence[StudyRun], folder: StudyFolder, cache: Path, allow_files: bool) -> list[Job]:
-    """Jobs for `mstfilter.study.jobs`, as plain values."""
-    libraries = "".join(f" {name}={version}" for name, version in library_versions().items())
-    work = {
-        "folder": str(cache / "work"),
-        "limit_bytes": int(plan.config.cache_gb * 1e9),
-        "version": plan.code + libraries,
-    }
-    return [
-        {
-            "kind": "run",
-            "name": run.name,
-            "share": run.scene.key,
-            "folder": str(folder.run(run.folder).absolute()),
-            "identity": run.identity,
-            "code": plan.code,
-            "config": {**run.arm.config, "description": run.arm.name},
-            "source": run.scene.source,
-            "seed": run.seed,
-            "keep": plan.config.keep,
-            "allow_files": allow_files,
-            "recordings": str(cache / "recordings"),
-            "work": work if plan.config.cache_gb and run.arm.known_code else None,
-            "tries": plan.config.tries,
-            "timeout_s": plan.config.timeout_s,
-        }
-        for run in runs
-    ]
-
-
-def _counter(
-    progress: Callable[[StudyProgress], None], what: str, names: Sequence[str], done: int, total: int, failed: int
-) -> Tell:
-    """A function that turns the events of jobs into progress."""
-
-    def count(event: Event) -> None:
-        nonlocal done, failed
-        if event.outcome is not None:
-            done += event.outcome.status == "done"
-            failed += event.outcome.status != "done"
-        progress(StudyProgress(what, event, names[event.job], done, failed, total))
-
-    progress(StudyProgress(what, None, "", done, failed, total))
-    return count
+    return (cached_path(family, source["seed"], recordings) / "manifest.json").is_file()

@@ -1,18 +1,11 @@
-"""Contracts: properties that every component of a kind has, as pytest classes, for your components and ours.
+"""Contracts of components of scenes, and the check of any component: what ``mstfilter check`` does.
 
-Inherit the contract of the interface and define `make`:
+>>> for result in run_contract(MyRule()):
+...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
->>> from mstfilter.testing import WeightResamplerContract
->>> from mine import MyResampler
->>> class TestMyResampler(WeightResamplerContract):
-...     def make(self):
-...         return MyResampler()
-
-``pytest`` then tests the component. ``mstfilter check ./mine.py:MyResampler`` runs the same class and states in words
-which property is violated; `run_contract` does so from Python. ``mstfilter new resampler mine.py`` writes a
-component to start from, and its test (`write_starter`).
-
-Contracts need pytest: ``pip install 'mstfilter[check]'``.
+Contracts of components of numbers, and how to use a contract as a test, are in `mstfilter.smc.testing`.
+`scene_example` gives hypotheses and a clip for either. ``mstfilter new resampler mine.py`` writes a component to
+start from, and its test (`write_starter`).
 """
 
 from mstfilter.lazy import attach

@@ -1,7 +1,11 @@
-"""The contract of the stages of MST: boundaries, trees, cuts, completion, motions and the parts of the updates."""
+"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, parts of the updates.
+
+`contract_of` and `run_contract` are for components of every interface, also for those of `mstfilter.smc.testing`.
+"""
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,15 +15,27 @@ from typing import Any
 
 import numpy as np
 
+import mstfilter.smc.testing as numbers
 from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed_box
 from mstfilter.completion.completer import fault_of
 from mstfilter.crossover import Crossover, CrossoverUpdate, Structure
-from mstfilter.errors import InputWarning
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.partition import PairOdds, PartitionUpdate
 from mstfilter.scene import Clip, Hypothesis, Projection, render_hypothesis
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition, child
-from mstfilter.testing.contract import RandomContract, prerequisite, reports_errors, same, skips_errors
+from mstfilter.smc.testing.contract import (
+    CheckResult,
+    Contract,
+    check_properties,
+    close,
+    prerequisite,
+    reports_errors,
+    same,
+    seeded,
+    skips_errors,
+)
+from mstfilter.smc.testing.values import ScoreContract
 from mstfilter.testing.scenes import scene_example
 from mstfilter.tracking import (
     DenseFlow,
@@ -49,7 +65,37 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
 }
 
 
-class StageContract(RandomContract):
+class EvidenceContract(ScoreContract):
+    """The contract of every `Evidence`. The default example is a scene."""
+
+    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
+        """`n` hypotheses and a clip."""
+        return scene_example(rng, n)
+
+    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
+        """Log scores, rounded to 9 digits."""
+        hypotheses = tuple(inputs["population"].realised().particles)
+        return np.round(component.log_score(hypotheses, inputs["observation"]), 9)
+
+    def test_copies_score_the_same(self) -> None:
+        """Equal hypotheses have equal scores, also if the numbers of the labels differ."""
+        inputs, rng = self.inputs(9), seeded(2)
+        hypotheses = tuple(inputs["population"].realised().particles)
+
+        def renamed(labels: np.ndarray) -> np.ndarray:
+            table = np.concatenate([[0], 3 + 5 * rng.permutation(int(labels.max()))])
+            return table.astype(np.uint16)[labels]
+
+        for change, fault in (
+            (np.copy, "a hypothesis and its copy have different scores"),
+            (renamed, "other numbers for the same labels give other scores"),
+        ):
+            copies = tuple(Hypothesis.from_labels(change(h.labels), h.grid) for h in hypotheses)
+            scores = self.checked_call(self.make(), {**inputs, "population": Population(hypotheses + copies)})
+            assert close(scores[:9], scores[9:]), fault
+
+
+class StageContract(Contract):
     """The contract of a stage of MST, which is tested in its place in the proposal, the tracking or the update."""
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
@@ -77,7 +123,7 @@ class StageContract(RandomContract):
     def checked_step(self, component: Any, inputs: dict[str, Any]) -> None:
         """Use the component in its place; an exception is reported with a description of the inputs."""
         with reports_errors(inputs):
-            result = self.step(component, np.random.default_rng(3), inputs)
+            result = self.step(component, seeded(3), inputs)
         assert all(isinstance(h, Hypothesis) for h in result.particles), "the result has no hypotheses"
 
     @prerequisite
@@ -102,29 +148,31 @@ class CompleterContract(StageContract):
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
+    def _case(self, cut: bool = False) -> tuple[Completer, list[ObservedBox], Clip]:
+        """The component, boxes of three objects, and the clip."""
+        component, inputs = self.make(), self.inputs(1)
+        return component, _boxes(component, _correct(inputs), inputs["observation"], cut), inputs["observation"]
+
     def test_works_for_any_box(self) -> None:
         """It works for a box with edges of different lengths, and for one without voxels."""
-        component, inputs = self.make(), self.inputs(1)
-        box = _boxes(component, _correct(inputs), inputs["observation"])[0]
-        odd = [_cropped(box, *size) for size in ((7, 6, 5), (0, 0, 0))]
+        component, seen, clip = self._case()
+        odd = [_cropped(seen[0], *size) for size in ((7, 6, 5), (0, 0, 0))]
         with reports_errors("boxes of shape (7, 6, 5) and (0, 0, 0)"):
-            _estimated(component, np.random.default_rng(0), odd, inputs["observation"])
+            _estimated(component, seeded(0), odd, clip)
 
     def test_follows_what_is_seen(self) -> None:
         """Its probabilities are not constant, and visible surface is probably occupied."""
-        component, inputs = self.make(), self.inputs(1)
-        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        component, seen, clip = self._case()
         with skips_errors():
-            filled = _estimated(component, np.random.default_rng(0), seen, inputs["observation"])
+            filled = _estimated(component, seeded(0), seen, clip)
         fault = fault_of(seen, filled)
         assert fault is None, f"{type(component).__name__}.fill {fault}"
 
     def test_axes_are_those_of_the_grid(self) -> None:
         """The axes of its result are those of the box: reversed, it fits the visible surface less well."""
-        component, inputs = self.make(), self.inputs(1)
-        seen = _boxes(component, _correct(inputs), inputs["observation"], cut=True)
+        component, seen, clip = self._case(cut=True)
         with skips_errors():
-            filled = _estimated(component, np.random.default_rng(0), seen, inputs["observation"])
+            filled = _estimated(component, seeded(0), seen, clip)
         choices = [axes for n in range(4) for axes in combinations(range(3), n)]
         fit = {axes: _on_surface(filled, seen, axes) for axes in choices}
         best = max(choices, key=lambda axes: fit[axes])
@@ -135,11 +183,10 @@ class CompleterContract(StageContract):
 
     def test_objects_do_not_depend_on_others(self) -> None:
         """The result for an object does not depend on the others, nor on their order."""
-        component, inputs = self.make(), self.inputs(1)
-        seen = _boxes(component, _correct(inputs), inputs["observation"])
+        component, seen, clip = self._case()
         with skips_errors():
             every, last = (
-                _estimated(component, np.random.default_rng(0), boxes, inputs["observation"], first)
+                _estimated(component, seeded(0), boxes, clip, first)
                 for boxes, first in ((seen, 0), (seen[-1:], len(seen) - 1))
             )
         assert same(np.asarray(every[-1]), np.asarray(last[0])), (
@@ -205,7 +252,7 @@ class MotionRuleContract(StageContract):
 
     def test_motions_stay_in_the_workspace(self) -> None:
         """No candidate moves an object farther than the workspace is wide."""
-        component, rng = self.make(), np.random.default_rng(0)
+        component, rng = self.make(), seeded(0)
         for label, track in _tracks(self.inputs(1)):
             with skips_errors(), _without_warnings():
                 candidates = component.candidates(child(rng, "segment", label), track)
@@ -219,3 +266,52 @@ def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
     flow = DenseFlow().track(clip)
     segments = segments_of(_correct(inputs), clip.before)
     return [(label, Track(one, clip, flow)) for label, one in segments.items() if len(one.support)]
+
+
+# --- the check of any component: what ``mstfilter check`` does -----------------------------------------------------
+
+
+def contract_of(cls: type) -> type[Contract]:
+    """The contract of a class of components: `UpdateContract` for an `Update`, and so on for the other interfaces.
+
+    InputError if no interface of the class has a contract.
+    """
+    for base in cls.__mro__:
+        if base.__module__.startswith("mstfilter."):
+            name = f"{base.__name__}Contract"
+            contract = globals().get(name) or getattr(numbers, name, None)
+            if contract is not None:
+                return contract
+        if base in STAGE_OWNERS:
+            return StageContract
+    named = [name.removesuffix("Contract") for name in dir(numbers) if name.endswith("Contract")]
+    interfaces = [*filter(None, named), "Evidence", *(stage.__name__ for stage in STAGE_OWNERS)]
+    raise InputError(f"{cls.__name__} is no component with a contract", f"inherit one of {', '.join(interfaces)}")
+
+
+def run_contract(
+    component: Any, example: Callable[..., Any] | None = None, exact: Callable[..., Any] | None = None
+) -> list[CheckResult]:
+    """Test all properties of a component, whose interface has a contract.
+
+    ``example(rng, n)`` returns a population and an observation that the component can handle. Default: the function
+    ``example`` in the module of its class; without one, a scene for components of images and numbers for others.
+
+    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
+    observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
+    """
+    cls = type(component)
+    contract = contract_of(cls)
+    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
+    return check_properties(component, contract, example, exact or _function_beside(cls, "exact"))
+
+
+def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
+    """A function in the module of a class."""
+    found = getattr(sys.modules.get(cls.__module__), name, None)
+    return found if callable(found) else None
+
+
+def _uses_images(cls: type) -> bool:
+    """Whether a class of components belongs to a package of mstfilter other than smc."""
+    return cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")

@@ -11,7 +11,8 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from mstfilter.errors import InputError, suggestion
+from mstfilter import smc
+from mstfilter.errors import InputError, check_choice, suggestion
 from mstfilter.lazy import exported
 from mstfilter.resources import examples_folder
 
@@ -19,7 +20,7 @@ _TEST = '''"""{name} keeps the contract of its interface."""
 
 from {module} import {names}
 
-from mstfilter.testing import {contract}
+from {package} import {contract}
 
 
 class Test{name}({contract}):
@@ -40,17 +41,14 @@ class Starter(NamedTuple):
     commands: list[str]  #: commands that run the component, as its docstring lists them
 
 
-def starter_kinds(target: str = "") -> list[str]:
-    """Kinds of component that have a starting file: for "scenes", for "numbers", or for any of the two."""
-    folders = {"scenes": [_folder("scenes")], "numbers": [_folder("numbers")]}.get(
-        target, list(map(_folder, _TARGETS))
-    )
-    found = {path.stem for folder in folders for path in folder.glob("*.py")}
-    return sorted(found | set(_BOTH))
-
-
 _TARGETS = ("scenes", "numbers")
 _BOTH = ("resampler", "trigger", "size")  # use the weights only, so one file is for both
+
+
+def starter_kinds(target: str = "") -> list[str]:
+    """Kinds of component that have a starting file: for "scenes", for "numbers", or for any of the two."""
+    folders = map(_folder, [target] if target else _TARGETS)
+    return sorted({path.stem for folder in folders for path in folder.glob("*.py")} | set(_BOTH))
 
 
 def _folder(target: str) -> Path:
@@ -63,21 +61,15 @@ def write_starter(kind: str, path: Path, target: str = "") -> Starter:
     `target` says what the particles are: "scenes" (hypotheses) or "numbers". Default: scenes, if the kind has a file
     for them. Raises InputError if there is no such file, the name cannot be imported, or a file exists already.
     """
-    if target and target not in _TARGETS:
-        raise InputError(f"there are no components for {target!r}", f"there are: {', '.join(_TARGETS)}")
-    if kind not in starter_kinds():
-        kinds = starter_kinds()
-        raise InputError(
-            f"there is no starting file for {kind!r}", *suggestion(kind, kinds), f"there are: {', '.join(kinds)}"
-        )
-    wanted = target or ("scenes" if kind in starter_kinds("scenes") else "numbers")
-    if kind not in starter_kinds(wanted):
-        raise InputError(
-            f"there is no starting file of a {kind} for {wanted}", f"there are: {', '.join(starter_kinds(wanted))}"
-        )
+    check_choice("the target", target or "scenes", _TARGETS)
+    kinds = starter_kinds(target)
+    if kind not in kinds:
+        fact = f"there is no starting file of {kind!r}" + f" for {target}" * bool(target)
+        raise InputError(fact, *suggestion(kind, kinds), f"there are: {', '.join(kinds)}")
+    target = target or ("scenes" if kind in starter_kinds("scenes") else "numbers")
     if path.suffix != ".py" or not path.stem.isidentifier():
         raise InputError(f"{path.name} cannot be imported as a Python module", "choose a name like mine.py")
-    source = _folder("numbers" if kind in _BOTH else wanted) / f"{kind}.py"
+    source = _folder("numbers" if kind in _BOTH else target) / f"{kind}.py"
     text = re.sub(rf"(\./|python ){kind}\.py\b", rf"\g<1>{path.name}", source.read_text(encoding="utf-8"))
     files = {path: text}
     test = path.with_name(f"test_{path.name}")
@@ -100,13 +92,16 @@ def write_starter(kind: str, path: Path, target: str = "") -> Starter:
 
 def _test_of(text: str, module: str) -> str | None:
     """The test of the component in a file, by the contract of its base class; None if it has none."""
-    contracts = exported(Path(__file__).with_name("__init__.pyi"))
     found = re.search(r"^class (My\w+)\((\w+)\)", text, flags=re.M)
     assert found is not None
     name, contract = found[1], f"{found[2]}Contract"
     if "mstfilter check" not in text:
         return None
     functions = [f for f in ("exact", "example") if re.search(rf"^(def {f}\(|{f} = )", text, flags=re.M)]
+    contracts = exported(Path(__file__).with_name("__init__.py"))
+    contracts |= exported(Path(smc.__file__).with_name("testing") / "__init__.py")
     contract = contract if contract in contracts else "StageContract"
-    test = _TEST.format(name=name, module=module, names=", ".join([name, *functions]), contract=contract)
+    package = contracts[contract].rpartition(".")[0]
+    names = ", ".join([name, *functions])
+    test = _TEST.format(name=name, module=module, names=names, package=package, contract=contract)
     return test + "".join(_METHOD.format(function=f) for f in reversed(functions))

@@ -10,7 +10,8 @@ from mstfilter.presets import preset
 from mstfilter.scene import Clip, Frame, Hypothesis, render
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
-from mstfilter.testing import UpdateContract, scene_example
+from mstfilter.smc.testing import UpdateContract
+from mstfilter.testing import scene_example
 from tests.baselines.scenes import slide
 from tests.scene.scenes import CAMERA, GRID, table_scene
 

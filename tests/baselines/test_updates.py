@@ -13,7 +13,8 @@ from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import FreeSpace, Hypothesis, NoFreeSpace
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
-from mstfilter.testing import UpdateContract, scene_example
+from mstfilter.smc.testing import UpdateContract
+from mstfilter.testing import scene_example
 from tests.baselines.scenes import ProposalRecorder, slide
 
 

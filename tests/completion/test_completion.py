@@ -58,23 +58,21 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return (a & b).sum() / (a | b).sum()
 
 
+AT_THE_BORDER = boxes(((0, 0, 0), (9, 9, 9)), ((25, 25, 10), (35, 35, 16)))
+
+
 @pytest.mark.parametrize("completer", COMPLETERS)
-@pytest.mark.parametrize("scene", [TWO, STACK])
-def test_nothing_is_where_the_frame_saw_free_space(completer, scene):
-    frame = frame_of(scene, noise=0.3)
+@pytest.mark.parametrize("scene", [TWO, STACK, AT_THE_BORDER])
+def test_promises_of_every_completer(completer, scene):
+    """Nothing where the frame saw free space or outside the grid, and each object shows in its own mask."""
+    frame = frame_of(scene, width=320, noise=0.3)
     free = frame_geometry(frame, GRID).known_free(0.01)
-    for mask in masks_of(scene, frame):
-        one = completer.complete(RNG, frame, [mask], GRID)[0]
-        assert not ((placed(one) > 0) & free).any()
-        assert one.points.sum() == GRID.contains(GRID.index_of(frame.points))[mask & frame.valid].sum()
-
-
-@pytest.mark.parametrize("completer", COMPLETERS)
-@pytest.mark.parametrize("scene", [TWO, STACK])
-def test_objects_show_in_their_own_masks(completer, scene):
-    frame = frame_of(scene, width=640, noise=0.3)
     masks = masks_of(scene, frame)
     completions = completer.complete(RNG, frame, masks, GRID)
+    for mask, one in zip(masks, completions, strict=True):
+        assert (one.offset >= 0).all() and (one.offset + one.probability.shape <= GRID.shape).all()
+        assert not ((placed(one) > 0) & free).any()
+        assert one.points.sum() == GRID.contains(GRID.index_of(frame.points))[mask & frame.valid].sum()
     shown = render(arbitrate(completions, GRID), GRID, frame.camera).labels
     for k, mask in enumerate(masks, start=1):
         assert (shown[mask] == k).mean() > 0.8
@@ -113,7 +111,7 @@ def test_the_answer_depends_on_frame_and_mask_alone():
             assert x.key == y.key
 
 
-@pytest.mark.parametrize("turns", [1, 2, 3])
+@pytest.mark.parametrize("turns", [1, 2])
 def test_extrusion_turns_with_its_evidence(turns):
     rng = np.random.default_rng(5)
     points = rng.integers(0, 3, (7, 6, 5)).astype(np.int32) * (rng.random((7, 6, 5)) < 0.2)
@@ -147,15 +145,6 @@ def test_masks_without_anything():
         assert completer.complete(RNG, frame, [pixel], far)[0].probability.size == 0
 
 
-def test_objects_at_the_border_and_floating():
-    scene = boxes(((0, 0, 0), (9, 9, 9)), ((25, 25, 10), (35, 35, 16)))
-    frame = frame_of(scene)
-    for completer in COMPLETERS:
-        for one in completer.complete(RNG, frame, masks_of(scene, frame), GRID):
-            assert (np.array(one.offset) >= 0).all()
-            assert (one.offset + one.probability.shape <= np.array(GRID.shape)).all()
-
-
 def test_wrong_mask_size():
     frame = frame_of(TWO)
     with pytest.raises(InputError, match="mask has shape"):
@@ -179,6 +168,7 @@ def random_completions(rng: np.random.Generator, n: int) -> list[Completion]:
 @settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 6))
 def test_renumbering_objects_renumbers_the_result(seed, n):
+    assert not arbitrate([], SMALL).any()
     rng = np.random.default_rng(seed)
     completions = random_completions(rng, n)
     order = rng.permutation(n)
@@ -207,24 +197,14 @@ def test_arbitration_by_its_definition(seed, n):
             assert labels[voxel] in {r[3] for r in rank if r[:3] == best}
 
 
-def test_nothing_to_arbitrate():
-    assert not arbitrate([], SMALL).any()
-
-
-def overlapping_completions(seed: int, n: int = 4) -> list[Completion]:
-    rng, made = np.random.default_rng(seed), []
-    for k in range(n):
-        low, size = rng.integers(0, 6, 3), rng.integers(3, 7, 3)
-        p = rng.choice([0.0, 0.01, 1.0, *rng.random(5)], size).astype(np.float32)
-        made.append(Completion(low, p, np.zeros(size, np.int32), f"{k}"))
-    return made
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_occupancy_is_that_of_one_owner_or_free_space(seed):
     """By enumeration at each voxel: at most one of the objects is there, given independent claims."""
-    grid = VoxelGrid((0, 0, 0), 0.01, (12, 12, 12))
-    made = overlapping_completions(seed)
+    grid, rng, made = VoxelGrid((0, 0, 0), 0.01, (12, 12, 12)), np.random.default_rng(seed), []
+    for k in range(4):
+        low, size = rng.integers(0, 6, 3), rng.integers(3, 7, 3)
+        p = rng.choice([0.0, 0.01, 1.0, *rng.random(5)], size).astype(np.float32)
+        made.append(Completion(low, p, np.zeros(size, np.int32), f"{k}"))
     labels = arbitrate(made, grid)
     occupancy = occupancy_of(made, labels, grid)
     claims = np.clip([placed(one, grid) for one in made], 0, 0.999).astype(float)
@@ -243,23 +223,22 @@ def test_occupancy_is_that_of_one_owner_or_free_space(seed):
     assert occupancy_of(sure, arbitrate(sure, grid), grid) is None
 
 
-def test_only_the_object_with_most_readings_claims_a_voxel():
-    grid, box = VoxelGrid((0, 0, 0), 0.01, (2, 1, 1)), (2, 1, 1)
-    p = [np.array(v, np.float32).reshape(box) for v in ([0.6, 0.6], [0.9, 0.9])]
-    points = [np.array(v, np.int32).reshape(box) for v in ([30, 0], [2, 0])]
-    made = [Completion(np.zeros(3, np.int64), a, n, str(k)) for k, (a, n) in enumerate(zip(p, points, strict=True))]
-    found = occupancy_of(made, arbitrate(made, grid), grid)
-    np.testing.assert_array_equal(found.owner.ravel(), [1, 2])
-    np.testing.assert_allclose(found.probability.ravel(), [0.6, 9 / (1 + 9 + 1.5)], rtol=1e-3)
+CLAIMS = {
+    "only the object with most readings": ([[0.6, 0.6], [0.9, 0.9]], [[30, 0], [2, 0]], [1, 2], [0.6, 9 / 11.5]),
+    "an object without a voxel claims nothing": ([[0.6, 0.0], [0.4, 0.4]], [[0, 0], [0, 0]], [1, 0], [0.6, 0]),
+}
 
 
-def test_objects_without_a_voxel_claim_nothing():
-    grid, box = VoxelGrid((0, 0, 0), 0.01, (2, 1, 1)), (2, 1, 1)
-    p = [np.array(v, np.float32).reshape(box) for v in ([0.6, 0.0], [0.4, 0.4])]
-    made = [Completion(np.zeros(3, np.int64), a, np.zeros(box, np.int32), str(k)) for k, a in enumerate(p)]
+@pytest.mark.parametrize("case", CLAIMS)
+def test_claims_of_voxels(case):
+    """Odds of two voxels in two completions: 1.5 and 9 against free space."""
+    p, points, owner, expected = CLAIMS[case]
+    grid, first = VoxelGrid((0, 0, 0), 0.01, (2, 1, 1)), np.zeros(3, np.int64)
+    values = zip(np.array(p, np.float32), np.array(points, np.int32), strict=True)
+    made = [Completion(first, a[:, None, None], n[:, None, None], str(k)) for k, (a, n) in enumerate(values)]
     found = occupancy_of(made, arbitrate(made, grid), grid)
-    np.testing.assert_array_equal(found.owner.ravel(), [1, 0])
-    np.testing.assert_allclose(found.probability.ravel(), [0.6, 0], rtol=1e-3)
+    np.testing.assert_array_equal(found.owner.ravel(), owner)
+    np.testing.assert_allclose(found.probability.ravel(), expected, rtol=1e-3)
 
 
 def surface_and_free(seen: ObservedBox) -> tuple[np.ndarray, ...]:

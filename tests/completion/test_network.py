@@ -9,7 +9,7 @@ import torch
 from mstfilter.completion import Extrude, NetworkCompleter, arbitrate, observed_box
 from mstfilter.completion.crops import CHANNELS, channels, crop_box, extruded
 from mstfilter.completion.observed import encode_box, observed_again
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Frame, VoxelGrid, frame_geometry, look_at, render, scene_cache
 from mstfilter.trained import write_model
@@ -60,6 +60,11 @@ def test_crops_equal_the_rules_of_extrusion(frame):
 
 
 def test_crops_stand_on_the_table_and_stay_in_the_grid():
+    voxels = np.argwhere(np.ones((10, 10, 12), bool)) + (20, 20, 0)
+    for lowest, first, top in ((0, 0, 32), (6, 0, 32), (-7, 7, 39), (-40, 40, 60)):
+        grid = VoxelGrid((-0.3, -0.3, 0.01 * lowest), 0.01, (60, 60, 60))
+        low, high = crop_box(voxels + (0, 0, first), grid)
+        assert (low[2], high[2]) == (first, top)
     grid = VoxelGrid(np.zeros(3), 0.01, (100, 100, 50))
     for low, high, edge in (
         ((40, 50, 0), (50, 60, 9), 32),
@@ -86,19 +91,6 @@ def test_free_space_and_order(completer, frame):
         assert np.array_equal(alone.probability, together[k].probability)
         assert not ((placed(alone) > 0) & free).any()
         assert (placed(alone) >= 0.5).any()
-
-
-def test_divergence_of_normal_laws():
-    """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
-    torch.manual_seed(1)
-    a, b = (LatentLaw(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
-    x = a.draw(torch.randn(100_000, 3))
-
-    def log_density(law):
-        return (-0.5 * ((x - law.mean) * (-law.log_std).exp()) ** 2 - law.log_std).sum(dim=1)
-
-    assert float(a.divergence(b)) == pytest.approx(float((log_density(a) - log_density(b)).mean()), abs=0.03)
-    assert float(a.divergence(a)) == 0
 
 
 @pytest.mark.parametrize("size", [0.02, 0.008])
@@ -156,7 +148,7 @@ def test_crops_do_not_depend_on_the_size_of_the_image(completer):
     """Of a long box whose right part is hidden now, as much is remembered whatever the number of its pixels."""
     long, occluder = ((8, 34, 0), (53, 42, 8)), ((26, 22, 0), (56, 25, 24))
     found = []
-    for width in (320, 640, 1280):
+    for width in (320, 960):
         frames = [frame_of(boxes(long), width), frame_of(boxes(long, occluder), width)]
         masks = [masks_of(boxes(*shown), f)[0] for shown, f in (((long,), frames[0]), ((long, occluder), frames[1]))]
         views = completer.complete_each([None], frames[0], [masks[0]], GRID, [()])[0].views
@@ -167,34 +159,22 @@ def test_crops_do_not_depend_on_the_size_of_the_image(completer):
     assert np.abs(np.array(found) - found[0]).max() <= 1
 
 
-def test_wrong_models(tmp_path, frame):
-    net = CompletionNet(len(CHANNELS), 8, 4)
-    tensors = {name: t.numpy() for name, t in net.state_dict().items()}
-    mask = [np.ones(frame.depth.shape, bool)]
-
-    def complete(name: str) -> None:
-        NetworkCompleter(weights=str(tmp_path / name)).complete(np.random.default_rng(0), frame, mask, GRID)
-
-    write_model(tmp_path / "narrow", describe(width=16), tensors)
-    with pytest.raises(InputError, match="the architecture has"):
-        complete("narrow")
-    write_model(tmp_path / "channels", describe(channels=["a"]), tensors)
-    with pytest.raises(InputError, match="channels"):
-        complete("channels")
-    write_model(tmp_path / "bare", {"architecture": ARCHITECTURE}, tensors)
-    with pytest.raises(InputError, match=r"model\.toml"):
-        complete("bare")
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (describe(width=16), "the architecture has"),
+        (describe(channels=["a"]), "channels"),
+        ({"architecture": ARCHITECTURE}, r"model\.toml"),
+    ],
+)
+def test_wrong_models(tmp_path, model, message):
+    tensors = CompletionNet(len(CHANNELS), 8, 4).state_dict()
+    write_model(tmp_path / "model", model, {name: t.numpy() for name, t in tensors.items()})
+    with pytest.raises(InputError, match=message):
+        NetworkCompleter(weights=str(tmp_path / "model")).check_files(None)
 
 
-def test_robot_pixels_are_unknown(completer, frame):
-    """A mask under the robot has no evidence, and a frame with a robot differs from one without."""
-    hidden = Frame(frame.rgb, frame.depth, frame.camera, np.ones(frame.depth.shape, bool))
-    mask = masks_of(STACK, frame)[0]
-    assert completer.complete(np.random.default_rng(0), hidden, [mask], GRID)[0].probability.size == 0
-
-
-@pytest.mark.parametrize("below", [7, 40])
-def test_a_grid_may_start_below_the_table(completer, frame, below):
+def test_a_grid_may_start_below_the_table(completer, frame, below=7):
     """The same completions as on a grid that starts at the table, and nothing below it."""
     low = VoxelGrid((-0.3, -0.3, -0.01 * below), 0.01, (60, 60, 30 + below))
     masks, rngs = masks_of(STACK, frame), [np.random.default_rng(0)] * 2
@@ -203,11 +183,3 @@ def test_a_grid_may_start_below_the_table(completer, frame, below):
         assert not found[:, :, :below].any()
         # Readings on the border of two voxels can change sides by rounding.
         assert (np.abs(found[:, :, below:] - placed(one)) > 1e-3).mean() < 1e-2
-
-
-def test_crops_of_grids_that_start_above_or_below_the_table():
-    voxels = np.argwhere(np.ones((10, 10, 12), bool)) + (20, 20, 0)
-    for lowest, first, last in ((0, 0, 32), (6, 0, 32), (-7, 7, 39), (-40, 40, 60)):
-        grid = VoxelGrid((-0.3, -0.3, 0.01 * lowest), 0.01, (60, 60, 60))
-        low, high = crop_box(voxels + (0, 0, first), grid)
-        assert (low[2], high[2]) == (first, last)

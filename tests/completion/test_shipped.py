@@ -11,6 +11,7 @@ from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
 from mstfilter.resources import models_folder
+from mstfilter.scene import Seen
 
 SEED = 99  # of no training
 
@@ -25,7 +26,7 @@ def test_better_than_extrusion_on_new_scenes(samples):
     """About 100 masks of three scenes; on the 50 test scenes of the card the difference is of a similar size."""
     boxes = [samples.box(k) for k in range(len(samples))]
     p = np.stack(NetworkCompleter().fill_many([np.random.default_rng(0)] * len(boxes), boxes))
-    p[(samples.bits & 4) > 0] = 0
+    p[Seen.FREE.among(samples.bits)] = 0
     found, rule = shape_iou(p >= 0.5, samples.truth), shape_iou(extruded(samples.bits), samples.truth)
     assert found.mean() > rule.mean() + 0.02
     # Probabilities come true: of the voxels forecast near p, a share near p is filled.

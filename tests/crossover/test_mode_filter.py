@@ -35,7 +35,7 @@ grids = hnp.arrays(np.uint16, (7, 6, 5), elements=st.sampled_from([0, 0, 0, 1, 1
 
 
 @settings(max_examples=60, deadline=None)
-@given(grids, st.sampled_from([1, 3, 5]), st.integers(1, 4), st.integers(5, 125))
+@given(grids, st.sampled_from([1, 3, 5, 7, 11]), st.integers(1, 4), st.integers(5, 125))
 def test_one_sweep_against_loops(labels, window, margin, isolation):
     one = ModeFilter(window, margin, isolation, max_sweeps=1)
     expected = by_loops(labels, window, margin, isolation) if window > 1 else labels
@@ -55,23 +55,6 @@ def test_sweep_after_sweep_against_loops(seed):
         expected = by_loops(expected, window, margin, isolation)
         filter = ModeFilter(window, margin, isolation, max_sweeps=sweeps)
         np.testing.assert_array_equal(filter.apply(labels), expected)
-
-
-def test_a_large_window():
-    """More cells than a byte counts; wider than the grid."""
-    labels = np.random.default_rng(0).choice([0, 1, 1, 2, 9], (7, 6, 5)).astype(np.uint16)
-    for window in (7, 11):
-        expected = by_loops(labels, window, 3, 120)
-        np.testing.assert_array_equal(ModeFilter(window, 3, 120, max_sweeps=1).apply(labels), expected)
-
-
-@settings(max_examples=30, deadline=None)
-@given(grids)
-def test_the_result_is_a_fixed_point_or_the_bound_is_met(labels):
-    filter = ModeFilter(window=3, margin=2, isolation=24)
-    out = filter.apply(labels)
-    np.testing.assert_array_equal(filter.apply(out), out)
-    np.testing.assert_array_equal(filter.apply(labels), out)
 
 
 def test_the_authors_real_estimates_are_fixed_points(shared_data):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ pytest.importorskip("rosbags", reason="rosbags absent: pip install -e '.[bags]'"
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_bag(tmp_path, kind):
     path = write(tmp_path / "session", kind, scene_messages(kind == "bag"))
+    if kind == "mcap":  # the file itself, without the folder that ROS 2 puts around it
+        (path,) = path.glob("*.mcap")
     assert Bag.detects(path)
     recording = Bag(world=WORLD).open(path)
     same_frames(recording, SHIFTS)
@@ -30,16 +33,10 @@ def test_every_kind_of_bag(tmp_path, kind):
     assert open_recording(save_recording(recording, tmp_path / "out")).key == recording.key
 
 
-def test_a_bare_mcap_file(tmp_path):
-    """The .mcap itself, without the folder that ROS 2 puts around it."""
-    folder = write(tmp_path / "session", "mcap", scene_messages(False, (0, 1)))
-    file = next(folder.glob("*.mcap"))
-    assert Bag.detects(file)
-    same_frames(Bag(pauses=Ends(), world=WORLD).open(file), (0, 1))
-
-
-@pytest.mark.parametrize("depth", ["32FC1", "mono16", "compressed 16UC1", "compressed 32FC1"])
-@pytest.mark.parametrize("colour", ["bgr8", "compressed"])
+@pytest.mark.parametrize(
+    ("depth", "colour"),
+    [("32FC1", "bgr8"), ("mono16", "compressed"), ("compressed 16UC1", "bgr8"), ("compressed 32FC1", "compressed")],
+)
 def test_encodings(tmp_path, depth, colour):
     path = write(tmp_path / "s", "db3", scene_messages(False, (0, 3), depth=depth, colour=colour))
     recording = Bag(pauses=Ends(), world=WORLD).open(path)
@@ -88,6 +85,8 @@ def test_registered_depth_is_the_default(tmp_path):
     same_frames(Bag(pauses=Ends(), world=WORLD).open(path), (0, 0))
     with pytest.raises(InputError, match="differ in size"):
         Bag(depth="/camera/depth/image_rect_raw").open(path)
+    other = with_messages(frame="camera_depth_optical_frame")(tmp_path / "other")
+    same_frames(Bag(registered=True, pauses=Ends(), world=WORLD).open(other), (0, 1))
 
 
 def test_the_lens_of_the_camera_info_is_used(tmp_path):
@@ -113,23 +112,15 @@ def two_colours(path):
     return write(path, "db3", messages + again)
 
 
-def other_matrix(path):
-    make, messages = Messages(False), scene_messages(False, (0, 1))
-    info = make.info(0.0, k=(100.0, 100.0, 80.0, 60.0))
-    return write(path, "db3", [*messages, (topic_info(DEPTH), 1700000000.0, info)])
+def with_info(topic, **change):
+    """The scene with another CameraInfo of a topic."""
 
+    def make(path):
+        messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(topic)]
+        info = Messages(False).info(0.0, **change)
+        return write(path, "db3", [*messages, (topic_info(topic), 1700000000.0, info)])
 
-def other_model(path):
-    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(COLOUR)]
-    info = Messages(False).info(0.0, d=(0.1, 0.1, 0.1, 0.1), model="equidistant")
-    return write(path, "db3", [*messages, (topic_info(COLOUR), 1700000000.0, info)])
-
-
-def uncalibrated(path):
-    messages = [m for m in scene_messages(False, (0, 1)) if m[0] != topic_info(COLOUR)]
-    return write(
-        path, "db3", [*messages, (topic_info(COLOUR), 1700000000.0, Messages(False).info(0.0, k=(0, 0, 0, 0)))]
-    )
+    return make
 
 
 def truncated(kind, share):
@@ -158,11 +149,10 @@ FAULTS = {
     "two colours": (two_colours, Bag(), "2 topics could be colour"),
     "sizes differ": (small_depth, Bag(), "differ in size: depth is not registered"),
     "other frame": (with_messages(frame="camera_depth_optical_frame"), Bag(), "not registered"),
-    "other matrix": (other_matrix, Bag(), "camera matrices .* differ"),
-    "fisheye": (other_model, Bag(), "'equidistant'"),
-    "not calibrated": (uncalibrated, Bag(), "not calibrated"),
+    "other matrix": (with_info(DEPTH, k=(100.0, 100.0, 80.0, 60.0)), Bag(), "camera matrices .* differ"),
+    "fisheye": (with_info(COLOUR, d=(0.1,) * 4, model="equidistant"), Bag(), "'equidistant'"),
+    "not calibrated": (with_info(COLOUR, k=(0, 0, 0, 0)), Bag(), "not calibrated"),
     "1 km away": (with_messages(), Bag(depth_scale=1.2), "median of"),
-    "1 mm away": (with_messages(), Bag(depth_scale=1e-6), "median of"),
     "never together": (with_messages(lag=0.05), Bag(), "0.05 s apart"),
     "truncated bag": (truncated("bag", 0.6), Bag(), "bag cannot be read"),
     "truncated mcap": (truncated("mcap", 0.6), Bag(), "bag cannot be read"),
@@ -192,11 +182,6 @@ def test_ambiguous_topics_are_listed(tmp_path):
     same_frames(Bag(colour="/left" + COLOUR, K=K, pauses=Ends(), world=WORLD).open(path), (0, 1))
 
 
-def test_depth_can_be_declared_registered(tmp_path):
-    path = with_messages(frame="camera_depth_optical_frame")(tmp_path / "session")
-    same_frames(Bag(registered=True, pauses=Ends(), world=WORLD).open(path), (0, 1))
-
-
 def test_images_are_paired_by_the_stamps_of_their_headers(tmp_path):
     """Also if messages were logged late; lost messages give a warning."""
     rng = np.random.default_rng(1)
@@ -212,8 +197,6 @@ def test_images_are_paired_by_the_stamps_of_their_headers(tmp_path):
 
 
 def test_without_rosbags(tmp_path, monkeypatch):
-    import sys
-
     path = with_messages()(tmp_path / "session")
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(InputError, match="need rosbags") as caught:

@@ -32,7 +32,8 @@ from mstfilter.frontends.mask_files import decode_rle
 from mstfilter.presets import preset
 from mstfilter.scene import render, scene_cache, write_image
 from mstfilter.segmentation import ExactCuts, ObjectRule, OptimalCut, TreeCutProposal, UcmTree
-from mstfilter.testing import ProposalContract, scene_example
+from mstfilter.smc.testing import ProposalContract
+from mstfilter.testing import scene_example
 from mstfilter.testing.scenes import _labels
 from tests.segmentation.scenes import GRID, boxes, clip_of
 

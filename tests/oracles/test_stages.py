@@ -6,10 +6,9 @@ import tomllib
 
 import pytest
 
-from mstfilter import oracles
 from mstfilter.oracles import uses_truth
 from mstfilter.oracles.stages import STAGES
-from mstfilter.presets import REGISTRY, build_filter, describe_filter, load_config
+from mstfilter.presets import build_filter, describe_filter, load_config
 from tests.baselines.test_presets import differences
 from tests.conftest import REPOSITORY
 
@@ -76,13 +75,3 @@ def test_the_experiment_has_all_arms():
     data = tomllib.loads((REPOSITORY / "experiments/error_budget/study.toml").read_text())
     assert {arm["name"]: tuple(arm.get("set", ())) for arm in data["arms"]} == arms
     assert data["reference"] == "mst"
-
-
-def test_every_oracle_has_a_name_and_comes_back_from_its_description():
-    for kind, names in oracles.__components__.items():
-        for name in names:
-            assert name.startswith("true_")
-            component = REGISTRY.build(kind, name)
-            described_ = REGISTRY.describe(component)
-            assert described_["component"] == name
-            assert REGISTRY.build(kind, described_) == component

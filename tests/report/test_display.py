@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from html.parser import HTMLParser
-
 import numpy as np
 import pytest
 
@@ -27,6 +24,7 @@ from mstfilter.smc import (
     run_many,
 )
 from mstfilter.testing import scene_example
+from tests.report.pages import check_html
 from tests.scene.scenes import CAMERA, table_scene
 
 MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
@@ -63,32 +61,6 @@ OBJECTS = {
     "filter": NUMBERS,
     "preset": mstfilter.preset("mst"),
 }
-
-
-class Checked(HTMLParser):
-    """Fails if an element is not closed or anything is loaded from elsewhere."""
-
-    def __init__(self):
-        super().__init__()
-        self.open = []
-
-    def handle_starttag(self, tag, attrs):
-        for name, value in attrs:
-            if name in ("src", "href"):
-                assert value.startswith("data:"), value
-        if tag not in ("img", "meta", "br"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
-def check_html(text):
-    parser = Checked()
-    parser.feed(text)
-    parser.close()
-    assert parser.open == []
-    assert not re.search(r"https?://|import\(|fetch\(|@import", text)
 
 
 @pytest.mark.parametrize("name", OBJECTS)

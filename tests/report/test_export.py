@@ -98,11 +98,10 @@ def test_the_same_hypothesis_gives_the_same_file(o3d, tmp_path, ending):
     assert export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes() == first
 
 
-@pytest.mark.parametrize("ending", MESH_FORMATS)
-def test_a_smooth_ball_is_rounder_than_a_blocky_one(o3d, tmp_path, ending):
+def test_a_smooth_ball_is_rounder_than_a_blocky_one(o3d, tmp_path):
     deviation = {}
     for style in ("blocky", "smooth"):
-        path = export_mesh(ball(), tmp_path / f"{style}.{ending}", style=style)
+        path = export_mesh(ball(), tmp_path / f"{style}.ply", style=style)
         (mesh,) = objects_of(o3d, path).values()
         assert mesh.is_watertight()
         centre = np.array([-0.1, 0.2, 0.0]) + 8 * 0.01
@@ -162,6 +161,6 @@ def test_without_open3d_the_report_is_written_and_an_export_is_one_clear_error(t
     run = make_run(tmp_path / "run", pauses=1)
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert write_report(run).is_file()
-    with pytest.raises(MissingLibraryError, match="open3d cannot be imported"):
+    with pytest.raises(MissingLibraryError, match="needs open3d, which cannot be imported"):
         export_run(run, tmp_path / "out")
     assert not (tmp_path / "out").exists()

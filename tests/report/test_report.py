@@ -7,7 +7,6 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -20,45 +19,8 @@ from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scene import Hypothesis, project, render
 from mstfilter.scoring import BeliefScore, read_truth, score_pauses, weighted_coverage
 from mstfilter.smc import Key, Population, State, save_state
+from tests.report.pages import Page
 from tests.report.runs import CAMERA, GRID, labels_of, make_run, recording, truth_at
-
-
-class Page(HTMLParser):
-    """Checks that tags match; collects text, ids and whatever is referred to."""
-
-    VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
-
-    def __init__(self, text):
-        super().__init__()
-        self.stack, self.tags, self.ids, self.links, self.words = [], [], [], [], []
-        self.feed(text)
-        self.close()
-        assert not self.stack, self.stack
-        self.text = " ".join(" ".join(self.words).split())
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self._note(attrs)
-        if tag not in self.VOID:
-            self.stack.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append(tag)
-        self._note(attrs)
-
-    def handle_endtag(self, tag):
-        assert self.stack.pop() == tag
-
-    def handle_data(self, data):
-        if self.stack and self.stack[-1] != "style":
-            self.words.append(data)
-
-    def _note(self, attrs):
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(value)
-            if name in ("href", "src", "xlink:href", "srcset", "action", "data"):
-                self.links.append(value)
 
 
 def read(path):

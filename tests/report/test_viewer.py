@@ -19,8 +19,8 @@ from mstfilter.report import recording_page, run_page, viewer
 from mstfilter.report.pictures import colour
 from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
 from mstfilter.testing import scene_example
+from tests.report.pages import check_html
 from tests.report.runs import GRID, make_run, recording, truth_at
-from tests.report.test_display import check_html
 from tests.test_cli import call
 
 LABELS = np.random.default_rng(0).integers(0, 3, (4, 3, 2))

@@ -107,17 +107,13 @@ def test_values_on_disk_are_found_bit_for_bit(tmp_path, name, value):
             assert a.text == b.text
 
 
-def test_hits_are_counted_on_disk_and_in_memory(tmp_path):
-    get(tmp_path, "array", 1, lambda: np.zeros(1))
+def test_key_version_and_type_separate_entries(tmp_path):
+    get(tmp_path, "array", (1,), lambda: np.zeros(1))
     cache = Cache()
     with cache.on_disk(tmp_path, 10**6, "1"):
         for _ in range(3):
-            cache.get("array", 1, fail, stored_as=np.ndarray)
-    assert cache.hits == {"array": 3}
-
-
-def test_key_version_and_type_separate_entries(tmp_path):
-    get(tmp_path, "array", (1,), lambda: np.zeros(1))
+            cache.get("array", (1,), fail, stored_as=np.ndarray)
+    assert cache.hits == {"array": 3}  # on disk and in memory
     assert get(tmp_path, "array", (2,), lambda: np.ones(1))[0] == 1
     assert get(tmp_path, "array", (1,), lambda: np.full(1, 5.0), version="2")[0] == 5
     assert get(tmp_path, "array", (1,), fail)[0] == 0
@@ -225,19 +221,17 @@ def test_threads_and_processes_use_one_folder(tmp_path):
     assert disk.find("array", "last", np.ndarray) is not None
 
 
-def test_a_folder_that_cannot_be_written_stores_nothing(tmp_path):
+def test_a_folder_that_cannot_be_written_and_a_full_disk_store_nothing(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     folder = tmp_path / "file" / "below"
     assert get(folder, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
 
-
-def test_a_full_disk_stores_nothing(tmp_path, monkeypatch):
     def full(*args, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(diskcache.Cache, "set", full)
-    assert get(tmp_path, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(diskcache.Cache, "set", full)
+        assert get(tmp_path, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
     assert get(tmp_path, "array", 1, lambda: np.zeros(2)).tolist() == [0, 0]
 
 

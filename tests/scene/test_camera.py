@@ -96,6 +96,10 @@ def test_frames_are_checked_and_read_only():
     assert frame.valid.sum() == 480 * 640 - 3 - 640
     with pytest.raises(ValueError, match="read-only"):
         frame.depth[3, 3] = 1
+    rgb[0, 0], robot[6] = 9, True
+    assert not frame.rgb[0, 0].any() and not frame.robot_mask[6].any()  # the caller's arrays are copied
+    assert np.shares_memory(Frame(frame.rgb, frame.depth, CAMERA).rgb, frame.rgb)  # read-only memory is shared
+    rgb[0, 0], robot[6] = 0, False
     assert frame.key == Frame(rgb.copy(), depth.copy(), CAMERA, robot).key
     assert frame.key != Frame(rgb, depth, CAMERA).key
     for wrong, message in (

@@ -6,7 +6,6 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
@@ -16,70 +15,43 @@ from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene
 from tests.test_cli import call
 
-ELSEWHERE = VoxelGrid((3.0, 3.0, 0.0), 0.01, (60, 60, 30))
 
-
-def arrays(grid, pose=CAMERA.pose, noise=None):
+def arrays(grid, noise=None, **named):
     rgb, depth, _ = table_scene(noise=noise)
-    return Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=pose, grid=grid)
+    return Recording.from_arrays(rgb, depth, **{"K": CAMERA.K, "T_world_camera": CAMERA.pose, "grid": grid, **named})
 
 
 def scaled_focal_length(factor):
     return CAMERA.K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
 
 
-def deeper(factor):
-    return lambda d: factor * d
-
-
-WRONG_DEPTH_OR_CAMERA = {
-    "a tenth of a metre": (deeper(0.1), {}, "the table is 0.078 m from the camera, expected 0.25 to 2 m"),
-    "ten metres": (deeper(10), {}, "the table is 7.97 m"),
-    "half the scale, known pose": (deeper(0.5), {"T_world_camera": CAMERA.pose}, "at z = 0.250 m, expected z = 0"),
+# Further cases, in Python alone, are in tests/wrong_inputs.py.
+ERRORS = {
     "focal length that contradicts the plane": (
-        deeper(1),
-        {"K": scaled_focal_length(0.8), "T_world_camera": CAMERA.pose},
+        {"K": scaled_focal_length(0.8), "grid": None},
         # The camera looks at (0, 0, 0.03) from (0, -0.6, 0.5). The gradient of disparity is measured, so the tangent
         # of the angle between axis and normal, 0.6 / 0.47, is scaled by 0.8: atan(1.277) - atan(1.021) = 6.3 degrees.
         "tilted by 6.",
     ),
-    "voxels of a metre": (deeper(1), {"grid": VoxelGrid((-2, -2, 0.0), 1.0, (4, 4, 1))}, "edges of 1 m"),
-    "a wall": (np.ones_like, {}, "all depth readings of the first pause are 1 m"),
-    "a misplaced workspace": (deeper(1), {"grid": ELSEWHERE, "T_world_camera": CAMERA.pose}, "has no reading above"),
     "a workspace above the objects": (
-        deeper(1),
-        {"grid": VoxelGrid((-0.3, -0.3, 0.2), 0.01, (60, 60, 30)), "T_world_camera": CAMERA.pose},
+        {"grid": VoxelGrid((-0.3, -0.3, 0.2), 0.01, (60, 60, 30))},
         "spans x -0.30 to 0.30, y -0.30 to 0.30, z 0.20 to 0.50 m, depth readings span x -",
     ),
-    "an upside-down pose": (
-        deeper(1),
-        {"T_world_camera": RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0, 0])) * CAMERA.pose},
-        "the largest plane is tilted by 180 degrees",
-    ),
-}
-IMPLAUSIBLE = {
-    "focal length of a larger image": ({"K": scaled_focal_length(8)}, "field of view of 8.73 degrees"),
-    "focal lengths that differ": ({"K": CAMERA.K * [[1, 1, 1], [1, 2, 1], [1, 1, 1]]}, "131 and 262 pixels"),
-    "a low workspace": (
-        {"grid": VoxelGrid((-0.3, -0.3, 0.0), 0.01, (60, 60, 2)), "T_world_camera": CAMERA.pose},
-        "are above the workspace, which ends at z = 0.02 m",
-    ),
 }
 
 
-@pytest.mark.parametrize("case", WRONG_DEPTH_OR_CAMERA)
-def test_input_that_cannot_be_right_is_an_error(case, tmp_path, capsys):
-    change, named, message = WRONG_DEPTH_OR_CAMERA[case]
-    rgb, depth, _ = table_scene(noise=np.random.default_rng(0))
-    depth = change(depth).astype(np.float32)
-    arguments = {"K": CAMERA.K, **named}
+@pytest.mark.parametrize("case", ERRORS)
+def test_input_that_cannot_be_right_is_one_error(case, tmp_path, capsys):
+    named, message = ERRORS[case]
+    noise = np.random.default_rng(0)
     with pytest.raises(InputError) as caught:
-        Recording.from_arrays(rgb, depth, **arguments)
+        arrays(noise=noise, **named)
     assert message in caught.value.message
     assert caught.value.hints
-    camera = Camera(arguments["K"], 160, 120, arguments.get("T_world_camera"))
-    with RecordingWriter(tmp_path / "r", camera, arguments.get("grid")) as writer:
-        writer.add_frame(rgb, depth, 0.0, "static")
+    with RecordingWriter(
+        tmp_path / "r", Camera(named.get("K", CAMERA.K), 160, 120, CAMERA.pose), named["grid"]
+    ) as out:
+        out.add_frame(*table_scene(noise=np.random.default_rng(0))[:2], 0.0, "static")
     code, _, err = call("run", tmp_path / "r", "--out", tmp_path / "run", capsys=capsys)
     assert code != 0
     assert err.count("error:") == 1
@@ -87,14 +59,9 @@ def test_input_that_cannot_be_right_is_an_error(case, tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("case", IMPLAUSIBLE)
-def test_implausible_input_gives_a_warning(case, tmp_path, capsys):
-    named, message = IMPLAUSIBLE[case]
-    rgb, depth, _ = table_scene(noise=np.random.default_rng(0))
-    with pytest.warns(InputWarning) as caught:
-        recording = Recording.from_arrays(rgb, depth, **{"K": CAMERA.K, **named})
-    texts = [str(one.message) for one in caught]
-    assert any(message in text for text in texts), texts
+def test_a_long_focal_length_gives_a_warning(tmp_path, capsys):
+    with pytest.warns(InputWarning, match="field of view of 8.73 degrees") as caught:
+        recording = arrays(None, np.random.default_rng(0), K=scaled_focal_length(8), T_world_camera=None)
     assert all(one.message.hints for one in caught)
     assert caught[0].filename == __file__
     with warnings.catch_warnings():
@@ -102,7 +69,7 @@ def test_implausible_input_gives_a_warning(case, tmp_path, capsys):
         save_recording(recording, tmp_path / "r")
     command = ("run", tmp_path / "r", "--preset", "floor_one_blob", "n=1", "--out", tmp_path / "run", "--no-report")
     err = call(*command, capsys=capsys)[2]
-    assert err.count(message) == 1, err
+    assert err.count("field of view of 8.73 degrees") == 1, err
     assert "hint: check" in err
 
 
@@ -121,7 +88,7 @@ def test_a_workspace_with_objects_gives_no_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for grid in (GRID, None):
-            arrays(grid, noise=np.random.default_rng(0)).check()
+            arrays(grid, np.random.default_rng(0)).check()
         # Empty at the first pause, objects at the second.
         with RecordingWriter(tmp_path / "r", CAMERA, GRID) as writer:
             for k, empty in enumerate((True, False)):
@@ -144,7 +111,7 @@ def around(degrees, distance=0.8, side=0.0):
     return look_at((side, -distance * np.cos(down) - 1e-6, distance * np.sin(down)), (0, 0, 0.03))
 
 
-@pytest.mark.parametrize("degrees", [20, 45, 60, 75, 90])
+@pytest.mark.parametrize("degrees", [20, 60, 90])
 def test_cameras_at_usual_angles_are_silent(degrees):
     images = [seen(around(degrees), shift) for shift in (0, 4)]
     with warnings.catch_warnings():

@@ -10,7 +10,7 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import VoxelGrid, render
-from mstfilter.scoring import PauseEstimate, PauseTruth, read_estimates, read_truth, score_pauses, write_scores
+from mstfilter.scoring import PauseEstimate, PauseTruth, read_estimates, read_truth, score_pauses
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (6, 1, 1))
@@ -103,13 +103,6 @@ def test_a_run_scores_as_its_own_metrics_say(tmp_path):
         q = np.array([float(m[f"quality_{row.form}"]) for m in written if int(m["pause"]) == row.pause])
         w = np.array([float(m["weight"]) for m in written if int(m["pause"]) == row.pause])
         np.testing.assert_allclose([row.mean, row.weighted, row.best], [q.mean(), w @ q, q.max()], atol=2e-6)
-    write_scores(tmp_path / "q.csv", rows)
-    table = list(csv.DictReader((tmp_path / "q.csv").open()))
-    assert len(table) == 6
-    assert float(table[0]["best"]) == pytest.approx(rows[0].best, abs=1e-6)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["q.csv", "r", "run"]
-    with pytest.raises(InputError, match="cannot write"):
-        write_scores(tmp_path / "none" / "q.csv", rows)
 
 
 def test_input_that_does_not_match_is_an_error(tmp_path):

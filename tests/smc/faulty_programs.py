@@ -39,39 +39,30 @@ FAULTY: dict = {}
 INHERENT: dict = {}
 CORRECT: dict = {}
 ALONE = "alone"
+SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 REPEATED = "when (it|the step) is repeated with the same random numbers"
 
 
+def add(table, model, ys, n, kind, guide, options, *rest):
+    """Add the filter of a program to a table; the name of the function is that of the fault."""
+    program, name = Program(model), getattr(model, "function", model).__name__
+    filter = program.guided(guide, n, **options) if guide else getattr(program, kind)(n, **options)
+    assert name not in table
+    table[name] = (filter, ys, *rest)
+    return model
+
+
 def faulty(expected, ys=YS, n=200, kind="bootstrap", guide=None, **options):
-    """Add a program to the list; the name of the function is that of the fault."""
-
-    def add(model):
-        program, name = Program(model), getattr(model, "function", model).__name__
-        filter = program.guided(guide, n, **options) if guide else getattr(program, kind)(n, **options)
-        assert name not in FAULTY
-        FAULTY[name] = (filter, ys, expected)
-        return model
-
-    return add
+    """Add a program to `FAULTY`."""
+    return lambda model: add(FAULTY, model, ys, n, kind, guide, options, expected)
 
 
-def inherent(reason, guide, ys=YS, n=200):
-    def add(model):
-        INHERENT[model.__name__] = (Program(model).guided(guide, n), ys, reason)
-        return model
-
-    return add
+def inherent(reason, guide):
+    return lambda model: add(INHERENT, model, YS, 200, "guided", guide, {}, reason)
 
 
 def correct(ys=YS, n=200, kind="bootstrap", guide=None, **options):
-    def add(model):
-        program, name = Program(model), getattr(model, "function", model).__name__
-        filter = program.guided(guide, n, **options) if guide else getattr(program, kind)(n, **options)
-        assert name not in CORRECT
-        CORRECT[name] = (filter, ys)
-        return model
-
-    return add
+    return lambda model: add(CORRECT, model, ys, n, kind, guide, options)
 
 
 def walk(previous, scale=0.6):
@@ -82,41 +73,108 @@ def seen(x, y, scale=0.5):
     observe("y", Normal(x, scale), y)
 
 
+def named(expected, programs, **options):
+    """Add programs to `FAULTY` by name."""
+    for name, program in programs.items():
+        program.__name__ = name
+        faulty(expected, **options)(program)
+
+
+def in_transition(expected, ys=YS, **functions):
+    """Programs with the transition density Normal(f(x_{t-1}), 0.6)."""
+
+    def program_of(f):
+        def program(previous, y):
+            seen(sample("x", Normal(0.0, 1.0) if previous is None else Normal(f(previous["x"]), 0.6)), y)
+
+        return program
+
+    named(expected, {name: program_of(f) for name, f in functions.items()}, ys=ys)
+
+
+def in_likelihood(expected, **functions):
+    """Programs whose observation has the density Normal(f(x), 0.5), or Normal(*f(x))."""
+
+    def program_of(f):
+        def program(previous, y):
+            found = f(walk(previous))
+            seen(*found[:1], y, *found[1:]) if isinstance(found, tuple) else seen(found, y)
+
+        return program
+
+    named(expected, {name: program_of(f) for name, f in functions.items()})
+
+
+def in_site(expected, **distributions):
+    """Programs with a second site z of the distribution f(x), which is observed."""
+
+    def program_of(f):
+        def program(previous, y):
+            x = walk(previous)
+            with np.errstate(invalid="ignore"):
+                z = sample("z", f(x))
+            seen(z + 0.0 * x, y)
+
+        return program
+
+    named(expected, {name: program_of(f) for name, f in distributions.items()})
+
+
+def in_observation(expected, value, **distributions):
+    """Programs that observe a value of the distribution f(x)."""
+
+    def program_of(f):
+        def program(previous, y):
+            observe("y", f(walk(previous)), value)
+
+        return program
+
+    named(expected, {name: program_of(f) for name, f in distributions.items()})
+
+
+def in_branch(expected, probs=(0.5, 0.5), **functions):
+    """Programs with two branches: one observes its particles v, the other f(v, x) with x of all particles."""
+
+    def program_of(f):
+        def program(previous, y):
+            x = walk(previous)
+            switch("s", np.array(probs), [lambda v: seen(v, y), lambda v: seen(f(v, x), y)], x)
+
+        return program
+
+    named(expected, {name: program_of(f) for name, f in functions.items()})
+
+
 # --- reductions over the particles --------------------------------------------------------------------------------
-@faulty(ALONE)
-def the_first_particle_for_all(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"][0], 0.6))
-    seen(x, y)
-
-
-@faulty(ALONE)
-def the_last_particle_for_all(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(0.9 * previous["x"][-1], 0.6))
-    seen(x, y)
+in_transition(
+    ALONE,
+    the_first_particle_for_all=lambda x: 0.9 * x[0],
+    the_last_particle_for_all=lambda x: 0.9 * x[-1],
+    sorted_particles=np.sort,
+    the_neighbour=lambda x: np.roll(x, 1),
+    a_median=np.median,
+    a_mean_at_later_steps_only=lambda x: x.mean() + 0.0 * x,
+)
+in_likelihood(
+    ALONE,
+    a_mean_in_the_likelihood=lambda x: 0.5 * x + 0.5 * x.mean(),
+    a_standardised_state=lambda x: (x - x.mean()) / x.std(),
+    a_maximum_decides=lambda x: (x, 2.0 if x.max() > 1.5 else 0.5),
+    any_decides=lambda x: x if not (x > 1.0).any() else x - 1.0,
+    reversed_particles=lambda x: x[::-1],
+    a_running_sum_over_particles=lambda x: 0.01 * np.cumsum(x),
+    ranks=lambda x: np.argsort(np.argsort(x)) / len(x),
+    a_dot_product_over_particles=lambda x: (x, 0.5 + 0.001 * (x @ x)),
+    the_length_of_the_population=lambda x: x.sum() / 200,
+    half_of_the_particles_differ=lambda x: np.where(np.arange(len(x)) < len(x) // 2, x, -x),
+)
+in_observation(ALONE, 1, weights_normalised_over_particles=lambda x: Bernoulli(np.exp(x) / np.exp(x).sum()))
 
 
 @faulty(ALONE)
 def a_sum_without_axis(previous, y):
     v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 1.0))
     observe("y", Normal(v.sum(), 1.0), y)
-
-
-@faulty(ALONE)
-def a_mean_in_the_likelihood(previous, y):
-    x = walk(previous)
-    seen(0.5 * x + 0.5 * x.mean(), y)
-
-
-@faulty(ALONE)
-def a_maximum_decides(previous, y):
-    x = walk(previous)
-    seen(x, y, 2.0 if x.max() > 1.5 else 0.5)
-
-
-@faulty(ALONE)
-def any_decides(previous, y):
-    x = walk(previous)
-    seen(x if not (x > 1.0).any() else x - 1.0, y)
 
 
 @faulty(ALONE)
@@ -127,53 +185,9 @@ def a_centred_state(previous, y):
 
 
 @faulty(ALONE)
-def a_standardised_state(previous, y):
-    x = walk(previous)
-    z = (x - x.mean()) / x.std()
-    seen(z, y)
-
-
-@faulty(ALONE)
 def the_spread_of_the_particles_as_noise(previous, y):
     x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(previous["x"], previous["x"].std()))
     seen(x, y)
-
-
-@faulty(ALONE)
-def sorted_particles(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(np.sort(previous["x"]), 0.6))
-    seen(x, y)
-
-
-@faulty(ALONE)
-def the_neighbour(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(np.roll(previous["x"], 1), 0.6))
-    seen(x, y)
-
-
-@faulty(ALONE)
-def reversed_particles(previous, y):
-    x = walk(previous)
-    seen(x[::-1], y)
-
-
-@faulty(ALONE)
-def a_running_sum_over_particles(previous, y):
-    x = walk(previous)
-    seen(0.01 * np.cumsum(x), y)
-
-
-@faulty(ALONE)
-def ranks(previous, y):
-    x = walk(previous)
-    seen(np.argsort(np.argsort(x)) / len(x), y)
-
-
-@faulty(ALONE)
-def weights_normalised_over_particles(previous, y):
-    x = walk(previous)
-    w = np.exp(x) / np.exp(x).sum()
-    observe("y", Bernoulli(w), 1)
 
 
 @faulty(ALONE)
@@ -185,39 +199,15 @@ def probabilities_normalised_over_particles(previous, y):
 
 
 @faulty(ALONE)
-def a_dot_product_over_particles(previous, y):
-    x = walk(previous)
-    seen(x, y, 0.5 + 0.001 * (x @ x))
-
-
-@faulty(ALONE)
 def the_covariance_of_the_particles(previous, y):
     v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 0.5))
     observe("y", MultivariateNormal(v, np.cov(v.T) + np.eye(2)), [y, y])
 
 
 @faulty(ALONE)
-def the_length_of_the_population(previous, y):
-    x = walk(previous)
-    seen(x.sum() / 200, y)
-
-
-@faulty(ALONE)
-def a_median(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(np.median(previous["x"]), 0.6))
-    seen(x, y)
-
-
-@faulty(ALONE)
 def the_most_frequent_regime(previous, y):
     k = sample("k", Categorical([0.4, 0.6]))
     seen(np.full(len(k), np.bincount(k).argmax()), y)
-
-
-@faulty(ALONE)
-def a_mean_at_later_steps_only(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(previous["x"].mean() + 0.0 * previous["x"], 0.6))
-    seen(x, y)
 
 
 @faulty(ALONE, ys=[0.3, None, None, 0.2])
@@ -234,12 +224,6 @@ def a_mean_in_an_auxiliary_filter(previous, y):
 @faulty(ALONE, kind="resample_move")
 def a_mean_in_a_resample_move_filter(previous, y):
     seen(walk(previous).mean(), y)
-
-
-@faulty(ALONE)
-def half_of_the_particles_differ(previous, y):
-    x = walk(previous)
-    seen(np.where(np.arange(len(x)) < len(x) // 2, x, -x), y)
 
 
 @faulty(ALONE)
@@ -307,48 +291,24 @@ def draws_of_numpy(previous, y):
     return {"x": x}
 
 
-GENERATOR = np.random.default_rng(1)
+GENERATOR, COUNT = np.random.default_rng(1), itertools.count()
 
 
-@faulty(REPEATED)
-def draws_of_another_generator(previous, y):
-    x = walk(previous)
-    seen(x + 0.3 * GENERATOR.standard_normal(len(x)), y)
+def kept_values(x, kept=[]):
+    kept.append(x)
+    return kept
 
 
-@faulty(ALONE)
-def draws_of_a_new_generator(previous, y):
-    x = walk(previous)
-    seen(x + 0.3 * np.random.default_rng(0).standard_normal(len(x)), y)
-
-
-@faulty(REPEATED)
-def draws_of_scipy(previous, y):
-    x = walk(previous)
-    seen(x + stats.norm.rvs(size=len(x)), y)
-
-
-@faulty(REPEATED)
-def draws_of_the_standard_library(previous, y):
-    x = walk(previous)
-    seen(x, y, 0.5 + random.random())
-
-
-@faulty(REPEATED)
-def the_time(previous, y):
-    x = walk(previous)
-    seen(x, y, 0.5 + time.perf_counter() % 1.0)
-
-
-COUNT = itertools.count()
-
-
-@faulty(REPEATED)
-def a_counter(previous, y):
-    x = walk(previous)
-    seen(x, y, 0.5 + 0.1 * next(COUNT))
-
-
+in_likelihood(
+    REPEATED,
+    draws_of_another_generator=lambda x: x + 0.3 * GENERATOR.standard_normal(len(x)),
+    draws_of_scipy=lambda x: x + stats.norm.rvs(size=len(x)),
+    draws_of_the_standard_library=lambda x: (x, 0.5 + random.random()),
+    the_time=lambda x: (x, 0.5 + time.perf_counter() % 1.0),
+    a_counter=lambda x: (x, 0.5 + 0.1 * next(COUNT)),
+    a_mutable_default=lambda x: x + 0.1 * len(kept_values(x)),
+)
+in_likelihood(ALONE, draws_of_a_new_generator=lambda x: x + 0.3 * np.random.default_rng(0).standard_normal(len(x)))
 LAST: dict = {"x": 0.0}
 
 
@@ -384,104 +344,34 @@ def a_changed_observation(previous, y):
     observe("y", Normal(v, 1.0), y)
 
 
-@faulty(REPEATED)
-def a_mutable_default(previous, y):
-    x = walk(previous)
-    seen(x + 0.1 * len(kept_values(x)), y)
-
-
-def kept_values(x, kept=[]):
-    kept.append(x)
-    return kept
-
-
 # --- parameters out of range, in some rows ------------------------------------------------------------------------
-@faulty(r"p of a Bernoulli is 1\.\d+ in row")
-def a_probability_above_one(previous, y):
-    x = walk(previous)
-    k = sample("k", Bernoulli(0.8 + 0.5 * abs(x)))
-    seen(k * x, y)
-
-
-@faulty(r"p of a Bernoulli is \S+ in row")
-def a_negative_probability(previous, y):
-    observe("y", Bernoulli(walk(previous)), 1)
-
-
-@faulty(r"scale of a Normal is -\S+ in row")
-def a_negative_scale(previous, y):
-    x = walk(previous)
-    z = sample("z", Normal(0.0, x))
-    seen(z, y)
-
-
-@faulty(r"scale of a Normal is 0\.0 in row")
-def a_scale_of_zero(previous, y):
-    x = walk(previous)
-    seen(sample("z", Normal(x, np.maximum(x, 0.0))), y)
-
-
-@faulty(r"loc of a Normal is nan in row")
-def a_location_of_nan(previous, y):
-    x = walk(previous)
-    with np.errstate(invalid="ignore"):
-        z = sample("z", Normal(np.sqrt(x), 1.0))
-    seen(x, y)
-    return {"w": z}
-
-
-@faulty(r"high of a Uniform is \S+ in row")
-def an_empty_interval(previous, y):
-    x = walk(previous)
-    seen(sample("z", Uniform(0.0, x)), y)
-
-
-@faulty("shape of a Gamma is -")
-def a_negative_shape(previous, y):
-    observe("y", Gamma(walk(previous), 1.0), abs(y))
-
-
-@faulty("df of a Student is -")
-def negative_degrees_of_freedom(previous, y):
-    seen(sample("z", Student(walk(previous), 0.0, 1.0)), y)
-
-
-@faulty("rate of a Poisson is -")
-def a_negative_rate(previous, y):
-    observe("y", Poisson(walk(previous)), 0)
-
-
-@faulty("probabilities of a categorical are .* in row")
-def negative_probabilities(previous, y):
-    x = walk(previous)
-    observe("y", Categorical(np.stack([0.5 + x, 0.5 - x], axis=1)), 1)
-
-
-@faulty("covariance is not positive definite in row")
-def a_covariance_of_a_row(previous, y):
-    x = walk(previous)
-    cov = np.eye(2) + x[:, None, None] * np.array([[0.0, 1.0], [1.0, 0.0]])
-    observe("y", MultivariateNormal(np.zeros((1, 2)), cov), [y, y])
+in_site(r"p of a Bernoulli is 1\.\d+ in row", a_probability_above_one=lambda x: Bernoulli(0.8 + 0.5 * abs(x)))
+in_site(r"scale of a Normal is -\S+ in row", a_negative_scale=lambda x: Normal(0.0, x))
+in_site(r"scale of a Normal is 0\.0 in row", a_scale_of_zero=lambda x: Normal(x, np.maximum(x, 0.0)))
+in_site("loc of a Normal is nan in row", a_location_of_nan=lambda x: Normal(np.sqrt(x), 1.0))
+in_site(r"high of a Uniform is \S+ in row", an_empty_interval=lambda x: Uniform(0.0, x))
+in_site("df of a Student is -", negative_degrees_of_freedom=lambda x: Student(x, 0.0, 1.0))
+in_site("Domain error|is NaN|nan", a_negative_scale_of_scipy=lambda x: stats.norm(0.0, x))
+in_site("is NaN", a_negative_scale_of_new_scipy=lambda x: stats.Normal(mu=0.0, sigma=x))
+in_observation(r"p of a Bernoulli is \S+ in row", 1, a_negative_probability=Bernoulli)
+in_observation("shape of a Gamma is -", 0.3, a_negative_shape=lambda x: Gamma(x, 1.0))
+in_observation("rate of a Poisson is -", 0, a_negative_rate=Poisson)
+in_observation(
+    "probabilities of a categorical are .* in row",
+    1,
+    negative_probabilities=lambda x: Categorical(np.stack([0.5 + x, 0.5 - x], axis=1)),
+)
+in_observation(
+    "covariance is not positive definite in row",
+    [0.3, 0.3],
+    a_covariance_of_a_row=lambda x: MultivariateNormal(np.zeros((1, 2)), np.eye(2) + x[:, None, None] * SWAP),
+)
 
 
 @faulty("covariance is not symmetric")
 def an_asymmetric_covariance(previous, y):
     v = sample("v", MultivariateNormal([0.0, 0.0], [[1.0, 0.8], [0.0, 1.0]]))
     observe("y", Normal(v, 1.0), [y, y])
-
-
-@faulty("Domain error|is NaN|nan")
-def a_negative_scale_of_scipy(previous, y):
-    x = walk(previous)
-    seen(sample("z", stats.norm(0.0, x)), y)
-
-
-@faulty("is NaN")
-def a_negative_scale_of_new_scipy(previous, y):
-    x = walk(previous)
-    z = sample("z", stats.Normal(mu=0.0, sigma=x))
-    seen(x, y)
-    return {"w": z}
 
 
 def draw_jump():
@@ -720,22 +610,12 @@ def an_argument_in_another_order(previous, y):
     switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(-v, y)], x[::-1])
 
 
-@faulty(ALONE)
-def a_branch_reduces_values_of_all(previous, y):
-    x = walk(previous)
-    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(x.mean() + 0.0 * v, y)], x)
-
-
-@faulty(ALONE)
-def a_branch_takes_the_first_rows_of_all(previous, y):
-    x = walk(previous)
-    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(x[: len(v)], y)], x)
-
-
-@faulty(ALONE)
-def a_rare_branch_reduces(previous, y):
-    x = walk(previous)
-    switch("s", [0.95, 0.05], [lambda v: seen(v, y), lambda v: seen(v - v.mean(), y)], x)
+in_branch(
+    ALONE,
+    a_branch_reduces_values_of_all=lambda v, x: x.mean() + 0.0 * v,
+    a_branch_takes_the_first_rows_of_all=lambda v, x: x[: len(v)],
+)
+in_branch(ALONE, (0.95, 0.05), a_rare_branch_reduces=lambda v, x: v - v.mean())
 
 
 @faulty(ALONE)

@@ -1,12 +1,12 @@
 """The run that `test_running` kills: ``killed.py KIND PATH``. It continues from what PATH holds.
 
-`checkpoint` is one run with a checkpoint file; `run_many` stores finished runs of two filters in a folder; `batch` is
-`run_many` where it runs many seeds at once.
+`checkpoint` is one run with a checkpoint file; `run_many` stores finished runs of two filters in a folder.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from mstfilter.smc import (
     Normal,
     StateSpaceModel,
     bootstrap,
-    ess,
     linear_gaussian,
     log_evidence,
     mean,
@@ -33,9 +32,9 @@ def run(kind: str, path: Path) -> None:
     if kind == "checkpoint":
         bootstrap(MODEL, 2000).run(OBSERVATIONS, 3, checkpoint=path)
         return
-    arms = {"systematic": bootstrap(LINEAR, 500), "multinomial": bootstrap(LINEAR, 500, Multinomial())}
-    collectors = {"log_evidence": log_evidence, **({"ess": ess} if kind == "batch" else {"mean": mean})}
-    history = run_many(arms, OBSERVATIONS, range(8), folder=path, **collectors)
+    model = replace(LINEAR, batched=False)  # runs that are processed together are stored together
+    arms = {"systematic": bootstrap(model, 500), "multinomial": bootstrap(model, 500, Multinomial())}
+    history = run_many(arms, OBSERVATIONS, range(8), folder=path, log_evidence=log_evidence, mean=mean)
     np.savez(path / "history.npz", **history)
 
 

@@ -1,15 +1,13 @@
-"""Models with exact answers: linear-Gaussian (Kalman, dense joint Gaussian) and a hidden Markov chain."""
+"""Models with exact answers, which test_exact.py checks: an AR(1) process and a hidden Markov chain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 import pytest
-from scipy import stats
 
-from mstfilter.smc import Normal, StateSpaceModel, batch
+from mstfilter.smc import Normal, StateSpaceModel, forward_backward, kalman_filter, run_many
 
 
 def filterpy_class(name: str):
@@ -52,25 +50,9 @@ def predictive(x, y):
 
 def kalman_ar1(ys):
     """(T, 2) filtered means and variances, and the log evidence. None in `ys` is a missing observation."""
-    kf = filterpy_class("KalmanFilter")(dim_x=1, dim_z=1)
-    kf.F, kf.Q, kf.H, kf.R = (np.array([[v]]) for v in (RHO, SIGMA**2, 1.0, TAU**2))
-    kf.x, kf.P = np.zeros(1), np.array([[SD0**2]])
-    total, out = 0.0, []
-    for t, y in enumerate(ys):
-        if t:
-            kf.predict()
-        if y is not None:
-            total += stats.norm(kf.x[0], np.sqrt(kf.P[0, 0] + TAU**2)).logpdf(y)
-            kf.update(y)
-        out.append((kf.x[0], kf.P[0, 0]))
-    return np.array(out), float(total)
-
-
-def dense_ar1(ys) -> float:
-    """The log evidence from the joint Gaussian of what was observed: an oracle for the oracle."""
-    seen = np.array([t for t, y in enumerate(ys) if y is not None])
-    cov = SD0**2 * RHO ** np.abs(seen[:, None] - seen) + TAU**2 * np.eye(len(seen))
-    return float(stats.multivariate_normal(np.zeros(len(seen)), cov).logpdf([ys[t] for t in seen]))
+    pytest.importorskip("filterpy.kalman")
+    found = kalman_filter([[RHO]], [[SIGMA**2]], [[1.0]], [[TAU**2]], [0.0], [[SD0**2]], ys)
+    return np.stack([found.means[:, 0], found.covariances[:, 0, 0]], axis=1), float(found.log_evidence[-1])
 
 
 # --- three-state chain with asymmetric emissions ------------------------------------------------------------------
@@ -81,29 +63,9 @@ SYMBOLS = [0, 2, 2, 1, 3, 1, 0, 2]
 
 
 def forward(symbols=SYMBOLS):
-    """Filtered marginals (T, 3) and the log evidence by the forward algorithm; None is missing."""
-    alpha, out, total = START, [], 0.0
-    for t, y in enumerate(symbols):
-        if t:
-            alpha = alpha @ MOVES
-        if y is not None:
-            alpha = alpha * EMIT[:, y]
-            total += np.log(alpha.sum())
-            alpha = alpha / alpha.sum()
-        out.append(alpha)
-    return np.array(out), float(total)
-
-
-def brute_force(symbols=SYMBOLS):
-    """The same by summing over all paths."""
-    paths = np.array(list(product(range(3), repeat=len(symbols))))
-    p = START[paths[:, 0]]
-    for t in range(len(symbols)):
-        if t:
-            p = p * MOVES[paths[:, t - 1], paths[:, t]]
-        if symbols[t] is not None:
-            p = p * EMIT[paths[:, t], symbols[t]]
-    return np.array([p[paths[:, -1] == k].sum() for k in range(3)]) / p.sum(), float(np.log(p.sum()))
+    """Filtered marginals (T, 3) and the log evidence; None is missing."""
+    found = forward_backward(START, MOVES, lambda y: _log_emit(np.arange(3), y), symbols)
+    return found.filtered, float(found.log_evidence[-1])
 
 
 @dataclass(frozen=True)
@@ -153,7 +115,7 @@ def states_of(particles) -> np.ndarray:
 
 
 def mean_ratio(filter, ys, exact, seeds):
-    """Mean of L_hat / L, its standard error, and the log evidences. Runs of `batch` equal single runs bit for bit."""
-    logs = batch(filter, ys, seeds).log_evidence[:, -1]
+    """Mean of L_hat / L, its standard error, and the log evidences."""
+    logs = run_many(filter, ys, seeds)["log_evidence"][:, -1]
     ratios = np.exp(logs - exact)
     return ratios.mean(), ratios.std(ddof=1) / np.sqrt(len(ratios)), logs

@@ -1,12 +1,13 @@
-"""Runs of a batch equal single runs bit for bit, whatever the components."""
+"""Runs that are processed together equal single runs bit for bit, or raise InputError, or are made one by one."""
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
@@ -18,37 +19,70 @@ from mstfilter.smc import (
     Multinomial,
     Never,
     Normal,
+    Poisson,
     Program,
     RandomWalkMove,
+    Reweight,
     RunGenerators,
     Ssp,
     StateSpaceModel,
     Stratified,
     Systematic,
-    Tempered,
-    batch,
-    batched_slots,
+    Uniform,
+    WithInput,
     bootstrap,
+    collect,
+    ensemble,
+    ess,
     guided,
+    hidden_markov,
+    linear_gaussian,
+    log_evidence,
+    nonlinear_gaussian,
     observe,
+    pmmh,
     resample_move,
+    resampled,
+    run_many,
     sample,
+    unique_ancestors,
 )
-from mstfilter.smc.batching import summaries
 from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key, pcg64_states
-from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, ar1_observations, hmm, optimal
+from mstfilter.smc.streams import Key, summaries
+from tests.smc.models import AR1, ar1_observations, hmm
 from tests.smc.test_particle_filter import MODEL, observations
-from tests.smc.test_streams import words_of
 
-YS = ar1_observations(8)
-SEEDS = [3, 1, 4, 1_000_003, 2**40 + 1]
-BATCHED = StateSpaceModel(
-    lambda rng, n: SD0 * rng.standard_normal(n),
-    lambda rng, x: RHO * x + SIGMA * rng.standard_normal(x.shape),
-    lambda x, y: -0.5 * ((y - x) / TAU) ** 2,
-    batched=True,
-)
+T = 5
+YS = [0.3, 1.1, -0.2, None, 0.4]
+
+
+def vectors(d, k):
+    rng = np.random.default_rng(d)
+    F, H = 0.9 * np.linalg.qr(rng.standard_normal((d, d)))[0], rng.standard_normal((k, d))
+    return F, 0.3 * np.eye(d), H, 0.5 * np.eye(k), np.zeros(d), np.eye(d)
+
+
+def raw(d, batched=True):
+    shape = (d,) if d > 1 else ()
+
+    def log_likelihood(x, y):
+        return -np.square(y - x) if d == 1 else -np.square(y - x).sum(axis=-1)
+
+    return StateSpaceModel(
+        lambda rng, n: rng.standard_normal((n, *shape)),
+        lambda rng, x: 0.9 * x + rng.standard_normal(x.shape),
+        log_likelihood,
+        batched=batched,
+    )
+
+
+def of(d):
+    if d == 1:
+        return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+    F = vectors(d, 1)[0]
+    return StateSpaceModel.of(
+        Normal(np.zeros((1, d)), 1.0), lambda x: Normal(x @ F.T, 0.5), lambda x: Normal(x[:, :1], 1.0)
+    )
 
 
 def walk(previous, y):
@@ -56,73 +90,255 @@ def walk(previous, y):
     observe("y", Normal(x, 1.0), y)
 
 
-def branching(filter):
-    return replace(filter, transition=Branching(filter.transition, 2))
+def counts(d):
+    return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Poisson(np.exp(x)))
 
 
-FILTERS = {
-    "batched": bootstrap(BATCHED, 20),
-    "always": bootstrap(BATCHED, 20, Stratified(), Always()),
-    "after": replace(bootstrap(BATCHED, 20, Ssp(), EssBelow(0.9)), resample="after"),
-    "every third": bootstrap(BATCHED, 20, Multinomial(), EveryKth(3)),
-    "many draws": bootstrap(BATCHED, 2100, Multinomial(), Always()),
-    "many strata": bootstrap(BATCHED, 1100, Stratified(), Always()),
-    "never": bootstrap(BATCHED, 20, Systematic(), Never()),
-    "rows": bootstrap(AR1, 20),
-    "guided": guided(AR1, optimal, 20),
-    "program": Program(walk).bootstrap(20),
-    "objects": bootstrap(hmm("objects"), 20),
-    "more candidates": branching(bootstrap(AR1, 20)),
-    "without duplicates": branching(bootstrap(AR1, 20, FearnheadClifford())),
-    "one by one": resample_move(AR1, RandomWalkMove(AR1, 0.5), 20),
+CHAIN = hidden_markov([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]], lambda y: -np.square(y - np.arange(2.0)))
+#: name -> filter of (n, d, k), and whether an observation is a vector of k entries.
+MODELS = {
+    "linear": lambda n, d, k: (bootstrap(linear_gaussian(*vectors(d, k)), n), True),
+    "linear scalar": lambda n, d, k: (bootstrap(linear_gaussian(*vectors(d, 1)), n), False),
+    "nonlinear": lambda n, d, k: (
+        bootstrap(nonlinear_gaussian(np.sin, np.eye(d), lambda x: x[:, :1], [[1.0]], np.zeros(d), np.eye(d)), n),
+        False,
+    ),
+    "raw": lambda n, d, k: (bootstrap(raw(1), n), False),
+    "raw vectors": lambda n, d, k: (bootstrap(raw(k), n), k > 1),
+    "of": lambda n, d, k: (bootstrap(of(1), n), False),
+    "of vectors": lambda n, d, k: (bootstrap(of(d), n), d > 1),
+    "counts": lambda n, d, k: (bootstrap(counts(1), n), False),
+    "guided": lambda n, d, k: (guided(of(1), lambda x, y: Normal(0.5 * (x + y), 1.0), n), False),
+    "chain": lambda n, d, k: (bootstrap(CHAIN, n), False),
+    "program": lambda n, d, k: (Program(walk).bootstrap(n), False),
 }
 
 
-def equal(a, b):
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
-    return all(x == y for x, y in zip(a, b, strict=True)) if isinstance(a, tuple) else np.array_equal(a, b)
+def particles(state, info):
+    """All that a step leaves, as one array."""
+    p = state.population
+    found = p.particles if isinstance(p.particles, np.ndarray) else list(p.particles.values())
+    parents = [p.parents.get(name, np.full(len(p), -1)) for name in ("previous", "ancestor")]
+    return np.concatenate([np.ravel(a) for a in (found, p.log_weights, *parents)])
 
 
-def assert_equal_to_single_runs(filter, data, seeds, runs):
+ALL = {"z": log_evidence, "ess": ess, "resampled": resampled, "ancestors": unique_ancestors, "all": particles}
+FEW = {"z": log_evidence, "ess": ess, "resampled": resampled}
+
+
+def keeps_its_promise(filter, data, seeds, paired=False, kept=ALL):
+    """Compare many runs with their single runs; whether they were made together."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            runs = run_many(filter, data, seeds, paired=paired, **kept)
+    except InputError:
+        return "raised"
     for r, seed in enumerate(seeds):
-        state = None
-        for state, info in filter.iterate(data[r], seed):
-            np.testing.assert_array_equal(runs.values["weights"][r, info.t], state.population.weights)
-            assert runs.ess[r, info.t] == info.ess
-            assert runs.log_evidence[r, info.t] == state.log_evidence
-            assert runs.resampled[r, info.t] == info.resampled
-        last = runs.state(r)
-        assert (last.t, last.key) == (state.t, state.key)
-        assert equal(last.population.particles, state.population.particles)
-        np.testing.assert_array_equal(last.population.log_weights, state.population.log_weights)
-        np.testing.assert_array_equal(last.population.parents["previous"], state.population.parents["previous"])
+        ys = data[r] if paired else data
+        if seed in runs.lost:
+            with pytest.raises(InputError) as error:
+                filter.run(ys, seed)
+            assert error.value.message == runs.lost[seed]
+            continue
+        single = collect(filter.iterate(ys, seed), **kept)
+        for name in kept:
+            np.testing.assert_array_equal(runs[name][r], single[name], err_msg=name)
+    return "single" if runs.single else "together"
+
+
+def series(rng, name, filter, vector, d, k, missing):
+    size = {"of vectors": 1}.get(name, k)
+    ys = rng.poisson(2, T).tolist() if name == "counts" else list(rng.standard_normal((T, size) if vector else T))
+    return [None if t in missing else (y if vector else float(y)) for t, y in enumerate(ys)]
+
+
+@settings(max_examples=120, deadline=None, derandomize=True)
+@given(
+    name=st.sampled_from(sorted(MODELS)),
+    shape=st.sampled_from(
+        [(3, 3, 1, 1), (2, 2, 2, 2), (4, 2, 4, 1), (3, 5, 3, 3), (5, 7, 5, 2), (6, 3, 2, 3), (1, 4, 1, 1)]
+    ),
+    missing=st.lists(st.sets(st.integers(0, T - 1), max_size=3), min_size=6, max_size=6),
+    paired=st.booleans(),
+)
+def test_correct_models_equal_single_runs(name, shape, missing, paired):
+    """Shapes are (runs, n, d, k): runs == n, runs == d, n == d, one run, and sizes that differ."""
+    n_runs, n, d, k = shape
+    filter, vector = MODELS[name](n, d, k)
+    rng = np.random.default_rng(0)
+    data = [series(rng, name, filter, vector, d, k, missing[r]) for r in range(n_runs)]
+    found = keeps_its_promise(filter, data if paired else data[0], list(range(n_runs)), paired)
+    one_gap = len({frozenset(gap) for gap in missing[:n_runs]}) == 1
+    assert found == "together" or (
+        found == "single" and paired and (name in ("program", "chain", "guided", "of vectors") or not one_gap)
+    )
+
+
+SEEDS = [3, 1, 4, 1_000_003, 2**40 + 1]
+FILTERS = {
+    "always": bootstrap(raw(1), 20, Stratified(), Always()),
+    "after": replace(bootstrap(raw(1), 20, Ssp(), EssBelow(0.9)), resample="after"),
+    "every third": bootstrap(raw(1), 20, Multinomial(), EveryKth(3)),
+    "many draws": bootstrap(raw(1), 2100, Multinomial(), Always()),
+    "many strata": bootstrap(raw(1), 1100, Stratified(), Always()),
+    "never": bootstrap(raw(1), 20, Systematic(), Never()),
+    "rows": bootstrap(AR1, 20),
+    "vectors": bootstrap(MODEL, 20, Systematic(), Always()),
+    "not batched": bootstrap(raw(1, False), 20),
+    "objects": bootstrap(hmm("objects"), 20),
+    "more candidates": replace(bootstrap(AR1, 20), transition=Branching(bootstrap(AR1, 20).transition, 2)),
+    "fewer particles": bootstrap(AR1, 20, FearnheadClifford()),
+    "moves": resample_move(AR1, RandomWalkMove(AR1, 0.5), 20),
+}
+TOGETHER = ("always", "after", "every third", "many draws", "many strata", "never", "rows", "vectors")
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_every_run_equals_its_single_run(name):
-    filter = FILTERS[name]
-    ys = [0, 2, 1, 3, 0] if name == "objects" else [*YS[:4], None, *YS[5:]]
-    runs = batch(filter, ys, SEEDS, weights=lambda p: p.weights)
-    assert_equal_to_single_runs(filter, [ys] * len(SEEDS), SEEDS, runs)
+    ys = {"objects": [0, 2, 1, 3, 0], "vectors": observations(5, 1)}.get(name, [0.3, -0.2, 1.0, None, 0.1])
+    for kept in (FEW,) if name == "objects" else (ALL, FEW):
+        found = keeps_its_promise(FILTERS[name], ys, SEEDS, kept=kept)
+        assert found == ("together" if name in TOGETHER else "single")
 
 
-def test_a_model_of_vectors_with_its_own_data_for_each_run():
-    data = [observations(6, seed) for seed in range(5)]
-    for filter in (bootstrap(MODEL, 50, Systematic(), Always()), guided(AR1, optimal, 10)):
-        ys = data if filter.n == 50 else [[float(y[0]) for y in run] for run in data]
-        assert_equal_to_single_runs(filter, ys, SEEDS, batch(filter, ys, SEEDS, True, weights=lambda p: p.weights))
-    data[2][3] = None
-    filter = bootstrap(MODEL, 50)
-    assert_equal_to_single_runs(filter, data, SEEDS, batch(filter, data, SEEDS, True, weights=lambda p: p.weights))
+def first_particle(x):
+    x = np.array(x)
+    x[0] = x.mean()
+    return x
 
 
-def test_which_components_are_called_once_per_step():
-    assert batched_slots(bootstrap(BATCHED, 5)) == ("initial", "transition", "update", "resampler")
-    assert batched_slots(bootstrap(AR1, 5, Ssp())) == ("initial", "transition", "update")
-    assert batched_slots(bootstrap(replace(AR1, batched=False), 5)) == ("resampler",)
-    assert batched_slots(bootstrap(BATCHED, 5, Tempered())) is None
-    assert batched_slots(resample_move(AR1, RandomWalkMove(AR1, 0.5), 5)) is None
+def last_run(x):
+    x = np.array(x)
+    x[-1] += len(x)
+    return x
+
+
+GOOD = raw(1)
+FAULTY = {
+    "mean of all": replace(GOOD, sample_transition=lambda rng, x: x - x.mean() + rng.standard_normal(x.shape)),
+    "first particle": replace(
+        GOOD, sample_transition=lambda rng, x: first_particle(x) + rng.standard_normal(x.shape)
+    ),
+    "last run": replace(GOOD, sample_transition=lambda rng, x: last_run(x) + rng.standard_normal(x.shape)),
+    "number of runs": replace(GOOD, sample_initial=lambda rng, n: n + rng.standard_normal(n)),
+    "neighbours": replace(GOOD, sample_transition=lambda rng, x: np.roll(x, 1) + rng.standard_normal(x.shape)),
+    "largest weight": replace(GOOD, log_likelihood=lambda x, y: -np.square(y - x) - np.square(y - x).max()),
+    "first observation": replace(GOOD, log_likelihood=lambda x, y: -np.square(np.ravel(y)[0] - x)),
+    "one number for all": replace(GOOD, sample_transition=lambda rng, x: x + rng.standard_normal()),
+    "other shape": replace(GOOD, sample_transition=lambda rng, x: x + rng.standard_normal(2 * len(x))[: len(x)]),
+    "own generator": replace(GOOD, sample_initial=lambda rng, n: np.random.default_rng(1).standard_normal(n)),
+    "a matrix": replace(GOOD, log_likelihood=lambda x, y: (-np.square(np.ravel(y)[:, None] - x)).sum(axis=0)),
+}
+
+
+@pytest.mark.parametrize("stated", [True, None], ids=["stated", "tried"])
+@pytest.mark.parametrize("name", FAULTY)
+@pytest.mark.parametrize("n_runs, n", [(4, 4), (7, 3)])
+def test_faulty_models_are_never_wrong_in_silence(name, stated, n_runs, n):
+    """A model that mixes runs raises InputError if it states that it is batched, and else is run singly."""
+    filter = bootstrap(replace(FAULTY[name], batched=stated), n)
+    data = [np.random.default_rng(r).standard_normal(T).tolist() for r in range(n_runs)]
+    found = keeps_its_promise(filter, data, list(range(n_runs)), True)
+    assert found == ("raised" if stated else "single")
+
+
+def test_an_error_names_slot_step_run_values_and_what_to_do():
+    with pytest.raises(
+        InputError, match=r"step 1, transition: the particles of run \d are .* in the batch, .* alone"
+    ) as error:
+        run_many(bootstrap(FAULTY["first particle"], 4), [0.1] * 4, range(5))
+    assert any("batched" in hint for hint in error.value.hints)
+    good, scalar = bootstrap(GOOD, 4), MODELS["linear scalar"](5, 1, 1)[0]
+    for filter, data, message in (
+        (good, [[0.1] * 4, [0.1, 0.2, float("nan"), 0.1]], "run 1, observation 2 is NaN"),
+        (
+            scalar,
+            [[0.1], [np.zeros(2)]],
+            r"seed 1: step 0, update: the observation has shape \(2,\), expected \(1,\)",
+        ),
+        (good, [YS] * 3, "3 sequences of observations for 2 seeds"),
+        (good, [YS, YS[:2]], "lengths"),
+    ):
+        with pytest.raises(InputError, match=message):
+            run_many(filter, data, range(2), paired=True)
+    with pytest.raises(ValueError, match="broadcast"):  # as a single run raises it
+        run_many(good, [[0.1] * 3, [0.1, [1.0, 2.0], 0.1]], range(2), paired=True)
+    for seeds, message in (([], "no seeds"), ([1, 2, 1], "occurs twice")):
+        with pytest.raises(InputError, match=message):
+            run_many(good, YS, seeds)
+
+
+def test_a_model_that_differs_later_only_is_found_then():
+    def later(rng, x, t):
+        return x + rng.standard_normal(x.shape) + (x.mean() if t >= 3 else 0.0)
+
+    stated = replace(GOOD, sample_transition=later)
+    with pytest.raises(InputError, match="step 5, transition"):
+        run_many(bootstrap(stated, 4), [0.1] * 6, range(5))
+    assert keeps_its_promise(bootstrap(replace(stated, batched=None), 4), [0.1] * 6, range(5)) == "single"
+
+
+def test_a_model_that_differs_at_every_third_step_is_found():
+    def periodic(rng, x, t):
+        return x + rng.standard_normal(x.shape) + (x.mean() if t % 3 == 0 else 0.0)
+
+    with pytest.raises(InputError, match="step 12, transition"):
+        run_many(bootstrap(replace(GOOD, sample_transition=periodic), 4), [0.1] * 14, range(5))
+
+
+def test_a_program_that_mixes_particles_is_named_by_its_first_batch():
+    def program(previous, y):
+        x = sample("x", Normal(0.0, 1.0))
+        observe("y", Normal(x - x.mean(), 1.0), y)
+
+    with pytest.raises(InputError, match="seed 0: step 0, initial: observation 'y': particle .* alone"):
+        run_many(Program(program).bootstrap(30), [0.5, -0.3], range(5))
+
+
+def test_an_error_with_the_runs_in_another_order_is_named():
+    def ordered(x, y):  # the first run alone and first in the batch
+        if len(x) > 4 and x[0] != FIRST[0]:
+            raise ArithmeticError("order")
+        return -np.square(y - x)
+
+    filter = bootstrap(replace(GOOD, log_likelihood=ordered), 4)
+    FIRST = filter.run([None], 0)[0].population.particles
+    with pytest.raises(InputError, match="update: a call for the runs in another order raises ArithmeticError"):
+        run_many(filter, [0.5], range(5))
+
+
+def needs_one_number(previous, y):
+    x = sample("x", Normal(0.0, 1.0))
+    observe("y", Normal(x, 1.0 if y > 0 else 2.0), y)
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_paired_programs_are_called_together_also_where_their_checks_are_due(n):
+    """The first steps of a program are checked; in a batch, the single runs that it is compared with are."""
+
+    def fresh(previous, y):
+        return walk(previous, y)
+
+    data = np.random.default_rng(0).standard_normal((3, 9)).tolist()
+    assert keeps_its_promise(Program(fresh).bootstrap(n), data, range(3), True) == "together"
+
+
+def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
+    def rounds(x, y):  # in another order for another number of rows, as matrix products of BLAS
+        return -np.square(y - x) * (1 + 1e-15 * len(x))
+
+    filter = bootstrap(replace(GOOD, log_likelihood=rounds), 4)
+    with pytest.warns(UserWarning, match="the runs of 'filter' are made one by one: update: .* by rounding"):
+        runs = run_many(filter, [0.5] * 3, range(5))
+    assert runs.single["filter"].startswith("update: ")
+    assert run_many(Program(walk).bootstrap(4), [[0.5, None]] * 3, range(3), paired=True).single == {}
+    assert run_many(Program(needs_one_number).bootstrap(4), [[0.5]] * 3, range(3), paired=True).single
+    assert run_many(bootstrap(GOOD, 4), [0.5] * 3, range(5), ess=ess).single == {}
+    tried = bootstrap(replace(GOOD, batched=None), 4)
+    reads = run_many(tried, [0.5] * 3, range(5), slots=lambda state, info: len(info.seconds))
+    assert reads.single == {"filter": "collector: it reads the seconds of the components"}
+    assert (reads["slots"] > 0).all()
 
 
 def limited(model, bound):
@@ -130,30 +346,46 @@ def limited(model, bound):
     return replace(model, log_likelihood=lambda x, y: np.where(x < bound, model.log_likelihood(x, y), -np.inf))
 
 
-@pytest.mark.parametrize("model", [BATCHED, AR1], ids=["batched", "rows"])
+@pytest.mark.parametrize("model", [GOOD, replace(GOOD, batched=False)], ids=["together", "single"])
 def test_lost_runs_are_recorded_and_the_others_continue(model):
-    filter = bootstrap(limited(model, -0.2), 3)
-    runs = batch(filter, YS, range(40))
+    """Also if all runs are lost at a step."""
+    ys, filter = ar1_observations(8), bootstrap(limited(model, -0.2), 3)
+    runs = run_many(filter, ys, range(40), **ALL)
     assert 0 < len(runs.lost) < 40
-    for r in range(40):
-        if r not in runs.lost:
-            assert filter.run(YS, r)[0].log_evidence == runs.log_evidence[r, -1] == runs.state(r).log_evidence
-            continue
-        with pytest.raises(InputError) as error:
-            filter.run(YS, r)
-        assert error.value.message == runs.lost[r] and "all 3 log weights are -inf" in runs.lost[r]
-        lost_at = int(runs.lost[r].split(":")[0].split()[1].rstrip(","))
-        assert np.isneginf(runs.log_evidence[r, lost_at:]).all() and np.isfinite(runs.log_evidence[r, :lost_at]).all()
-        assert np.isnan(runs.ess[r, lost_at:]).all() and runs.states[r] is None
-        with pytest.raises(InputError, match=f"run {r} is lost"):
-            runs.state(r)
-    everything = batch(bootstrap(limited(model, -1e9), 3), YS, range(4))
-    assert set(everything.lost) == {0, 1, 2, 3} and np.isneginf(everything.log_evidence).all()
+    assert keeps_its_promise(filter, ys, range(40)) == ("single" if model.batched is False else "together")
+    for seed, reason in runs.lost.items():
+        lost_at = int(reason.split(":")[0].split()[1].rstrip(","))
+        assert np.isneginf(runs["z"][seed, lost_at:]).all() and np.isfinite(runs["z"][seed, :lost_at]).all()
+        assert np.isnan(runs["ess"][seed, lost_at:]).all() and np.isnan(runs["all"][seed, lost_at:]).all()
+    everything = run_many(bootstrap(limited(model, -1e9), 3), ys, range(4))
+    assert set(everything.lost) == {0, 1, 2, 3} and np.isneginf(everything["log_evidence"]).all()
 
 
+def test_all_runs_are_lost_at_the_first_step():
+    def program(previous, y):
+        x = sample("x", Normal(0.0, 1.0))
+        observe("y", Uniform(x, x + 1.0), y)
+
+    runs = run_many(Program(program).bootstrap(5), [100.0, 0.0], range(3), **ALL)
+    assert runs.single == {} and runs["all"].shape[:2] == (3, 2) and np.isneginf(runs["z"]).all()
+    assert runs.lost[1].startswith("step 0, initial: ")
+
+
+def test_inputs_of_each_run_are_given_by_row():
+    model = linear_gaussian(*vectors(2, 1), B=np.array([[1.0, 0.5, 0.2], [0.3, 1.0, 0.1]]))
+    rng = np.random.default_rng(0)
+    data = [
+        [WithInput(float(y), u) for y, u in zip(rng.standard_normal(T), rng.standard_normal((T, 3)), strict=True)]
+        for _ in range(4)
+    ]
+    assert keeps_its_promise(bootstrap(model, 6), data, range(4), True) == "together"
+    assert keeps_its_promise(bootstrap(model, 6), data[0], range(4)) == "together"
+
+
+# --- generators ---------------------------------------------------------------------------------------------------
 def test_generators_of_runs_draw_what_their_streams_draw():
     seeds = list(range(6))
-    ours = RunGenerators(pcg64_states(words_of(seeds, "a")))
+    ours = RunGenerators([Key(seed).child("a").generator() for seed in seeds])
     singles = [Key(seed).child("a").generator() for seed in seeds]
     means = np.arange(12.0).reshape(6, 2)
     for draw in (
@@ -183,26 +415,129 @@ def test_summaries_are_those_of_populations():
         assert (ess[row], log_mean[row]) == (population.ess, population.log_mean_weight)
 
 
-def test_wrong_calls_are_named():
-    with pytest.raises(InputError, match="2 sequences of observations for 3 seeds"):
-        batch(bootstrap(AR1, 5), [YS, YS], range(3), paired=True)
-    with pytest.raises(InputError, match="lengths"):
-        batch(bootstrap(AR1, 5), [YS, YS[:2]], range(2), paired=True)
-    with pytest.raises(InputError, match="no seeds"):
-        batch(bootstrap(AR1, 5), YS, [])
-    with pytest.raises(InputError, match=r"run 0, step 0, update: log likelihood has shape \(\)"):
-        batch(bootstrap(replace(AR1, log_likelihood=lambda x, y: 0.0), 5), YS, range(2))
+# --- chains -------------------------------------------------------------------------------------------------------
+def chain_model(kind, theta, n):
+    """A filter of a coefficient, with particles (n,) or (n, 2)."""
+    (rho,) = theta
+    if kind == "of":
+        model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, 0.5), lambda x: Normal(x, 1.0))
+        return bootstrap(model, n)
+    factor = rho if kind in ("scalar", "vectors without axis") else rho[..., None]
+    size = () if kind == "scalar" else (2,)
+    model = StateSpaceModel(
+        lambda rng, n: rng.standard_normal((n, *size)),
+        lambda rng, x: factor * x + rng.standard_normal(x.shape),
+        lambda x, y: -np.square(y - (x if kind == "scalar" else x[:, 0])),
+        batched=True,
+    )
+    return bootstrap(model, n)
 
 
-def test_threads_do_not_mix_their_streams():
-    """Threads that draw at the same time draw what each of them draws alone."""
+START = [[0.1], [0.5], [0.9]]
 
-    def drawn(first):
-        rng = RunGenerators(pcg64_states(words_of(range(first, first + 50), "a")))
-        return np.stack([rng.standard_normal((50, 40)) for _ in range(40)])
 
-    alone = [drawn(first) for first in (0, 100, 200, 300)]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(drawn, (0, 100, 200, 300)))
-    for a, b in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(a, b)
+def flat(theta):
+    return 0.0
+
+
+@pytest.mark.parametrize("n", [3, 2, 5])
+@pytest.mark.parametrize("kind", ["scalar", "vectors", "of", "vectors without axis"])
+@pytest.mark.parametrize("paired", [False, True])
+def test_chains_equal_single_chains_or_refuse(kind, paired, n):
+    """Three chains; parameters of all chains without an axis do not fit vectors, whatever the sizes."""
+    data = [[None if y is None else k * y for y in YS] for k in (1.0, 2.0, -1.0)] if paired else YS
+
+    def chains(batched):
+        return pmmh(
+            lambda theta: chain_model(kind, theta, n), data, flat, START, 0.2, 6, batched=batched, paired=paired
+        )
+
+    if kind == "vectors without axis":
+        with pytest.raises(InputError, match="step 1, transition"):
+            chains(True)
+        return
+    one, many = chains(False), chains(True)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
+
+
+def test_chains_of_which_one_run_is_lost_stay_in_one_sweep():
+    calls = []
+
+    def fragile(theta):
+        calls.append(np.ndim(theta))
+        filter = chain_model("scalar", theta, 4)
+        return replace(
+            filter, update=Reweight(lambda x, y: np.where(np.abs(x - y) < 1.0, 0.0, -np.inf), batched=True)
+        )
+
+    many = pmmh(fragile, [0.1, 0.2, 0.3], flat, START * 3, 0.2, 20, 1, batched=True)
+    together = len(calls)
+    one = pmmh(fragile, [0.1, 0.2, 0.3], flat, START * 3, 0.2, 20, 1)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    assert (many.accepted < 1).all() and together < 2 * (len(calls) - together)
+
+
+def test_chains_say_that_they_are_run_singly():
+    def mixing(theta):
+        (rho,) = theta
+        model = StateSpaceModel.of(
+            Normal(0.0, 1.0), lambda x: Normal(rho * (x - x.mean()), 0.5), lambda x: Normal(x, 1.0)
+        )
+        return bootstrap(model, 4)
+
+    with pytest.warns(UserWarning, match="run one by one: transition"):
+        many = pmmh(mixing, YS, flat, START, 0.2, 4, batched=True)
+    np.testing.assert_array_equal(many.theta, pmmh(mixing, YS, flat, START, 0.2, 4).theta)
+
+
+@pytest.mark.parametrize("field", ["n", "resampler", "trigger"])
+def test_chains_whose_filters_differ_in_more_than_numbers_are_run_singly(field):
+    def filter_of(theta):
+        high = bool(np.max(theta) > 0.55)
+        other = {"n": 7, "resampler": Multinomial(), "trigger": Always()}[field]
+        return replace(bootstrap(of(1), 4), **({field: other} if high else {}))
+
+    with pytest.warns(UserWarning, match=f"one by one: all: the filters of the runs differ in {field}"):
+        many = pmmh(filter_of, YS, flat, [[0.3], [0.8]], 0.1, 4, batched=True)
+    np.testing.assert_array_equal(many.theta, pmmh(filter_of, YS, flat, [[0.3], [0.8]], 0.1, 4).theta)
+
+
+def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():
+    """A filter of one particle survives three observations with probability .1 or so: most starts are drawn again."""
+
+    def fragile(theta):
+        filter = chain_model("scalar", theta, 1)
+        return replace(
+            filter, update=Reweight(lambda x, y: np.where(np.abs(x - y) < 0.9, 0.0, -np.inf), batched=True)
+        )
+
+    for batched in (False, True):
+        chains = pmmh(fragile, [0.1, 0.2], flat, START, 0.2, 4, 2, batched=batched)
+        assert np.isfinite(chains.log_evidence).all()
+    with pytest.raises(InputError, match=r"of chain 1 has log density -inf: 20 estimates"):
+        pmmh(
+            lambda theta: chain_model("scalar", theta, 3) if theta[0] < 0.4 else fragile_never(theta),
+            [0.1],
+            flat,
+            [[0.1], [0.5]],
+            0.01,
+            2,
+        )
+    with pytest.raises(InputError, match="of chain 2 .* the log prior is -inf"):
+        pmmh(fragile, [0.1], lambda theta: 0.0 if theta[0] < 0.8 else -np.inf, START, 0.2, 2)
+
+
+def fragile_never(theta):
+    return replace(chain_model("scalar", theta, 3), update=Reweight(lambda x, y: np.full(len(x), -np.inf)))
+
+
+def test_walkers_of_emcee_are_the_same_in_one_sweep():
+    start = np.linspace(0.1, 0.9, 6)[:, None]
+
+    def walkers(batched):
+        return ensemble(lambda theta: chain_model("of", theta, 5), YS, flat, start, 4, 1, batched=batched)
+
+    one, many = walkers(False), walkers(True)
+    np.testing.assert_array_equal(one.theta, many.theta)
+    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)

@@ -9,7 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.smc import Always, Branching, Coalesced, Dynamics, FearnheadClifford, Never, Systematic, bootstrap
-from mstfilter.testing import TransitionContract
+from mstfilter.smc.testing import TransitionContract
 from tests.smc.models import AR1, ar1_observations, hmm, kalman_ar1, mean_ratio
 
 YS = ar1_observations(8)
@@ -41,10 +41,11 @@ def test_candidates_know_where_they_come_from():
         assert (info.n, info.n_candidates) == (20, 80 if info.t else 20)
         assert len(set(state.population.particles.tolist())) == 20
         if before is not None:
-            expected = before[info.parents["previous"]]
+            parents = state.population.parents
+            expected = before[parents["previous"]]
             away = state.population.particles - 0.9 * expected
             assert np.abs(away).max() < 6 * 0.6, "steps of the model from the parent that is named"
-            np.testing.assert_array_equal(info.ancestors // 4, info.parents["previous"])
+            np.testing.assert_array_equal(parents["ancestor"] // 4, parents["previous"])
         before = state.population.particles
     objects = Branching(Dynamics(hmm("objects")), 2).predict(
         np.random.default_rng(0), bootstrap(hmm("objects"), 5).run([0], 0)[0].population, None

@@ -5,10 +5,11 @@ Weights are small whole numbers, so that what the single uniforms decide changes
 
 from __future__ import annotations
 
-from itertools import combinations, pairwise, product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
 from mstfilter.smc import (
     Chopthin,
@@ -16,12 +17,9 @@ from mstfilter.smc import (
     Coalesced,
     FearnheadClifford,
     Gaussian,
-    KDpp,
     Killing,
-    Metropolis,
     Multinomial,
     Population,
-    Rejection,
     Residual,
     Shuffled,
     Sorted,
@@ -29,10 +27,11 @@ from mstfilter.smc import (
     Stratified,
     Systematic,
     Tempered,
-    diverse_resampling,
+    log_mean_exp,
     resampling,
 )
-from mstfilter.smc.resampling import systematic_ancestors
+from mstfilter.smc.diverse_resampling import optimal_threshold
+from mstfilter.smc.resampling import inverse_cdf
 from tests.smc.enumeration import outcomes
 
 
@@ -134,14 +133,19 @@ def test_multinomial_and_residual(weights, n, enumerated_uniforms):
 )
 def test_schemes_of_uniforms(scheme, weights, n):
     """One uniform, or one a stratum; jumps at multiples of one over the total weight."""
-    if isinstance(scheme, Stratified) or scheme == Residual("stratified"):
-        n = min(n, 4)
+    by_strata = scheme in (Stratified(), Residual("stratified"))
+    n = min(n, 4) if by_strata else n
     mean, cov, counts = copies_law(scheme, weights, n, cells=int(np.sum(weights)))
     _, expected, f = expected_of(weights, n)
     np.testing.assert_allclose(mean, expected, atol=1e-12)
     assert (counts.sum(axis=1) == n).all()
-    if not isinstance(scheme, Stratified) and scheme != Residual("stratified"):
-        np.testing.assert_allclose(np.diag(cov), f * (1 - f), atol=1e-12)
+    variance = f * (1 - f)
+    if by_strata:  # the sum over the strata, of which a particle covers the share p
+        ends = np.cumsum(expected if scheme == Stratified() else f)[:, None]
+        begins, k = np.vstack([[0.0], ends[:-1]]), np.arange(n)
+        p = np.clip(np.minimum(ends, k + 1) - np.maximum(begins, k), 0, None)
+        variance = (p * (1 - p)).sum(axis=1)
+    np.testing.assert_allclose(np.diag(cov), variance, atol=1e-12)
 
 
 def carried(scheme, population, n, **how):
@@ -196,29 +200,15 @@ def test_shuffled_and_coalesced(n):
     np.testing.assert_allclose(found, np.array([0.0, 2.0, 4.0, 2.0]) / 4, atol=1e-12)
 
 
-@pytest.mark.parametrize(("weights", "n"), [((1, 3, 2), 3), ((1, 3, 2), 2), ((3, 1), 3), ((2, 0, 1), 2)])
-def test_rejection(weights, n, enumerated_uniforms):
-    """Mean n W and the covariance of killing, also with the draws by weight after the second trial."""
-    enumerated_uniforms(weights)
-    mean, cov, _ = copies_law(Rejection(max_trials=2), weights, n, coins=True)
-    np.testing.assert_allclose(mean, expected_of(weights, n)[1], atol=1e-12)
-    np.testing.assert_allclose(cov, copies_law(Killing(), weights, n, coins=True)[1], atol=1e-12)
+class Uniform(np.random.Generator):
+    """A generator whose uniforms are all u."""
 
+    def __init__(self, u):
+        super().__init__(np.random.PCG64(0))
+        self.u = u
 
-@pytest.mark.parametrize("weights", [(1, 3, 2), (2, 0, 1)])
-def test_metropolis(weights):
-    """Two steps of the chain, by powers of its transition matrix; its bound of the total variation holds."""
-    mean, _, _ = copies_law(Metropolis(max_steps=2), weights, 2, coins=True)
-    w = np.array(weights, float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        P = np.where(w[:, None] > 0, np.minimum(1, w[None, :] / w[:, None]), 1.0) / 3
-    P += np.diag(1 - P.sum(axis=1))
-    start = np.where(w > 0, np.arange(3), np.argmax(w))  # weight zero starts at the heaviest
-    start_law = np.bincount(start, minlength=3) / 3  # two positions belong to a random pair of particles
-    np.testing.assert_allclose(mean / 2, start_law @ P @ P, atol=1e-12)
-    steps = Metropolis(tolerance=0.05).steps(w / w.max())
-    assert 0.5 * np.abs(np.linalg.matrix_power(P, steps)[w > 0] - w / w.sum()).sum(axis=1).max() <= 0.05
-    assert steps > 1
+    def random(self, size=None):
+        return self.u if size is None else np.full(size, self.u)
 
 
 CHOPPED = [(1.0, 4.0, 1.0, 2.0), (40.0, 1.0, 1.0, 2.0), (3.0, 3.0), (1.0,), (0.0, 1.0, 12.0)]
@@ -230,26 +220,19 @@ CHOPPED = [(1.0, 4.0, 1.0, 2.0), (40.0, 1.0, 1.0, 2.0), (3.0, 3.0), (1.0,), (0.0
 def test_chopthin(weights, n, ratio):
     """The mean over the uniform, exactly: the result changes where cumulative fractions end."""
     population = of(np.arange(float(len(weights))), weights)
-    uniforms: list[float] = []
     fractions: list[np.ndarray] = []
 
-    class One(np.random.Generator):
-        def random(self):
-            return uniforms[0]
+    def spy(weights, shifts, rest):
+        fractions.append(np.cumsum(weights) * (rest / weights.sum()))
+        return inverse_cdf(weights, shifts, rest)
 
-    def spy(cumulative, rest, shift):
-        fractions.append(cumulative * (rest / cumulative[-1]))
-        return systematic_ancestors(cumulative, rest, shift)
-
-    uniforms[:] = [0.5]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diverse_resampling, "systematic_ancestors", spy)
-        Chopthin(ratio).resample(One(np.random.PCG64(0)), population, n)
+        patch.setattr(resampling, "inverse_cdf", spy)
+        Chopthin(ratio).resample(Uniform(0.5), population, n)
     jumps = np.unique([0.0, 1.0, *np.mod(np.concatenate([[], *fractions]), 1.0)])
     total = np.zeros(len(weights))
     for a, b in pairwise(jumps):
-        uniforms[:] = [(a + b) / 2]
-        chosen = Chopthin(ratio).resample(One(np.random.PCG64(0)), population, n)
+        chosen = Chopthin(ratio).resample(Uniform((a + b) / 2), population, n)
         assert len(chosen) == n
         assert np.ptp(chosen.log_weights) <= np.log(ratio) + 1e-9
         carried = np.bincount(chosen.parents["ancestor"], np.exp(chosen.log_weights), minlength=len(weights)) / n
@@ -268,24 +251,6 @@ def test_sorted(order, n):
     np.testing.assert_array_equal(chosen.particles, population.particles[chosen.parents["ancestor"]])
 
 
-@pytest.mark.parametrize("k", [1, 2, 3, 4])
-def test_kdpp(k, monkeypatch):
-    """Every set with its probability by determinants, with the weights that resample gives it."""
-    rng = np.random.default_rng(2)
-    population = Population(rng.standard_normal((5, 2)), np.log(rng.random(5)) - 700)
-    scheme = KDpp(Gaussian(1.0))
-    L = scheme.likelihood(population)
-    total, found = 0.0, np.zeros(5)
-    for chosen_set in combinations(range(5), k):
-        determinant = np.linalg.det(L[np.ix_(chosen_set, chosen_set)])
-        monkeypatch.setattr(diverse_resampling, "sample_kdpp", lambda *_, s=chosen_set: np.array(s))
-        chosen = scheme.resample(rng, population, k)
-        assert chosen.notes["kdpp"] == f"rank 5 of {k}"
-        found[list(chosen_set)] += determinant * np.exp(chosen.log_weights + 700) / k
-        total += determinant
-    np.testing.assert_allclose(found / total, np.exp(population.log_weights + 700) / 5, rtol=1e-9)
-
-
 def test_enumeration_would_see_a_bias():
     """The harness on schemes that are wrong by little: it is exact, so every bias is seen."""
 
@@ -297,3 +262,65 @@ def test_enumeration_would_see_a_bias():
     assert np.abs(mean - 3 * np.array([1, 3, 2, 2]) / 8).max() > 1e-3
     pairs = list(product(range(2), repeat=2))
     assert [r for _, r in outcomes(lambda rng: (rng.digit([1, 1]), rng.digit([1, 1])))] == pairs
+
+
+# --- unequal output weights: integrals over the one uniform, and invariants ---------------------------------------
+positive_weights = st.lists(st.floats(0.01, 10.0), min_size=1, max_size=12)
+
+
+def expectation(scheme, lw, n, breaks):
+    """E of what each particle carries, by exact integration over the one uniform that a scheme draws."""
+    edges = np.unique(np.concatenate([[0.0, 1.0], np.mod(breaks, 1.0)]))
+    carried = np.zeros(len(lw))
+    included = np.zeros(len(lw))
+    for a, b in pairwise(edges):
+        chosen = scheme.resample(Uniform((a + b) / 2), Population(np.arange(len(lw)), lw), n)
+        ancestors = chosen.parents["ancestor"]
+        carried += (b - a) * np.bincount(ancestors, np.exp(chosen.log_weights), minlength=len(lw)) / len(ancestors)
+        included += (b - a) * (np.bincount(ancestors, minlength=len(lw)) > 0)
+    return carried, included
+
+
+@settings(max_examples=150, deadline=None)
+@given(weights=positive_weights, n=st.integers(1, 14))
+def test_fearnhead_clifford_by_quadrature(weights, n):
+    w = np.array(weights)
+    m = len(w)
+    if n < m:
+        c, heavy = optimal_threshold(w, n)
+        assert np.minimum(1, w / c).sum() == pytest.approx(n, abs=1e-6)
+        breaks, want = np.cumsum(w[~heavy]) / c, np.minimum(1, w / c)
+    else:
+        breaks, want = np.zeros(0), np.ones(m)
+    carried, included = expectation(FearnheadClifford(), np.log(w) + 5, n, breaks)
+    np.testing.assert_allclose(carried, np.exp(5.0) * w / m, rtol=1e-6)
+    np.testing.assert_allclose(included, want, atol=1e-6)
+
+
+any_positive_weights = st.lists(
+    st.one_of(st.floats(-2, 2), st.floats(-700, 0), st.sampled_from([0.0, 1.0, -744.0])), min_size=1, max_size=12
+).map(lambda lw: np.array(lw) - max(lw))
+
+
+@settings(max_examples=300, deadline=None)
+@given(lw=any_positive_weights, n=st.integers(1, 14), u=st.floats(0, 1, exclude_max=True))
+def test_fearnhead_clifford_invariants(lw, n, u):
+    """No duplicates, the total kept exactly, heavy particles kept with their weight."""
+    weights = np.exp(lw)
+    ancestors, out = FearnheadClifford().select(Uniform(u), lw, n)
+    assert len(ancestors) == min(n, (weights > 0).sum()) == len(set(ancestors.tolist()))
+    assert log_mean_exp(out) == pytest.approx(log_mean_exp(lw), abs=1e-9)
+    scaled = out - np.log(len(ancestors) / len(lw))
+    c = np.exp(scaled).min() if n < len(lw) else 0.0
+    heavy = np.flatnonzero(weights > c * (1 + 1e-6))
+    for i in heavy:
+        assert scaled[ancestors == i] == pytest.approx(lw[i], abs=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(weights=positive_weights, n=st.integers(1, 14), power=st.floats(0, 1))
+def test_tempered_systematic_by_quadrature(weights, n, power):
+    lw = np.log(weights)
+    alpha = np.exp(power * lw)
+    carried, _ = expectation(Tempered(Systematic(), power), lw, n, n * np.cumsum(alpha) / alpha.sum())
+    np.testing.assert_allclose(carried, np.array(weights) / len(lw), rtol=1e-6)

@@ -115,7 +115,7 @@ def test_columns_of_chains():
 
 
 def test_data_frames():
-    pandas = pytest.importorskip("pandas")
+    pandas, _ = pytest.importorskip("pandas"), pytest.importorskip("xarray")
     ys = ar1_observations(5)
     _, infos = bootstrap(AR1, 8).run(ys, 1)
     history = run_many({"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=n_particles)
@@ -128,6 +128,8 @@ def test_data_frames():
     assert frame["ess"].tolist() == [info.ess for info in infos] and frame["resampled"].dtype == bool
     row = history.to_pandas().query("arm == 'b' and seed == 5 and time == 3").iloc[0]
     assert (row["ess"], row["n"]) == (history["ess"][1, 1, 3], 9)
+    table = history.to_xarray()
+    assert table["ess"].dims == ("arm", "seed", "time") and float(table["n"].sel(arm="b", seed=5, time=3)) == 9
     assert Infos().columns() == {} and len(Infos().to_pandas()) == 0
 
 

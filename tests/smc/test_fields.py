@@ -18,8 +18,6 @@ from mstfilter.smc import (
     Fixed,
     Gamma,
     Gaussian,
-    GreedyDiverse,
-    KDpp,
     Kld,
     Normal,
     ParticleFilter,
@@ -28,6 +26,7 @@ from mstfilter.smc import (
     ProgramLookahead,
     ProgramMove,
     RandomWalkMove,
+    Residual,
     Shuffled,
     StateSpaceModel,
     Student,
@@ -60,13 +59,13 @@ from tests.smc.models import AR1
         (lambda: Kld(equivalence=Gaussian()), "equivalence is Gaussian"),
         (lambda: Gaussian(np.inf), "scale is inf"),
         (lambda: Bins(np.nan), "width is nan"),
+        (lambda: Residual("best"), "remainder is 'best'"),
         (lambda: Tempered(power=-0.1), r"power is -0\.1"),
         (lambda: Tempered(Systematic, 0.5), "scheme is the class Systematic, expected a Resampler"),
         (lambda: Shuffled("systematic"), "scheme is 'systematic'"),
         (lambda: Coalesced(equivalence=Gaussian()), "expected an Equivalence"),
         (lambda: ClusterStratified(at_least=2.0), r"at_least is 2\.0"),
-        (lambda: KDpp(Bins()), "similarity is Bins"),
-        (lambda: GreedyDiverse(Bins()), "similarity is Bins"),
+        (lambda: ClusterStratified(Bins()), "similarity is Bins"),
         (lambda: RandomWalkMove(AR1, steps=0), "steps is 0"),
         (lambda: RandomWalkMove(AR1, scale=-1.0), "scale is -1"),
         (lambda: RandomWalkMove(AR1, scale=[1.0, np.nan]), "scale is"),
@@ -139,15 +138,3 @@ def test_hints_say_what_was_meant():
     with pytest.raises(InputError) as raised:
         bootstrap(AR1, 5, Systematic)
     assert raised.value.hints == ("pass an instance: resampler=Systematic(...)",)
-
-
-def test_sense_is_not_refused():
-    for part in (
-        EssBelow(1),
-        EssBelow(np.float32(0.25)),
-        EveryKth(np.int64(3)),
-        Kld(n_min=5, n_max=5),
-        Tempered(power=0),
-    ):
-        assert part == part
-    assert len(bootstrap(AR1, np.int64(7)).run([0.1], 0)[0].population) == 7

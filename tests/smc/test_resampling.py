@@ -1,8 +1,11 @@
-"""Resampling: the law of the number of copies, by theory and by exact quadrature; hostile weights."""
+"""Resampling: draws by weight, hostile weights for all schemes, and what single schemes promise.
+
+The laws are enumerated in test_exact_laws.py; tests/testing runs the contract on all schemes.
+"""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,22 +15,34 @@ from scipy import stats
 from mstfilter.errors import InputError
 from mstfilter.smc import (
     Always,
+    ClusterStratified,
+    Coalesced,
     EssBelow,
     EveryKth,
+    ExactEquality,
+    FearnheadClifford,
+    Gaussian,
     KeepWeights,
     Killing,
     Multinomial,
     Never,
     Population,
+    Resampler,
     Residual,
+    Shuffled,
+    Similarity,
     Ssp,
     Stratified,
     Systematic,
+    Tempered,
+    WeightResampler,
+    coalesce,
     log_mean_exp,
 )
-from mstfilter.smc.resampling import independent_draws, stratified_ancestors, systematic_ancestors
+from mstfilter.smc.diverse_resampling import leader_clusters
+from mstfilter.smc.resampling import draw_rows, independent_draws, inverse_cdf, search
 
-SCHEMES = [
+EQUAL: list[WeightResampler] = [
     Multinomial(),
     Stratified(),
     Systematic(),
@@ -37,86 +52,23 @@ SCHEMES = [
     Ssp(),
     Killing(),
 ]
-NAMES = [
-    "multinomial",
-    "stratified",
-    "systematic",
-    "residual",
-    "residual-stratified",
-    "residual-systematic",
-    "ssp",
-    "killing",
+PLAIN: list[Resampler] = [
+    *EQUAL,
+    FearnheadClifford(),
+    Tempered(),
+    Tempered(Ssp(), 0.0),
+    Shuffled(),
+    Shuffled(FearnheadClifford()),
 ]
-ROUNDING = (Systematic(), Residual("systematic"), Ssp())
-each_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=NAMES)
-
-
-def counts(scheme, weights, n, repeats, seed=0):
-    rng = np.random.default_rng(seed)
-    with np.errstate(divide="ignore"):
-        lw = np.log(weights)
-    return np.array([np.bincount(scheme.select(rng, lw, n)[0], minlength=len(weights)) for _ in range(repeats)])
-
-
-def theory(name, W, n):
-    """Variance of the number of copies by the formulas of the module."""
-    expected = n * W
-    fraction = expected - np.floor(expected + 1e-12)
-    if name == "multinomial":
-        return expected * (1 - W)
-    if name in ("systematic", "residual-systematic", "ssp"):
-        return fraction * (1 - fraction)
-    if name == "residual":
-        rest = fraction.sum()
-        return fraction * (1 - fraction / rest) if rest > 0 else 0 * W
-    if name == "killing":
-        p = W / W.max()
-        alive = p * (1 - p)
-        if n != len(W):
-            return None
-        return alive * (1 - 2 * W) + W**2 * alive.sum() + (n - p.sum()) * W * (1 - W)
-    edges = np.concatenate([[0], np.cumsum(fraction if name == "residual-stratified" else expected)])
-    variance = np.zeros(len(W))
-    for i in range(len(W)):
-        for s in range(n):
-            p = max(0.0, min(edges[i + 1], s + 1) - max(edges[i], s))
-            variance[i] += p * (1 - p)
-    return variance
-
-
-@pytest.mark.parametrize(("scheme", "name"), list(zip(SCHEMES, NAMES, strict=True)), ids=NAMES)
-@pytest.mark.parametrize("n", [3, 5, 12])
-def test_mean_and_variance_of_copies(scheme, name, n):
-    # 135 means and as many variances at 5 standard errors: false alarm below 2e-4 for the file.
-    W = np.array([0.02, 0.31, 0.0, 0.17, 0.5])
-    repeats = 20_000
-    N = counts(scheme, W, n, repeats, seed=n)
-    assert (N.sum(axis=1) == n).all()
-    want = theory(name, W, n)
-    if want is None:  # no formula: at least the mean, by its own spread
-        assert (np.abs(N.mean(axis=0) - n * W) <= 5 * N.std(axis=0) / np.sqrt(repeats) + 1e-9).all()
-        return
-    if name in ("systematic", "residual-systematic", "ssp"):
-        assert ((np.floor(n * W + 1e-9) <= N) & (np.ceil(n * W - 1e-9) >= N)).all()
-    spread = np.sqrt(np.maximum(want, 1e-12) / repeats)
-    assert (np.abs(N.mean(axis=0) - n * W) <= 5 * spread + 1e-9).all()
-    found = N.var(axis=0)
-    # Fourth moment bounded by that of a count in 0..n.
-    kurtosis = np.maximum(((N - N.mean(axis=0)) ** 4).mean(axis=0) - found**2, 1e-12)
-    assert (np.abs(found - want) <= 5 * np.sqrt(kurtosis / repeats) + 1e-3).all()
-
-
-def test_systematic_by_exact_quadrature():
-    """Integrating the copies over the one uniform gives n W exactly."""
-    W = np.array([0.12, 0.0, 0.43, 0.05, 0.4])
-    for n in (1, 2, 5, 7):
-        edges = np.unique(np.concatenate([[0, 1], np.mod(n * np.cumsum(W), 1.0)]))
-        mean = np.zeros(len(W))
-        for a, b in pairwise(edges):
-            copies = np.bincount(systematic_ancestors(np.cumsum(W), n, (a + b) / 2), minlength=len(W))
-            assert ((copies == np.floor(n * W + 1e-9)) | (copies == np.ceil(n * W - 1e-9))).all()
-            mean += (b - a) * copies
-        np.testing.assert_allclose(mean, n * W, atol=1e-9)
+SEEING: list[Resampler] = [
+    ClusterStratified(),
+    ClusterStratified(Gaussian(0.2), 0.9, FearnheadClifford()),
+    Coalesced(),
+    Coalesced(Systematic()),
+    Tempered(ClusterStratified()),
+    Shuffled(ClusterStratified()),
+]
+each_plain = pytest.mark.parametrize("scheme", PLAIN, ids=repr)
 
 
 def hostile_weights(kind, m):
@@ -159,65 +111,86 @@ def test_many_independent_draws(kind, m, n):
 
 @pytest.mark.parametrize("kind", ["even", "zeros", "ends", "heavy", "one"])
 @pytest.mark.parametrize(("m", "n"), [(5_000, 30_000), (30_000, 30_000), (200_000, 100), (7, 2_000), (1, 3)])
-def test_stratified_equals_a_search(kind, m, n):
+def test_one_point_per_stratum_equals_a_search(kind, m, n):
     weights = hostile_weights(kind, m) if m > 1 else np.ones(1)
     uniforms = np.random.default_rng(m + n).random(n)
     cumulative = np.cumsum(weights)
-    points = (np.arange(n) + uniforms) * (cumulative[-1] / n)
-    expected = np.searchsorted(cumulative, points, side="right")
-    np.testing.assert_array_equal(stratified_ancestors(weights, uniforms), expected)
+    for shifts in (uniforms, uniforms[:1]):  # stratified and systematic
+        points = (np.arange(n) + shifts) * (cumulative[-1] / n)
+        expected = np.searchsorted(cumulative, points, side="right")
+        np.testing.assert_array_equal(inverse_cdf(weights, shifts, n), expected)
 
 
-@each_scheme
-def test_multinomial_law_of_pairs_is_not_position_dependent(scheme):
-    """Permuting the weights permutes the mean: chi-square of total copies, false alarm 1e-6 a scheme."""
-    W = np.array([0.5, 0.1, 0.25, 0.15])
-    order = np.array([2, 0, 3, 1])
-    N = counts(scheme, W[order], 2, 8000, seed=11).sum(axis=0)
-    expected = W[order] * N.sum()
-    # At most multinomial variance for every scheme, so the chi-square bound holds for all.
-    assert stats.chi2.sf(((N - expected) ** 2 / expected).sum(), 3) > 1e-6
+def test_points_at_the_ends_of_intervals():
+    """A point at an end belongs to the next particle of positive weight; one rounded up to the total, to the last."""
+    weights, points = np.array([0.0, 0.25, 0.0, 0.75, 0.0]), np.array([0.0, 0.25, 1.0])
+    assert search(weights, points).tolist() == [1, 3, 3]
+    assert draw_rows(np.tile(weights, (3, 1)), points).tolist() == [1, 3, 3]
+    assert inverse_cdf(weights, np.zeros(1), 4).tolist() == [1, 3, 3, 3]
 
 
-weights_space = st.lists(
-    st.one_of(st.just(-np.inf), st.floats(-50, 50), st.floats(-1e4, 1e4)), min_size=1, max_size=60
+# --- hostile weights, all schemes ---------------------------------------------------------------------------------
+hostile = st.lists(
+    st.one_of(st.just(-np.inf), st.floats(-50, 50), st.floats(-1e4, 1e4), st.sampled_from([0.0, -700.0, -745.0])),
+    min_size=1,
+    max_size=40,
 ).filter(lambda v: np.isfinite(v).any())
+offsets = st.sampled_from([0.0, -1e4, 1e4, np.log(0.9), np.log(2.0)])
 
 
-@each_scheme
-@settings(max_examples=150, deadline=None)
+def checked(scheme, rng, lw, n, particles=None):
+    """The numbers of copies of a selection that is valid: no particle of weight zero, finite weights."""
+    population = Population(np.arange(len(lw)) if particles is None else particles, lw)
+    chosen = scheme.resample(rng, population, n)
+    ancestors = chosen.parents["ancestor"]
+    assert len(chosen) == n or (not scheme.exact_size and 1 <= len(chosen) <= n)
+    W = np.exp(lw.astype(np.float64) - lw.max())
+    assert (W[ancestors] > 0).all(), "a particle without weight was chosen"
+    assert np.isfinite(chosen.log_weights).all()
+    np.testing.assert_array_equal(chosen.particles, population.particles[ancestors])
+    return np.bincount(ancestors, minlength=len(lw))
+
+
+@each_plain
+@settings(max_examples=100, deadline=None)
+@given(lw=hostile, n=st.integers(1, 80), offset=offsets, single=st.booleans(), seed=st.integers(0, 99))
+def test_hostile_weights(scheme, lw, n, offset, single, seed):
+    """Also: schemes that round make at least floor(n W) and at most ceil(n W) copies."""
+    lw = (np.array(lw) + offset).astype(np.float32 if single else np.float64)
+    copies = checked(scheme, np.random.default_rng(seed), lw, n)
+    W = np.exp(lw.astype(float) - lw.astype(float).max())
+    expected = n * W / W.sum()
+    if isinstance(scheme, Systematic | Residual | Ssp):
+        assert (copies >= np.floor(expected - 1e-6)).all()
+    if scheme in (Systematic(), Residual("systematic"), Ssp()):
+        assert (copies <= np.ceil(expected + 1e-6)).all()
+
+
+@pytest.mark.parametrize("scheme", SEEING, ids=repr)
+@settings(max_examples=60, deadline=None)
 @given(
-    lw=weights_space,
-    n=st.integers(1, 80),
-    offset=st.sampled_from([0.0, -1e4, 1e4]),
-    single=st.booleans(),
+    lw=hostile,
+    n=st.integers(1, 40),
+    offset=offsets,
+    spread=st.sampled_from([0.0, 1e-9, 1.0, 100.0]),
     seed=st.integers(0, 99),
 )
-def test_any_weights_give_valid_ancestors(scheme, lw, n, offset, single, seed):
-    lw = np.array(lw) + offset
-    if single:
-        lw = lw.astype(np.float32)
-    ancestors, out = scheme.select(np.random.default_rng(seed), lw, n)
-    assert out is None
-    assert ancestors.shape == (n,)
-    assert ((ancestors >= 0) & (ancestors < len(lw))).all()
-    W = np.exp(lw.astype(float) - lw.astype(float).max())
-    assert (W[ancestors] > 0).all(), "a particle without weight was chosen"
-    if isinstance(scheme, (Systematic, Residual, Ssp)):
-        floor = np.floor(n * W / W.sum() - 1e-6)
-        assert (np.bincount(ancestors, minlength=len(lw)) >= floor).all()
-    if scheme in ROUNDING:
-        ceil = np.ceil(n * W / W.sum() + 1e-6)
-        assert (np.bincount(ancestors, minlength=len(lw)) <= ceil).all()
+def test_hostile_populations(scheme, lw, n, offset, spread, seed):
+    rng = np.random.default_rng(seed)
+    checked(scheme, rng, np.array(lw) + offset, n, np.round(rng.standard_normal(len(lw)) * 2) * spread)
 
 
-@each_scheme
-@pytest.mark.parametrize("bad", [[np.nan, 0.0], [np.inf, 0.0], [-np.inf, -np.inf], []])
+@pytest.mark.parametrize("scheme", [s for s in PLAIN if isinstance(s, WeightResampler)], ids=repr)
+@pytest.mark.parametrize("bad", [[np.nan, 0.0], [0.0, np.inf], [-np.inf, -np.inf], []])
 def test_useless_weights_are_one_named_error(scheme, bad):
     with pytest.raises(InputError, match="log weights"):
         scheme.select(np.random.default_rng(0), np.array(bad, dtype=float), 3)
+
+
+@pytest.mark.parametrize("scheme", PLAIN + SEEING, ids=repr)
+def test_no_particles_wanted_is_an_error(scheme):
     with pytest.raises(InputError, match="at least 1"):
-        scheme.select(np.random.default_rng(0), np.zeros(3), 0)
+        scheme.resample(np.random.default_rng(0), Population(np.arange(3.0)), 0)
 
 
 class Edge(np.random.Generator):
@@ -232,21 +205,28 @@ class Edge(np.random.Generator):
 
 
 @pytest.mark.parametrize("u", [0.0, np.nextafter(1.0, 0.0)])
-@pytest.mark.parametrize("size", [1, 7, 100_000])
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (7, 7), (100_000, 100_000), (100_000, 30_000)])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-@each_scheme
-def test_extreme_uniforms_and_many_particles(scheme, u, size, kind):
+@each_plain
+def test_extreme_uniforms_and_many_particles(scheme, u, m, n, kind):
     rng = np.random.default_rng(5)
-    lw = np.log(rng.random(size)).astype(kind)
-    lw[: size // 3] = -np.inf
-    lw[size - size // 4 :] = -np.inf
-    if not np.isfinite(lw).any():
-        lw[0] = 0
-    ancestors, _ = scheme.select(Edge(u), lw, size)
-    assert ancestors.shape == (size,)
-    assert np.isfinite(lw[ancestors]).all()
+    lw = np.log(rng.random(m)).astype(kind)
+    lw[: m // 3] = lw[m - m // 4 :] = -np.inf
+    checked(scheme, Edge(u), lw, n)
 
 
+@pytest.mark.parametrize("scheme", PLAIN + SEEING, ids=repr)
+def test_parents_notes_and_objects_come_along(scheme):
+    population = Population(np.arange(6.0), np.log(np.arange(1.0, 7)), {"proposed": np.arange(6)}, {"n_trees": 3})
+    chosen = scheme.resample(np.random.default_rng(1), population, 4)
+    np.testing.assert_array_equal(chosen.parents["proposed"], chosen.parents["ancestor"])
+    assert chosen.notes["n_trees"] == 3
+    if "Cluster" not in repr(scheme):
+        things = replace(population, particles=("a", "b", "c", "d", "e", "f"))
+        assert set(scheme.resample(np.random.default_rng(1), things, 4).particles) <= set("abcdef")
+
+
+# --- single schemes -----------------------------------------------------------------------------------------------
 @settings(max_examples=100, deadline=None)
 @given(
     weights=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=30), n=st.integers(1, 50), u=st.floats(0.001, 0.999)
@@ -279,22 +259,6 @@ def test_killing_leaves_even_particles_in_their_place():
     np.testing.assert_array_equal(ancestors, np.arange(50))
 
 
-def test_ssp_has_no_positive_covariance():
-    """Counts of two particles never lean on each other: 10 pairs at 5 standard errors, false alarm below 1e-5."""
-    W = np.array([0.1, 0.25, 0.3, 0.15, 0.2])
-    N = counts(Ssp(), W, 3, 20_000, seed=4)
-    d = N - N.mean(axis=0)
-    for i in range(5):
-        for j in range(i):
-            product = d[:, i] * d[:, j]
-            assert product.mean() <= 5 * product.std() / np.sqrt(len(product))
-
-
-def test_an_unknown_remainder_is_an_error():
-    with pytest.raises(InputError, match="remainder is 'best'"):
-        Residual("best")
-
-
 def test_the_evidence_is_kept_and_ancestors_are_recorded():
     population = Population(np.arange(4.0), np.log([1.0, 2.0, 3.0, 4.0]), {"previous": np.array([3, 2, 1, 0])})
     out = Systematic().resample(np.random.default_rng(0), population, 9)
@@ -317,3 +281,85 @@ def test_triggers():
     assert Always().wants(even, 0)
     assert not Never().wants(peaked, 0)
     assert [EveryKth(3).wants(even, t) for t in range(4)] == [True, False, False, True]
+
+
+# --- schemes that compare particles ---
+@pytest.mark.parametrize("bad", [np.ones((2, 3)), np.full((4, 4), np.nan)])
+def test_a_similarity_that_is_none_is_an_error(bad):
+    class Bad(Similarity):
+        def matrix(self, particles):
+            return bad
+
+    with pytest.raises(InputError, match="similarities"):
+        ClusterStratified(Bad()).resample(np.random.default_rng(0), Population(np.arange(4.0)), 2)
+    with pytest.raises(InputError, match="at most"):
+        ClusterStratified().resample(np.random.default_rng(0), Population(np.zeros(20_000)), 2)
+
+
+def test_leader_clusters():
+    x = np.array([0.0, 0.1, 5.0, 5.2, 9.0])
+    w = np.array([1.0, 2.0, 3.0, 1.0, 0.0])
+    assert leader_clusters(w, Gaussian(1.0).matrix(x), 0.5).tolist() == [1, 1, 0, 0, -1]
+
+
+@pytest.mark.parametrize("scheme", [Systematic(), FearnheadClifford(), Multinomial()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 9, 30])
+def test_clusters_keep_their_mass_and_a_place(scheme, n):
+    rng = np.random.default_rng(n)
+    x = np.concatenate([rng.normal(c, 0.01, 6) for c in (0.0, 10.0, 20.0)])
+    lw = np.log(rng.random(18) * np.repeat([100.0, 1.0, 0.01], 6))
+    population = Population(x, lw)
+    for _ in range(20):
+        chosen = ClusterStratified(Gaussian(1.0), 0.5, scheme).resample(rng, population, n)
+        assert chosen.notes["clusters"] == 3
+        assert log_mean_exp(chosen.log_weights) == pytest.approx(log_mean_exp(lw), abs=1e-9)
+        assert len(chosen) == n or not scheme.exact_size
+        if n >= 3:
+            for group in range(3):
+                mine = chosen.parents["ancestor"] // 6 == group
+                share = np.exp(chosen.log_weights[mine]).sum() / len(chosen)
+                assert share == pytest.approx(np.exp(lw[6 * group : 6 * group + 6]).sum() / 18, rel=1e-9)
+
+
+def test_only_clusters_of_some_mass_are_sure_of_a_place():
+    """Of four clusters two hold .1 % of the weight each: they come in .5 % of draws, and stand for one place."""
+    population = Population(np.array([0.0, 10.0, 20.0, 30.0]), np.log([0.698, 0.3, 0.001, 0.001]))
+    scheme = ClusterStratified(Gaussian(1.0), least_mass=0.05)
+    found = np.zeros(4)
+    for seed in range(2000):
+        chosen = scheme.resample(np.random.default_rng(seed), population, 5)
+        ancestors = chosen.parents["ancestor"]
+        found += np.bincount(ancestors, minlength=4)
+        assert {0, 1} <= set(ancestors.tolist())
+        for light in np.flatnonzero(ancestors >= 2):
+            # A fifth of the total, as each of five places holds: the mean weight, which is kept.
+            assert np.exp(chosen.log_weights[light]) == pytest.approx(0.25, rel=0.01)
+    assert found[2:] / 2000 == pytest.approx([0.005, 0.005], abs=0.006)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    lw=st.lists(st.floats(-5, 5), min_size=1, max_size=20),
+    labels=st.lists(st.integers(0, 4), min_size=20, max_size=20),
+)
+def test_coalescing_is_lossless(lw, labels):
+    lw, labels = np.array(lw), np.array(labels[: len(lw)])
+    classes = ExactEquality().classes(labels)
+    representatives, merged = coalesce(lw, classes)
+    assert log_mean_exp(merged) == pytest.approx(log_mean_exp(lw), abs=1e-9)
+    for i, total in zip(representatives, merged, strict=True):
+        mine = labels == labels[i]
+        assert lw[i] == lw[mine].max()
+        assert np.exp(total) / len(merged) == pytest.approx(np.exp(lw[mine]).sum() / len(lw))
+    chosen = Coalesced().resample(np.random.default_rng(0), Population(labels, lw), 5)
+    assert sorted(chosen.particles.tolist()) == sorted(set(labels.tolist()))
+
+
+def test_shuffling_changes_the_order_only():
+    """Systematic on sorted weights never takes two neighbours of weight 1/2 copy each; shuffled it does."""
+    lw, rng = np.zeros(8), np.random.default_rng(0)
+    population = Population(np.arange(8), lw)
+    plain = {tuple(Systematic().resample(rng, population, 4).particles.tolist()) for _ in range(200)}
+    mixed = {tuple(sorted(Shuffled().resample(rng, population, 4).particles.tolist())) for _ in range(200)}
+    assert len(plain) == 2
+    assert len(mixed) > 30

@@ -12,14 +12,13 @@ import subprocess
 import sys
 import time
 import tracemalloc
-import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning, MissingLibraryError
+from mstfilter.errors import InputError
 from mstfilter.files import folder_name
 from mstfilter.smc import (
     ArrayCodec,
@@ -34,17 +33,21 @@ from mstfilter.smc import (
     StateSpaceModel,
     Tempered,
     Trace,
-    batch,
     bootstrap,
     collect,
-    diagnostics,
+    ess,
     kalman_filter,
     keep as keep_record,
     linear_gaussian,
+    log_evidence,
+    mean,
     observe,
     per_particle,
+    resampled,
     run_many,
     sample,
+    unique_ancestors,
+    weight_entropy,
 )
 from mstfilter.smc.checkpoint import digest, load_state, save_state
 from tests.conftest import REPOSITORY
@@ -56,101 +59,47 @@ FACTOR = 2.0
 
 # --- collectors ---------------------------------------------------------------------------------------------------
 def test_collectors():
-    history = collect(
-        bootstrap(AR1, 64).iterate(YS, 3),
-        ess=diagnostics.ess,
-        unique=diagnostics.unique_ancestors,
-        entropy=diagnostics.weight_entropy,
-        evidence=diagnostics.log_evidence,
-        mean=diagnostics.mean,
-        own=lambda state, info: [info.t, 2 * info.t],
-    )
-    state, infos = bootstrap(AR1, 64).run(YS, 3)
-    assert set(history) == {"ess", "unique", "entropy", "evidence", "mean", "own"}
-    np.testing.assert_array_equal(history["ess"], [i.ess for i in infos])
-    np.testing.assert_array_equal(history["own"], [[t, 2 * t] for t in range(10)])
-    assert history["evidence"][-1] == state.log_evidence == history.state.log_evidence
-    assert (history["entropy"] <= np.log(64) + 1e-12).all() and (
-        history["entropy"] >= np.log(history["ess"]) - 1e-9
-    ).all()
-    assert history["mean"][-1] == state.population.weights @ state.population.particles
+    filter = bootstrap(AR1, 64)
+    kept = {"ess": ess, "unique": unique_ancestors, "entropy": weight_entropy, "z": log_evidence, "mean": mean}
+    found = collect(filter.iterate(YS, 3), **kept, own=lambda state, info: [info.t, 2 * info.t])
+    state, infos = filter.run(YS, 3)
+    assert set(found) == {*kept, "own"}
+    np.testing.assert_array_equal(found["ess"], [info.ess for info in infos])
+    parents = [state.population.parents.get("previous", []) for state, _ in filter.iterate(YS, 3)]
+    assert found["unique"].tolist() == [len(set(index)) for index in parents]
+    np.testing.assert_array_equal(found["own"], [[t, 2 * t] for t in range(10)])
+    assert found["z"][-1] == state.log_evidence == found.state.log_evidence
+    w = state.population.weights
+    assert found["entropy"][-1] == pytest.approx(-(w * np.log(w)).sum())
+    assert found["mean"][-1] == pytest.approx(w @ state.population.particles)
     with pytest.raises(KeyError, match="nothing was collected as 'es'"):
-        history["es"]
+        found["es"]
     with pytest.raises(InputError, match="different shapes"):
-        collect(bootstrap(AR1, 4).iterate(YS, 0), odd=lambda state, info: np.zeros(info.t))
+        collect(filter.iterate(YS, 0), odd=lambda state, info: np.zeros(info.t))
+    for odd in (lambda state, info: np.zeros(info.t), lambda state, info: np.zeros(state.key.seed)):
+        with pytest.raises(InputError, match="different shapes"):
+            run_many(filter, YS, [0, 1], odd=odd)
 
 
-def test_to_xarray(monkeypatch):
-    history = collect(bootstrap(AR1, 8).iterate(YS, 3), ess=diagnostics.ess)
-    xarray = pytest.importorskip("xarray")
-    runs = run_many({"a": bootstrap(AR1, 8)}, YS, [1, 2], ess=diagnostics.ess, two=lambda s, i: np.zeros(2))
-    table = runs.to_xarray()
-    assert isinstance(table, xarray.Dataset)
-    assert table["ess"].dims == ("arm", "seed", "time")
-    assert table["two"].shape == (1, 2, 10, 2)
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(MissingLibraryError, match="needs the library xarray"):
-        history.to_xarray()
-
-
-def test_a_run_without_arrays():
-    full, light = (bootstrap(AR1, 16).run(YS, 3, keep_arrays=keep)[1] for keep in (True, False))
-    for a, b in zip(full, light, strict=True):
-        assert (a.t, a.n, a.ess, a.resampled, a.unique_ancestors) == (
-            b.t,
-            b.n,
-            b.ess,
-            b.resampled,
-            b.unique_ancestors,
-        )
-        assert len(a.log_weights) == 16
-        assert len(b.log_weights) == len(b.ancestors) == len(b.parents) == 0
-
-
-def test_the_infos_of_a_long_run_keep_no_arrays(monkeypatch):
-    """At 10 steps of 16 log weights, ancestors and parents: 3 * 16 * 8 bytes each."""
-    run = partial(bootstrap(AR1, 16).run, YS, 3)
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 10 * 384)
-    kept = run()[1]
-    assert {len(info.log_weights) for info in kept} == {16} and "without" not in repr(kept)
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 5 * 384)
-    with pytest.warns(InputWarning, match="do not keep arrays, which exceed") as told:
-        infos = run()[1]
-    assert len(told) == 1 and "keep_arrays=True" in told[0].message.hints[0] and told[0].filename == __file__
-    assert [info.n_bytes for info in infos] == [0] * 10 and "without arrays (above 268 MB)" in repr(infos)
-    assert [i.unique_ancestors for i in infos] == [i.unique_ancestors for i in kept]
-    for keep in (True, False):
-        found = run(keep_arrays=keep)[1]
-        assert {info.n_bytes > 0 for info in found} == {keep} and "without" not in repr(found)
-
-
-def test_the_memory_of_a_long_run_is_bounded(monkeypatch):
-    """Peak of the allocations of 60 steps of 4,000 particles, whose arrays of infos have 2 to 6 MB."""
-    monkeypatch.setattr("mstfilter.smc.filter.ARRAY_BYTES", 500_000)
-    held = {}
-    for keep, given in ((None, {}), (True, {"keep_arrays": True})):
-        tracemalloc.start()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)
-            infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3, **given)[1]
-        held[keep] = tracemalloc.get_traced_memory()[0]
-        tracemalloc.stop()
-        del infos
-    assert held[None] < 500_000 < 2_000_000 < held[True]
+def test_the_memory_of_a_long_run_is_bounded():
+    """60 steps of 4,000 particles: the weights and parents of one step have 64 kB, infos of all steps less."""
+    tracemalloc.start()
+    infos = bootstrap(AR1, 4000).run(np.tile(YS, 6), 3)[1]
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert len(infos) == 60 and held < 500_000
 
 
 # --- many runs ----------------------------------------------------------------------------------------------------
 def test_results_do_not_depend_on_workers_or_on_other_arms():
     arms = {"systematic": bootstrap(AR1, 50), "multinomial": bootstrap(AR1, 50, Multinomial())}
-    kept = {"log_evidence": diagnostics.log_evidence, "mean": diagnostics.mean}
+    kept = {"log_evidence": log_evidence, "mean": mean}
     one = run_many(arms, YS, range(6), **kept)
-    four = run_many(arms, YS, range(6), workers=4, **kept)
-    alone = run_many({"multinomial": arms["multinomial"]}, YS, [4], workers=2, **kept)
     more = run_many({"third": bootstrap(AR1, 7), **arms}, YS, range(6), workers=3, **kept)
+    alone = run_many(arms["multinomial"], YS, [4], **kept)
     for name in kept:
-        np.testing.assert_array_equal(one[name], four[name])
         np.testing.assert_array_equal(one[name], more[name][1:])
-        np.testing.assert_array_equal(one[name][1, 4], alone[name][0, 0])
+        np.testing.assert_array_equal(one[name][1, 4], alone[name][0])
     # Paired: both arms start from the same draws, so the first step is the same.
     np.testing.assert_array_equal(one["mean"][0, :, 0], one["mean"][1, :, 0])
 
@@ -160,8 +109,9 @@ def test_errors_in_workers_name_the_run():
         raise InputError("no")
 
     for workers in (1, 2):
-        with pytest.raises(InputError, match="arm 'a', seed 5: no"):
-            run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=workers, x=broken)
+        for filters, where in (({"a": bootstrap(AR1, 4)}, "arm 'a', seed 5: no"), (bootstrap(AR1, 4), "^seed 5: no")):
+            with pytest.raises(InputError, match=where):
+                run_many(filters, YS, [5], workers=workers, x=broken)
     with pytest.raises(InputError, match="workers is 0"):
         run_many({"a": bootstrap(AR1, 4)}, YS, [5], workers=0)
 
@@ -169,23 +119,12 @@ def test_errors_in_workers_name_the_run():
 FRAGILE = replace(AR1, log_likelihood=lambda x, y: np.where(x < -0.2, AR1.log_likelihood(x, y), -np.inf))
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_lost_runs_are_counted_and_the_others_are_kept(workers):
+def test_lost_runs_of_workers_are_those_of_one_process():
+    """What `History.lost` and the arrays of lost runs hold is tested in test_batching.py."""
     arms = {"few": bootstrap(FRAGILE, 3), "many": bootstrap(FRAGILE, 60)}
-    kept = {"log_evidence": diagnostics.log_evidence, "mean": diagnostics.mean, "resampled": diagnostics.resampled}
-    runs = run_many(arms, YS[:5], range(12), workers=workers, **kept)
-    lost = {arm: [seed for name, seed in runs.lost if name == arm] for arm in arms}
-    assert 0 < len(lost["few"]) < 12 and not lost["many"]
-    for seed in range(12):
-        history = runs["log_evidence"][0, seed]
-        if seed not in lost["few"]:
-            assert history[-1] == arms["few"].run(YS[:5], seed)[0].log_evidence
-            continue
-        reason = runs.lost["few", seed]
-        assert reason.startswith("step ") and "all 3 log weights are -inf" in reason
-        t = int(reason.split(",")[0].split()[1])
-        assert np.isneginf(history[t:]).all() and np.isfinite(history[:t]).all()
-        assert np.isnan(runs["mean"][0, seed, t:]).all() and np.isnan(runs["resampled"][0, seed, t:]).all()
+    one, two = (run_many(arms, YS[:5], range(12), workers=k, x=resampled) for k in (1, 2))
+    assert one.lost == two.lost and {arm for arm, _ in one.lost} == {"few"}
+    np.testing.assert_array_equal(one["x"], two["x"])
 
 
 CALLS: list[int] = []
@@ -202,7 +141,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
 
     steps: list[tuple[int, int]] = []
     first = run(range(4), progress=lambda done, total: steps.append((done, total)))
-    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert steps[-1] == (4, 4)
     before = len(CALLS)
     (tmp_path / "runs" / folder_name("a/b") / "2.npz").unlink()
     again = run(range(4))
@@ -220,72 +159,64 @@ def test_stored_runs_are_not_run_again(tmp_path):
             other()
 
 
-def test_a_batched_arm_gives_the_numbers_of_single_runs(tmp_path):
-    model = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
-    arms = {"batched": bootstrap(model, 20), "single": bootstrap(replace(model, batched=False), 20)}
-    kept = {"z": diagnostics.log_evidence, "ess": diagnostics.ess, "x": diagnostics.mean}
+LINEAR = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
+
+
+def test_an_arm_that_is_processed_together_gives_the_numbers_of_single_runs(tmp_path):
+    arms = {"together": bootstrap(LINEAR, 20), "single": bootstrap(replace(LINEAR, batched=False), 20)}
+    kept = {"z": log_evidence, "ess": ess, "x": mean}
     runs = run_many(arms, YS, range(5), **kept, folder=tmp_path)
     for name in kept:
         np.testing.assert_array_equal(runs[name][0], runs[name][1])
-    two = run_many(arms, YS, range(5), workers=2, **kept)
-    np.testing.assert_array_equal(two["z"], runs["z"])
+    assert runs.single == {"single": "initial: it is not batched"}
+    assert run_many(arms, YS, range(5), **kept, folder=tmp_path).single == {}, "all runs are stored"
+    one = run_many(arms["together"], YS, range(5), **kept)
+    assert one.dims == ("seed", "time") and list(one.coords) == ["seed", "time"]
+    np.testing.assert_array_equal(one["x"], runs["x"][0])
 
 
-ODD_NAMES = (
-    *(
-        "a",
-        "A",
-        "..",
-        ".",
-        "",
-        "a/b",
-        "a\\b",
-        "/etc/x",
-        "CON",
-        "con",
-        "a.",
-        "a ",
-        "a:b",
-        "a\0",
-        "a\n",
-        "\u00e9",
-        "e\u0301",
-    ),
-    *("~", "x" * 5000, "\ud800", "a~ca978112ca1b"),
-)
+def test_every_seed_with_its_own_data(tmp_path):
+    filter, data = bootstrap(LINEAR, 20), [YS, YS[::-1], 2 * np.asarray(YS)]
+    for workers in (1, 2):  # the second call reads the stored runs
+        runs = run_many(filter, data, [5, 3, 4], paired=True, workers=workers, folder=tmp_path)
+        for r, seed in enumerate([5, 3, 4]):
+            assert runs["log_evidence"][r, -1] == filter.run(data[r], seed)[0].log_evidence
+    with pytest.raises(InputError, match=r"3.npz was made by .*; 2 stored runs cannot be used"):
+        run_many(filter, [data[0], data[2], data[1]], [5, 3, 4], paired=True, folder=tmp_path)
+
+
+ODD_NAMES = ("a", "A", "..", "", "a/b", "/etc/x", "con", "a.", "a\0", "\u00e9", "e\u0301", "x" * 5000, "\ud800")
 
 
 def test_every_name_of_an_arm_has_a_folder_inside(tmp_path):
     folder = tmp_path / "in" / "runs"
     arms = {name: bootstrap(AR1, n) for n, name in enumerate(ODD_NAMES, 3)}
-    runs = run_many(arms, YS[:3], [1], folder=folder, x=diagnostics.ess)
+    runs = run_many(arms, YS[:3], [1], folder=folder, x=ess)
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
     names = [p.parent.name for p in files]
     assert len(files) == len(arms) and all(p.parent.parent == folder and p.name == "1.npz" for p in files)
     assert len({name.lower() for name in names}) == len(arms) and max(map(len, names)) < 100
     assert all(re.fullmatch("[a-z0-9_~-]+", name) and name != "con" for name in names)
-    np.testing.assert_array_equal(run_many(arms, YS[:3], [1], folder=folder, x=diagnostics.ess)["x"], runs["x"])
+    np.testing.assert_array_equal(run_many(arms, YS[:3], [1], folder=folder, x=ess)["x"], runs["x"])
 
 
 def test_damaged_stored_runs_are_named(tmp_path):
     """Cut anywhere, with any byte changed, or other content: never a raw error, never another result."""
 
     def run(**collectors):
-        return run_many(
-            {"a": bootstrap(AR1, 4)}, YS[:3], [0, 1], folder=tmp_path, **(collectors or {"x": diagnostics.ess})
-        )
+        return run_many({"a": bootstrap(AR1, 4)}, YS[:3], [0, 1], folder=tmp_path, **(collectors or {"x": ess}))
 
     first = run()["x"]
     path = tmp_path / "a" / "1.npz"
     whole, rng = path.read_bytes(), np.random.default_rng(0)
-    changed = [bytearray(whole) for _ in range(150)]
+    changed = [bytearray(whole) for _ in range(60)]
     for content in changed:
         content[rng.integers(len(whole))] ^= rng.integers(1, 256)
     other = io.BytesIO()
     np.savez(other, head=np.array(3.0))
     single = io.BytesIO()
     np.save(single, np.zeros(3))
-    cut = [whole[:k] for k in (*range(0, len(whole), 40), len(whole) - 1)]
+    cut = [whole[:k] for k in (*range(0, len(whole), 100), len(whole) - 1)]
     refused = 0
     for content in (*cut, *changed, other.getvalue(), single.getvalue(), b"no zip at all", pickle.dumps([1])):
         path.write_bytes(content)
@@ -296,7 +227,7 @@ def test_damaged_stored_runs_are_named(tmp_path):
             refused += 1
         else:  # a byte without a meaning, such as a date
             np.testing.assert_array_equal(again, first)
-    assert refused > len(cut) + 100
+    assert refused > len(cut) + 40
     for content in (b"", (tmp_path / "a" / "0.npz").read_bytes()):
         path.write_bytes(content)
         with pytest.raises(InputError, match="1.npz"):
@@ -304,9 +235,6 @@ def test_damaged_stored_runs_are_named(tmp_path):
     (tmp_path / "a" / "0.npz").write_bytes(b"")
     with pytest.raises(InputError, match="0.npz.*2 stored runs cannot be used"):
         run()
-    for file in tmp_path.rglob("*.npz"):
-        file.unlink()
-    np.testing.assert_array_equal(run()["x"], first)
     with pytest.raises(InputError, match="is a file"):
         run_many({"a": bootstrap(AR1, 4)}, YS[:3], [0], folder=path)
 
@@ -317,23 +245,12 @@ def ends_the_process(state, info):
     return info.ess
 
 
-def test_a_worker_that_dies_is_named_with_its_run(tmp_path):
-    arms = {"a": bootstrap(AR1, 4), "b": bootstrap(AR1, 5)}
-    with pytest.raises(InputError, match=r"arm 'a', seed 5: the worker process died \(EXIT\(3\)\)"):
-        run_many(arms, YS[:3], range(4, 8), workers=2, folder=tmp_path, x=ends_the_process)
-
-
-def test_a_worker_that_dies_once_changes_nothing(tmp_path):
-    def dies_once(state, info):
-        if state.key.seed == 2 and not (tmp_path / "died").exists():
-            (tmp_path / "died").touch()
-            os._exit(1)
-        return info.ess
-
-    arms = {"a": bootstrap(AR1, 4), "b": bootstrap(AR1, 5)}
-    runs = run_many(arms, YS[:3], range(5), workers=2, x=dies_once)
-    assert (tmp_path / "died").exists()
-    np.testing.assert_array_equal(runs["x"], run_many(arms, YS[:3], range(5), x=diagnostics.ess)["x"])
+def test_a_worker_that_dies_is_named_with_its_runs(tmp_path):
+    died = r"a worker process died \(EXIT\(3\)\); the first runs that are not finished: (seed 4; )?seed 5"
+    filter = bootstrap(replace(AR1, batched=False), 4)
+    with pytest.raises(InputError, match=died) as error:
+        run_many(filter, YS[:3], [4, 5, 6], workers=2, folder=tmp_path, x=ends_the_process)
+    assert "continues" in error.value.hints[-1]
 
 
 def test_workers_need_a_script_that_is_not_imported(tmp_path):
@@ -455,13 +372,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
     other, single = io.BytesIO(), io.BytesIO()
     np.savez(other, x=np.zeros(3))
     np.save(single, np.zeros(3))
-    for content in (
-        b"",
-        b"no zip",
-        *(whole[:k] for k in range(1, len(whole), 50)),
-        single.getvalue(),
-        other.getvalue(),
-    ):
+    for content in (b"", b"no zip", b"PK nonsense", whole[: len(whole) // 2], single.getvalue(), other.getvalue()):
         (tmp_path / "s.npz").write_bytes(content)
         with pytest.raises(InputError, match="s.npz") as found:
             load_state(tmp_path / "s.npz", Halves())
@@ -470,9 +381,6 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
         np.savez(tmp_path / "s.npz", head=np.array(head), log_weights=np.zeros(2))
         with pytest.raises(InputError, match="s.npz"):
             load_state(tmp_path / "s.npz", Halves())
-    (tmp_path / "s.npz").write_bytes(b"PK nonsense")
-    with pytest.raises(InputError, match="s.npz cannot be read"):
-        load_state(tmp_path / "s.npz")
     with pytest.raises(InputError, match="checkpoint is missing"):
         load_state(tmp_path / "t.npz")
 
@@ -586,7 +494,7 @@ def killed(kind, path, delays):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
-@pytest.mark.parametrize(("kind", "n_kills"), [("checkpoint", 8), ("run_many", 3), ("batch", 2)])
+@pytest.mark.parametrize(("kind", "n_kills"), [("checkpoint", 4), ("run_many", 2)])
 def test_a_killed_run_ends_as_one_that_was_not(kind, n_kills, tmp_path):
     """Kills at random moments; experiments/reliability stops a run at every operation on files."""
     whole, path = tmp_path / "whole.npz", tmp_path / "run.npz"
@@ -628,7 +536,7 @@ def test_observations_that_cannot_be_meant_are_refused_before_the_first_step(obs
     calls = (
         lambda: filter.run(observations, seed=0),
         lambda: next(iter(filter.iterate(observations, filter.start(0)))),
-        lambda: batch(filter, observations, range(2)),
+        lambda: run_many(filter, observations, range(2)),
         lambda: keep_record(filter, observations),
         lambda: kalman_filter(*one, np.zeros(1), np.eye(1), observations),
     )

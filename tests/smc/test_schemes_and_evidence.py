@@ -8,7 +8,7 @@ alarm 3e-7 a case), which are 2 to 6.8 % of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,16 +24,14 @@ from mstfilter.smc import (
     EssBelow,
     FearnheadClifford,
     Gaussian,
-    KDpp,
     Never,
     Normal,
     Residual,
-    Similarity,
     StateSpaceModel,
     Tempered,
     bootstrap,
 )
-from tests.smc.models import AR1, RHO, SD0, SIGMA, SYMBOLS, ar1_observations, forward, hmm, kalman_ar1, mean_ratio
+from tests.smc.models import AR1, RHO, SD0, SIGMA, ar1_observations, kalman_ar1, mean_ratio
 
 YS = ar1_observations(8)
 SCHEMES = sorted(smc.__components__["resampler"])
@@ -41,13 +39,11 @@ SCHEMES = sorted(smc.__components__["resampler"])
 SEEING = {
     "clusters": ClusterStratified(Gaussian(0.5)),
     "clusters, optimal": ClusterStratified(Gaussian(0.5), 0.5, FearnheadClifford()),
-    "kdpp": KDpp(Gaussian(0.3)),
     "fearnhead_clifford": FearnheadClifford(),
     "tempered optimal": Tempered(FearnheadClifford(), 0.5),
     "coalesced": Coalesced(),
 }
-# Rejection has the law of killing: test_exact_laws.py. Objects have no position to sort by.
-PLAIN = [name for name in SCHEMES if name not in {*SEEING, "rejection"}]
+PLAIN = [name for name in SCHEMES if name not in SEEING]
 TRIGGERS = pytest.mark.parametrize("trigger", [Always(), EssBelow(0.5)], ids=lambda t: type(t).__name__)
 
 
@@ -73,13 +69,6 @@ def test_kalman(name, trigger):
     is_unbiased(bootstrap(AR1, 3000, proper(name), trigger), YS, kalman_ar1(YS)[1], 135)
 
 
-@TRIGGERS
-@pytest.mark.parametrize("name", [name for name in PLAIN if name != "sorted"])
-def test_hidden_chain_of_objects(name, trigger):
-    """The same with particles that are objects."""
-    is_unbiased(bootstrap(hmm("objects"), 170, proper(name), trigger), SYMBOLS[:5], forward(SYMBOLS[:5])[1], 400)
-
-
 # --- schemes that see the particles, or do not duplicate ----------------------------------------------------------
 NOISE = 2.0  # weak observations: few particles give little spread
 MILD = StateSpaceModel.of(Normal(0.0, SD0), lambda x: Normal(RHO * x, SIGMA), lambda x: Normal(x, NOISE))
@@ -102,9 +91,7 @@ def test_kalman_where_schemes_choose(name):
     )
     _, infos = filter.run(FAR, 0)
     assert [info.resampled for info in infos] == [False, True, True]
-    if name == "kdpp":
-        assert "fallback" not in infos[-1].notes["resampler"]["kdpp"]
-    is_unbiased(filter, FAR, exact_mild(FAR), 1110 if name == "kdpp" else 670)
+    is_unbiased(filter, FAR, exact_mild(FAR), 670)
 
 
 @pytest.mark.parametrize("trigger", [Always(), EssBelow(0.95)], ids=lambda t: type(t).__name__)
@@ -113,23 +100,3 @@ def test_kalman_clusters_of_as_many(trigger):
     filter = bootstrap(MILD, 40, SEEING["clusters"], trigger)
     assert any(info.resampled for info in filter.run(FAR, 0)[1])
     is_unbiased(filter, FAR, exact_mild(FAR), 400)
-
-
-@dataclass(frozen=True)
-class SameBox(Similarity):
-    """Boxes are alike where they are equal, and a little where they are neighbours."""
-
-    def matrix(self, particles):
-        k = np.array([p.state for p in particles])
-        return np.exp(-np.abs(k[:, None] - k[None, :]))
-
-
-def test_hidden_chain_where_clusters_choose():
-    """The same with particles that are objects."""
-    model = hmm("objects")
-    filter = replace(
-        bootstrap(model, 30, ClusterStratified(SameBox(), 0.9), Never()),
-        transition=Branching(bootstrap(model, 1).transition, 4),
-        resample="after",
-    )
-    is_unbiased(filter, SYMBOLS[:3], forward(SYMBOLS[:3])[1], 1330)

@@ -15,7 +15,6 @@ from mstfilter.smc import (
     ClusterStratified,
     Coalesced,
     FearnheadClifford,
-    KDpp,
     Key,
     Kld,
     Never,
@@ -25,14 +24,13 @@ from mstfilter.smc import (
     StateSpaceModel,
     Systematic,
     auxiliary,
-    batch,
     bootstrap,
-    filter as filter_module,
     guided,
     key_of,
     observe,
     per_particle,
     resample_move,
+    run_many,
     sample,
 )
 from mstfilter.smc.programs import guard as checks
@@ -78,7 +76,7 @@ def test_two_selections_in_a_step_are_independent(filter):
 
     If both selections of a step used one stream, the first case would have the mean 0.888.
     """
-    ratios = np.exp(batch(filter, range(3), range(1000)).log_evidence[:, -1]) / EVIDENCE
+    ratios = np.exp(run_many(filter, range(3), range(1000))["log_evidence"][:, -1]) / EVIDENCE
     assert abs(1 - 0.888) > 5 * ratios.std() / np.sqrt(len(ratios))
     assert abs(ratios.mean() - 1) < 4 * ratios.std() / np.sqrt(len(ratios))
 
@@ -90,7 +88,6 @@ ASSEMBLIES = {
     "auxiliary": branching(auxiliary(AR1, predictive, 8, trigger=Always())),
     "resample-move": branching(resample_move(AR1, RandomWalkMove(AR1, 0.5), 8, trigger=Always())),
     "clusters": branching(bootstrap(AR1, 8, ClusterStratified(), Always())),
-    "k-dpp": branching(bootstrap(AR1, 8, KDpp(), Always())),
     "KLD size": branching(replace(bootstrap(AR1, 8, trigger=Always()), size=Kld(n_min=2, n_max=9))),
     "program": branching(Program(walk).resample_move(8, guide=guide, trigger=Always())),
     "per particle": branching(Program(per_particle(walk)).resample_move(8, trigger=Always())),
@@ -110,7 +107,6 @@ def used_twice(monkeypatch, filter, observations) -> list[Key]:
         return spy
 
     monkeypatch.setattr(Key, "generator", recorded(Key.generator))
-    monkeypatch.setattr(filter_module, "step_generator", recorded(filter_module.step_generator))
     filter.run(observations, 3)
     assert len(made) >= len(observations)
     return [key for key, times in made.items() if times > 1]

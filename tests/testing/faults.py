@@ -1,4 +1,7 @@
-"""Resamplers with one fault each, and correct ones."""
+"""Resamplers with one fault each, and correct ones.
+
+`FAULTS` holds ``class: (a property that it breaks, words of the message)``.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,45 @@ import copy
 import random
 import time
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from scipy.optimize import brentq
 
-from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp, normalise
+from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, log_mean_exp, normalise
+
+FAULTS: dict[type, tuple[str, str]] = {}
+
+
+def selecting(function, **attributes):
+    """A resampler class of ``function(rng, log_weights, n)``, which returns ancestors, or also log weights."""
+
+    def select(self, rng, log_weights, n):
+        found = function(rng, log_weights, n)
+        return found if isinstance(found, tuple) else (found, None)
+
+    body = {"select": select, "__doc__": function.__doc__, **attributes}
+    return dataclass(frozen=True)(type(function.__name__, (WeightResampler,), body))
+
+
+def faulty(broken, words, **attributes):
+    """Add a class, or one of `selecting`, to the list."""
+
+    def add(fault: Any) -> Any:
+        cls = fault if isinstance(fault, type) else selecting(fault, **attributes)
+        FAULTS[cls] = (broken, words)
+        return cls
+
+    return add
+
+
+def add_faults(add, **functions):
+    """Add the classes of functions whose messages have the same words."""
+    for name, function in functions.items():
+        function.__name__ = name
+        add(function)
+
+
+biased = faulty("carried_weight", "copies are biased")
 
 
 def systematic(rng, weights, n):
@@ -22,45 +58,43 @@ def systematic(rng, weights, n):
     return np.minimum(np.searchsorted(cumulative, points * cumulative[-1], side="right"), last)
 
 
-@dataclass(frozen=True)
-class Correct(WeightResampler):
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights), n), None
-
-
-@dataclass(frozen=True)
-class CorrectWeighted(WeightResampler):
-    """Select evenly among the positive ones and keep the weights: proper, with unequal output weights."""
-
-    def select(self, rng, log_weights, n):
-        even = (log_weights > -np.inf) / 1.0
-        ancestors = systematic(rng, even, n)
-        return ancestors, log_weights[ancestors] + np.log(even.mean())
-
-
 def multinomial(rng, weights, n):
     """Another correct scheme, with the largest variance."""
     return np.searchsorted(np.cumsum(weights)[:-1], rng.random(n) * weights.sum(), side="right")
 
 
-@dataclass(frozen=True)
-class Rejection(WeightResampler):
-    """Draws evenly and accepts with probability w / max w; the cost grows with max w / mean w."""
+# --- correct schemes ----------------------------------------------------------------------------------------------
 
-    def select(self, rng, log_weights, n):
-        weights = np.exp(log_weights - log_weights.max())
-        ancestors, waiting = np.empty(n, int), np.arange(n)
-        while len(waiting):
-            ancestors[waiting] = rng.integers(len(weights), size=len(waiting))
-            waiting = waiting[rng.random(len(waiting)) >= weights[ancestors[waiting]]]
-        return ancestors, None
+
+@selecting
+def Correct(rng, lw, n):
+    return systematic(rng, normalise(lw), n)
+
+
+@selecting
+def CorrectWeighted(rng, lw, n):
+    """Select evenly among the positive ones and keep the weights: proper, with unequal output weights."""
+    even = (lw > -np.inf) / 1.0
+    ancestors = systematic(rng, even, n)
+    return ancestors, lw[ancestors] + np.log(even.mean())
+
+
+@selecting
+def Rejection(rng, lw, n):
+    """Draws evenly and accepts with probability w / max w; the cost grows with max w / mean w."""
+    weights = np.exp(lw - lw.max())
+    ancestors, waiting = np.empty(n, int), np.arange(n)
+    while len(waiting):
+        ancestors[waiting] = rng.integers(len(weights), size=len(waiting))
+        waiting = waiting[rng.random(len(waiting)) >= weights[ancestors[waiting]]]
+    return ancestors
 
 
 @dataclass(frozen=True)
 class Metropolis(WeightResampler):
     """Chains of so many steps that their total variation distance from the weights is at most `tolerance`."""
 
-    tolerance: float = 0.01
+    tolerance: float = 0.05
 
     def select(self, rng, log_weights, n):
         weights = np.exp(log_weights - log_weights.max())
@@ -74,27 +108,7 @@ class Metropolis(WeightResampler):
 
 
 @dataclass(frozen=True)
-class Chopthin(WeightResampler):
-    """Light particles are thinned, heavy ones chopped: the output weights differ by a factor of at most `ratio`."""
-
-    ratio: float = 6.0
-
-    def select(self, rng, log_weights, n):
-        weights = normalise(log_weights)
-
-        def copies(a):
-            return np.where(weights < a, weights / a, np.maximum(1.0, 2 * weights / (self.ratio * a)))
-
-        a = brentq(lambda a: copies(a).sum() - n, 0.01 / n, 1.0, xtol=1e-15, rtol=1e-12)
-        expected = copies(a)
-        ancestors = systematic(rng, expected, n)
-        out = np.maximum(a, weights / np.maximum(np.bincount(ancestors, minlength=len(weights)), 1))
-        lw = np.where(weights < a, np.log(a), np.log(out))[ancestors]
-        return ancestors, lw + log_mean_exp(log_weights) + np.log(n)
-
-
-@dataclass(frozen=True)
-class MeansByOrder(Resampler):
+class MeansByOrder(TransformResampler):
     """New particles are means of the old ones by optimal transport, in one dimension: by order (Reich 2013)."""
 
     def resample(self, rng, population, n):
@@ -120,15 +134,13 @@ class RareHeaps(WeightResampler):
         return systematic(rng, weights, n), None
 
 
-@dataclass(frozen=True)
-class RareBlocks(WeightResampler):
+@selecting
+def RareBlocks(rng, lw, n):
     """In a call of 500, blocks of a third of the positions get one draw."""
-
-    def select(self, rng, log_weights, n):
-        weights = normalise(log_weights)
-        if rng.random() < 0.002 and n >= 3:
-            return np.resize(np.repeat(multinomial(rng, weights, 3), -(-n // 3)), n), None
-        return multinomial(rng, weights, n), None
+    weights = normalise(lw)
+    if rng.random() < 0.002 and n >= 3:
+        return np.resize(np.repeat(multinomial(rng, weights, 3), -(-n // 3)), n)
+    return multinomial(rng, weights, n)
 
 
 @dataclass(frozen=True)
@@ -145,291 +157,155 @@ class RandomNumber(WeightResampler):
         return ancestors, np.full(len(filled), log_mean_exp(log_weights) + np.log(len(filled) / n / share))
 
 
-@dataclass(frozen=True)
-class SizeChanging(WeightResampler):
+@selecting
+def SizeChanging(rng, lw, n):
     """Even draws that carry their weight: the total weight is kept on average only."""
-
-    def select(self, rng, log_weights, n):
-        ancestors = rng.choice(np.flatnonzero(log_weights > -np.inf), n)
-        return ancestors, log_weights[ancestors] + np.log((log_weights > -np.inf).mean())
+    ancestors = rng.choice(np.flatnonzero(lw > -np.inf), n)
+    return ancestors, lw[ancestors] + np.log((lw > -np.inf).mean())
 
 
-CORRECT = (
-    Metropolis(),
-    Chopthin(),
-    MeansByOrder(),
-    RareHeaps(),
-    RareBlocks(),
-    RandomNumber(),
-    SizeChanging(),
-)
+CORRECT = (Metropolis(), MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
+
+# --- wrong numbers of copies --------------------------------------------------------------------------------------
 
 
-class ForgetsAncestors(Resampler):
-    """A selection that sets no ancestors."""
-
-    def resample(self, rng, population, n):
-        ancestors = systematic(rng, population.weights, n)
-        return Population(population.particles[ancestors], np.full(n, population.log_mean_weight))
-
-
-@dataclass(frozen=True)
-class BiasedResidual(WeightResampler):
+@biased
+def BiasedResidual(rng, lw, n):
     """The remainder is drawn from W - copies instead of n W - copies: light particles are selected too rarely."""
-
-    def select(self, rng, log_weights, n):
-        W = normalise(log_weights)
-        copies = np.floor(n * W)
-        rest = np.maximum(W - copies, 0) if (np.maximum(W - copies, 0) > 0).any() else W
-        drawn = systematic(rng, rest, int(n - copies.sum())) if n > copies.sum() else np.array([], int)
-        return np.concatenate([np.repeat(np.arange(len(W)), copies.astype(int)), drawn]), None
+    W = normalise(lw)
+    copies = np.floor(n * W)
+    rest = np.maximum(W - copies, 0) if (np.maximum(W - copies, 0) > 0).any() else W
+    drawn = systematic(rng, rest, int(n - copies.sum())) if n > copies.sum() else np.array([], int)
+    return np.concatenate([np.repeat(np.arange(len(W)), copies.astype(int)), drawn])
 
 
-@dataclass(frozen=True)
-class IgnoresN(WeightResampler):
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights), len(log_weights)), None
+@faulty("gives_n_particles", "asked to make")
+def IgnoresN(rng, lw, n):
+    return systematic(rng, normalise(lw), len(lw))
 
 
-@dataclass(frozen=True)
-class PicksZeroWeights(WeightResampler):
+@faulty("zero_weights_are_never_chosen", "weight 0")
+def PicksZeroWeights(rng, lw, n):
     """Gives the remainder to the last particle, for any weight."""
-
-    def select(self, rng, log_weights, n):
-        W = normalise(log_weights)
-        copies = np.floor(n * W).astype(int)
-        copies[-1] += n - copies.sum()
-        return np.repeat(np.arange(len(W)), copies), None
+    copies = np.floor(n * normalise(lw)).astype(int)
+    copies[-1] += n - copies.sum()
+    return np.repeat(np.arange(len(lw)), copies)
 
 
-@dataclass(frozen=True)
-class ZeroAtTheEdge(WeightResampler):
+@faulty("zero_weights_are_never_chosen", "gives 0, of weights (0, 0, 1, 2, 3) it selects particle 0, weight 0")
+def ZeroAtTheEdge(rng, lw, n):
     """Picks a leading weight of zero where the uniform is exactly 0."""
-
-    def select(self, rng, log_weights, n):
-        points = (np.arange(n) + rng.random()) / n
-        return np.searchsorted(np.cumsum(normalise(log_weights)), points, side="left"), None
+    points = (np.arange(n) + rng.random()) / n
+    return np.searchsorted(np.cumsum(normalise(lw)), points, side="left")
 
 
-@dataclass(frozen=True)
-class RemainderFromWeights(WeightResampler):
+@biased
+def RemainderFromWeights(rng, lw, n):
     """The remainder is W - copies, which may be negative (a fault of a published library)."""
-
-    def select(self, rng, log_weights, n):
-        W = normalise(log_weights)
-        copies = np.floor(n * W).astype(int)
-        rest = W - copies
-        with np.errstate(all="ignore"):
-            cumulative = np.cumsum(rest / rest.sum())
-        cumulative[-1] = 1.0
-        drawn = np.searchsorted(cumulative, rng.random(n - copies.sum()))
-        return np.concatenate([np.repeat(np.arange(len(W)), copies), drawn]), None
+    W = normalise(lw)
+    copies = np.floor(n * W).astype(int)
+    rest = W - copies
+    with np.errstate(all="ignore"):
+        cumulative = np.cumsum(rest / rest.sum())
+    cumulative[-1] = 1.0
+    drawn = np.searchsorted(cumulative, rng.random(n - copies.sum()))
+    return np.concatenate([np.repeat(np.arange(len(W)), copies), drawn])
 
 
-@dataclass(frozen=True)
-class FirstAlwaysStays(WeightResampler):
+@biased
+def FirstAlwaysStays(rng, lw, n):
     """Always selects the first particle with weight."""
-
-    def select(self, rng, log_weights, n):
-        drawn = systematic(rng, normalise(log_weights), max(n - 1, 1))
-        return np.concatenate([[np.flatnonzero(log_weights > -np.inf)[0]], drawn])[:n], None
+    drawn = systematic(rng, normalise(lw), max(n - 1, 1))
+    return np.concatenate([[np.flatnonzero(lw > -np.inf)[0]], drawn])[:n]
 
 
-@dataclass(frozen=True)
-class GreedyCalledProper(WeightResampler):
-    def select(self, rng, log_weights, n):
-        best = np.argsort(-log_weights)[: np.isfinite(log_weights).sum()]
-        return best[np.arange(n) % len(best)], None
+@biased
+def GreedyCalledProper(rng, lw, n):
+    best = np.argsort(-lw)[: np.isfinite(lw).sum()]
+    return best[np.arange(n) % len(best)]
 
 
-@dataclass(frozen=True)
-class GlobalGenerator(WeightResampler):
-    def select(self, rng, log_weights, n):
-        return systematic(np.random, normalise(log_weights), n), None
-
-
-@dataclass(frozen=True)
-class OldWeightsKept(WeightResampler):
-    """Selects by weight and keeps the weight, so the weight counts twice."""
-
-    def select(self, rng, log_weights, n):
-        ancestors = systematic(rng, normalise(log_weights), n)
-        return ancestors, log_weights[ancestors]
-
-
-@dataclass(frozen=True)
-class WeightsForgotten(WeightResampler):
-    """Equal weights, but not those that keep the evidence."""
-
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights), n), np.full(n, -np.log(n))
-
-
-@dataclass(frozen=True)
-class OffByOne(WeightResampler):
+@faulty("gives_n_particles", "expected 0 to")
+def OffByOne(rng, lw, n):
     """Counts particles from 1."""
-
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights), n) + 1, None
+    return systematic(rng, normalise(lw), n) + 1
 
 
-@dataclass(frozen=True)
-class OffByOneClipped(WeightResampler):
+@faulty("carried_weight", "off by one")
+def OffByOneClipped(rng, lw, n):
     """Selects the next particle, inside the range."""
-
-    def select(self, rng, log_weights, n):
-        return (systematic(rng, normalise(log_weights), n) + 1) % len(log_weights), None
+    return (systematic(rng, normalise(lw), n) + 1) % len(lw)
 
 
-@dataclass(frozen=True)
-class OrderMatters(WeightResampler):
+@faulty("carried_weight", "are the particles sorted, and not the ancestors?")
+def OrderMatters(rng, lw, n):
     """Sorts by weight and forgets to sort back."""
-
-    def select(self, rng, log_weights, n):
-        return systematic(rng, np.sort(normalise(log_weights))[::-1], n), None
+    return systematic(rng, np.sort(normalise(lw))[::-1], n)
 
 
-@dataclass(frozen=True)
-class ChangesInput(WeightResampler):
-    def select(self, rng, log_weights, n):
-        log_weights -= log_mean_exp(log_weights)
-        return systematic(rng, np.exp(log_weights), n), None
-
-
-@dataclass(frozen=True)
-class SinglePrecisionOverflow(WeightResampler):
-    """exp in single precision overflows at 88."""
-
-    def select(self, rng, log_weights, n):
-        weights = np.exp(log_weights.astype(np.float32))
-        return systematic(rng, weights / weights.sum(), n), None
-
-
-@dataclass(frozen=True)
-class SinglePrecisionSum(WeightResampler):
-    """Cumulates in single precision: small weights are lost."""
-
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights).astype(np.float32), n), None
-
-
-@dataclass(frozen=True)
-class SeedIgnored(WeightResampler):
-    def select(self, rng, log_weights, n):
-        return systematic(np.random.default_rng(0), normalise(log_weights), n), None
-
-
-@dataclass(frozen=True)
-class OwnGenerator(WeightResampler):
-    """A new generator of unknown seed at each call."""
-
-    def select(self, rng, log_weights, n):
-        return systematic(np.random.default_rng(), normalise(log_weights), n), None
-
-
-@dataclass(frozen=True)
-class KeepsAll(WeightResampler):
+@faulty("carried_weight", "n = m must be resampled")
+def KeepsAll(rng, lw, n):
     """Returns all particles if as many are wanted."""
-
-    def select(self, rng, log_weights, n):
-        if n == len(log_weights):
-            return np.arange(n), None
-        return systematic(rng, normalise(log_weights), n), None
+    return np.arange(n) if n == len(lw) else systematic(rng, normalise(lw), n)
 
 
-@dataclass(frozen=True)
-class Flattens(WeightResampler):
+@faulty("carried_weight", "flattened")
+def Flattens(rng, lw, n):
     """Selects by a power of the weights if n = m."""
-
-    power: float = 0.9
-
-    def select(self, rng, log_weights, n):
-        power = self.power if n == len(log_weights) else 1.0
-        weights = np.where(log_weights > -np.inf, np.exp(power * (log_weights - log_weights.max())), 0.0)
-        return systematic(rng, weights, n), None
+    return systematic(rng, normalise((0.9 if n == len(lw) else 1.0) * lw), n)
 
 
-@dataclass(frozen=True)
-class TiesToTheFirst(WeightResampler):
+@faulty("carried_weight", "equal weight go to the first")
+def TiesToTheFirst(rng, lw, n):
     """Finds particles by their weight."""
-
-    def select(self, rng, log_weights, n):
-        _, first, index = np.unique(log_weights, return_index=True, return_inverse=True)
-        return first[index[systematic(rng, normalise(log_weights), n)]], None
+    _, first, index = np.unique(lw, return_index=True, return_inverse=True)
+    return first[index[systematic(rng, normalise(lw), n)]]
 
 
-@dataclass(frozen=True)
-class MeanOfPositive(WeightResampler):
-    """The evidence is the mean of the positive weights."""
-
-    def select(self, rng, log_weights, n):
-        positive = log_weights[log_weights > -np.inf]
-        return systematic(rng, normalise(log_weights), n), np.full(n, log_mean_exp(positive))
-
-
-@dataclass(frozen=True)
-class OnePosition(WeightResampler):
-    """The last position always goes to the heaviest particle, if n = m."""
-
-    def select(self, rng, log_weights, n):
-        ancestors = systematic(rng, normalise(log_weights), n)
-        if n == len(log_weights) > 1:
-            ancestors[0] = np.argmax(log_weights)
-        return ancestors, None
+@faulty("carried_weight", "positions always goes to particle")
+def OnePosition(rng, lw, n):
+    """The first position always goes to the heaviest particle, if n = m."""
+    ancestors = systematic(rng, normalise(lw), n)
+    if n == len(lw) > 1:
+        ancestors[0] = np.argmax(lw)
+    return ancestors
 
 
-@dataclass(frozen=True)
-class DropsLight(WeightResampler):
+@faulty("carried_weight", "dropped")
+def DropsLight(rng, lw, n):
     """Particles below a thousandth of the largest weight are dropped, if n = m."""
-
-    def select(self, rng, log_weights, n):
-        weights = normalise(log_weights)
-        if n == len(weights):
-            weights = np.where(weights < 1e-3 * weights.max(), 0.0, weights)
-        return systematic(rng, weights, n), None
+    weights = normalise(lw)
+    if n == len(weights):
+        weights = np.where(weights < 1e-3 * weights.max(), 0.0, weights)
+    return systematic(rng, weights, n)
 
 
-@dataclass(frozen=True)
-class Halves(WeightResampler):
+@faulty("carried_weight", "resampled apart")
+def Halves(rng, lw, n):
     """The halves of a population are resampled apart, if n = m is even."""
-
-    def select(self, rng, log_weights, n):
-        weights, half = normalise(log_weights), n // 2
-        if n != len(weights) or n % 2 or min(weights[:half].sum(), weights[half:].sum()) == 0:
-            return systematic(rng, weights, n), None
-        parts = systematic(rng, weights[:half], half), half + systematic(rng, weights[half:], half)
-        return np.concatenate(parts), None
+    weights, half = normalise(lw), n // 2
+    if n != len(weights) or n % 2 or min(weights[:half].sum(), weights[half:].sum()) == 0:
+        return systematic(rng, weights, n)
+    return np.concatenate([systematic(rng, weights[:half], half), half + systematic(rng, weights[half:], half)])
 
 
-@dataclass(frozen=True)
-class OnePercent(WeightResampler):
+@faulty("largest_weight", "heaviest particle gets +")
+def OnePercent(rng, lw, n):
     """The largest weight is 1 % too large; independent draws hide a small bias best."""
-
-    def select(self, rng, log_weights, n):
-        weights = normalise(log_weights)
-        weights[np.argmax(weights)] *= 1.01
-        return multinomial(rng, weights, n), None
+    weights = normalise(lw)
+    weights[np.argmax(weights)] *= 1.01
+    return multinomial(rng, weights, n)
 
 
-def faulty(function):
-    """A resampler class ``function(rng, log_weights, n) -> ancestors, log_weights``."""
-
-    def select(self, rng, log_weights, n):
-        found = function(rng, log_weights, n)
-        return found if isinstance(found, tuple) else (found, None)
-
-    return type(function.__name__, (WeightResampler,), {"select": select, "__doc__": function.__doc__})
+# --- faults at some sizes -----------------------------------------------------------------------------------------
 
 
-# --- faults at some sizes ---
-
-
-@faulty
+@faulty("carried_weight", "5 particles to 1")
 def single_is_heaviest(rng, lw, n):
     return np.array([np.argmax(lw)]) if n == 1 else systematic(rng, normalise(lw), n)
 
 
-@faulty
+@faulty("carried_weight", "125 particles to 5")
 def thins_first(rng, lw, n):
     """From many particles to few, the lightest half is dropped first."""
     weights = normalise(lw)
@@ -438,7 +314,7 @@ def thins_first(rng, lw, n):
     return multinomial(rng, weights, n)
 
 
-@faulty
+@biased
 def odd_is_special(rng, lw, n):
     found = systematic(rng, normalise(lw), n)
     if n % 2 and n > 1:
@@ -446,7 +322,7 @@ def odd_is_special(rng, lw, n):
     return found
 
 
-@faulty
+@biased
 def more_than_there_are(rng, lw, n):
     """If n > m every particle is kept once, and the rest is drawn."""
     weights, m = normalise(lw), len(lw)
@@ -455,51 +331,53 @@ def more_than_there_are(rng, lw, n):
     return np.concatenate([np.arange(m), systematic(rng, weights, n - m)])
 
 
-@faulty
-def eight_bits(rng, lw, n):
-    return systematic(rng, normalise(lw), n).astype(np.uint8).astype(int)
+add_faults(
+    faulty("carried_weight", "300 particles to 300"),
+    eight_bits=lambda rng, lw, n: systematic(rng, normalise(lw), n).astype(np.uint8).astype(int),
+    # Particles from number 256 on are never selected.
+    block_of_256=lambda rng, lw, n: systematic(rng, normalise(lw)[:256], n),
+)
 
 
-@faulty
+@faulty("many_particles", "too few bits")
 def sixteen_bits(rng, lw, n):
     return systematic(rng, normalise(lw), n).astype(np.int16).astype(int)
 
 
-@faulty
-def block_of_256(rng, lw, n):
-    """Particles from number 256 on are never selected."""
-    return systematic(rng, normalise(lw)[:256], n)
-
-
-@faulty
+@biased
 def last_is_forgotten(rng, lw, n):
-    weights = normalise(lw)
-    found = systematic(rng, weights, n)
-    return np.where((found == len(lw) - 1) & (weights[0] > 0), 0, found) if n == len(lw) else found
+    found = systematic(rng, normalise(lw), n)
+    return np.where((found == n - 1) & (lw[0] > -np.inf), 0, found) if n == len(lw) else found
 
 
-# --- faults at some weights ---
+@faulty("many_particles", "single precision")
+def SinglePrecisionSum(rng, lw, n):
+    """Cumulates in single precision: small weights are lost."""
+    return systematic(rng, normalise(lw).astype(np.float32), n)
 
 
-@faulty
+# --- faults at some weights ---------------------------------------------------------------------------------------
+
+
+@faulty("carried_weight", "heaviest particle gets -11 %")
 def at_most_half(rng, lw, n):
     return systematic(rng, np.minimum(normalise(lw), 0.5), n)
 
 
-@faulty
+@faulty("carried_weight", "particles to 3")
 def winner_takes_all(rng, lw, n):
     weights = normalise(lw)
     return np.full(n, np.argmax(weights)) if weights.max() > 0.9 else systematic(rng, weights, n)
 
 
-@faulty
+@faulty("carried_weight", "heaviest particle gets +")
 def heavy_gains(rng, lw, n):
     """A particle of more than 0.6 of the weight gets 5 % too much."""
     weights = normalise(lw)
     return multinomial(rng, np.where(weights > 0.6, 1.05, 1.0) * weights, n)
 
 
-@faulty
+@faulty("carried_weight", "100 particles to 2")
 def heaviest_of_many(rng, lw, n):
     """If there are more than twenty times as many as are selected, the light ones are left out."""
     w = normalise(lw)
@@ -508,23 +386,30 @@ def heaviest_of_many(rng, lw, n):
     return systematic(rng, w / w.sum(), n)
 
 
-@faulty
+@biased
 def floor_of_weights(rng, lw, n):
     weights = normalise(lw)
     return systematic(rng, np.where(weights > 0, np.maximum(weights, 0.02), 0), n)
 
 
-@faulty
+@faulty("scale_of_weights_is_irrelevant", "log weights")
 def dropped_by_absolute_weight(rng, lw, n):
     return systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n)
 
 
-@faulty
+@faulty("scale_of_weights_is_irrelevant", "overflow")
+def SinglePrecisionOverflow(rng, lw, n):
+    """exp in single precision overflows at 88."""
+    weights = np.exp(lw.astype(np.float32))
+    return systematic(rng, weights / weights.sum(), n)
+
+
+@faulty("zero_weights_are_never_chosen", "weight 0")
 def zero_is_small(rng, lw, n):
     return systematic(rng, normalise(np.nan_to_num(lw, neginf=-3.0)), n)
 
 
-@faulty
+@biased
 def rounds_up(rng, lw, n):
     """Residual resampling that rounds instead of taking the floor."""
     copies = np.rint(n * normalise(lw)).astype(int)
@@ -532,70 +417,82 @@ def rounds_up(rng, lw, n):
     return kept[:n] if len(kept) >= n else np.concatenate([kept, systematic(rng, normalise(lw), n - len(kept))])
 
 
-@faulty
-def offset_of_half(rng, lw, n):
-    """The systematic offset lies in the first half of a stratum."""
-    points = (np.arange(n) + 0.5 * rng.random()) / n
+def selected_at(points, lw):
+    """The particles at points of the cumulated weights."""
     weights = normalise(lw)
     return np.minimum(np.searchsorted(np.cumsum(weights), points, side="right"), np.flatnonzero(weights)[-1])
 
 
-@faulty
-def last_stratum(rng, lw, n):
-    """Strata of width 1 / (n - 1)."""
-    points = np.minimum((np.arange(n) + rng.random(n)) / max(n - 1, 1), 1 - 1e-12)
-    weights = normalise(lw)
-    return np.minimum(np.searchsorted(np.cumsum(weights), points, side="right"), np.flatnonzero(weights)[-1])
+add_faults(
+    biased,
+    # The systematic offset lies in the first half of a stratum.
+    offset_of_half=lambda rng, lw, n: selected_at((np.arange(n) + 0.5 * rng.random()) / n, lw),
+    # Strata of width 1 / (n - 1).
+    last_stratum=lambda rng, lw, n: selected_at(
+        np.minimum((np.arange(n) + rng.random(n)) / max(n - 1, 1), 1 - 1e-12), lw
+    ),
+)
 
 
-@faulty
+@faulty("carried_weight", "125 particles to 5")
 def sharpens_many(rng, lw, n):
     """A power of the weights, if there are more than a hundred."""
-    power = 1.1 if len(lw) > 100 else 1.0
-    return systematic(rng, normalise(power * lw), n)
+    return systematic(rng, normalise((1.1 if len(lw) > 100 else 1.0) * lw), n)
 
 
-# --- random numbers and state ---
+# --- random numbers and state -------------------------------------------------------------------------------------
 
 
-@faulty
+@faulty("does_not_use_global_generators", "global generator")
+def GlobalGenerator(rng, lw, n):
+    return systematic(np.random, normalise(lw), n)
+
+
+@faulty("does_not_use_global_generators", "numpy's global generator")
 def global_if_more(rng, lw, n):
-    source = np.random if n > len(lw) else rng
-    return systematic(source, normalise(lw), n)
+    return systematic(np.random if n > len(lw) else rng, normalise(lw), n)
 
 
-@faulty
+@faulty("does_not_use_global_generators", "Python's global generator")
 def python_generator(rng, lw, n):
     found = systematic(rng, normalise(lw), n)
     random.shuffle(found)
     return found
 
 
-@faulty
+@faulty("does_not_use_global_generators", "numpy's global generator")
 def reseeds_the_global(rng, lw, n):
     np.random.seed(int(rng.integers(1000)))  # noqa: NPY002
     return systematic(rng, normalise(lw), n)
 
 
+@faulty("depends_on_the_generator", "ignores `rng`")
+def SeedIgnored(rng, lw, n):
+    return systematic(np.random.default_rng(0), normalise(lw), n)
+
+
+_other_generator = faulty("repeats_with_the_same_generator", "does not come from `rng`")
+
+
+add_faults(
+    _other_generator,
+    # A new generator of unknown seed at each call.
+    OwnGenerator=lambda rng, lw, n: systematic(np.random.default_rng(), normalise(lw), n),
+    module_generator=lambda rng, lw, n: systematic(_OWN, normalise(lw), n),
+    seeded_by_time=lambda rng, lw, n: systematic(np.random.default_rng(time.time_ns()), normalise(lw), n),
+)
+
+
 _OWN = np.random.default_rng(5)
 
 
-@faulty
-def module_generator(rng, lw, n):
-    return systematic(_OWN, normalise(lw), n)
-
-
-@faulty
-def seeded_by_time(rng, lw, n):
-    return systematic(np.random.default_rng(time.time_ns()), normalise(lw), n)
-
-
-@faulty
+@faulty("depends_on_the_generator", "does not advance")
 def copies_the_generator(rng, lw, n):
     """Draws from a copy of the generator, which is not advanced."""
     return systematic(copy.deepcopy(rng), normalise(lw), n)
 
 
+@faulty("keeps_no_state", "keeps state")
 @dataclass(frozen=True)
 class FirstCallCached(WeightResampler):
     """The weights of the first call are used for ever, if there are as many."""
@@ -607,7 +504,7 @@ class FirstCallCached(WeightResampler):
         return systematic(rng, weights, n), None
 
 
-@dataclass(frozen=True)
+@faulty("keeps_no_state", "keeps state")
 class ResultCached(FirstCallCached):
     """The result of a call of the same sizes is returned again."""
 
@@ -618,16 +515,7 @@ class ResultCached(FirstCallCached):
         return self.cache[key], None
 
 
-_CACHE: dict = {}
-
-
-@faulty
-def module_cache(rng, lw, n):
-    """Cached by the sizes, beside the class."""
-    return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
-
-
-@dataclass(frozen=True)
+@faulty("keeps_no_state", "keeps state")
 class EverySecondCall(FirstCallCached):
     def select(self, rng, log_weights, n):
         self.cache["calls"] = self.cache.get("calls", 0) + 1
@@ -635,27 +523,58 @@ class EverySecondCall(FirstCallCached):
         return systematic(rng, weights, n), None
 
 
-@faulty
+_CACHE: dict = {}
+
+
+@biased
+def module_cache(rng, lw, n):
+    """Cached by the sizes, beside the class."""
+    return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
+
+
+@faulty("does_not_change_input", "in place")
+def ChangesInput(rng, lw, n):
+    lw -= log_mean_exp(lw)
+    return systematic(rng, np.exp(lw), n)
+
+
+@faulty("does_not_change_input", "in place")
 def in_place_if_equal(rng, lw, n):
     if n == len(lw):
         lw -= lw.max()
     return systematic(rng, normalise(lw), n)
 
 
-# --- output ---
+# --- output -------------------------------------------------------------------------------------------------------
 
 
-@faulty
-def sum_for_mean(rng, lw, n):
-    return systematic(rng, normalise(lw), n), np.full(n, np.logaddexp.reduce(lw))
+@faulty("carried_weight", "output weights are wrong")
+def OldWeightsKept(rng, lw, n):
+    """Selects by weight and keeps the weight, so the weight counts twice."""
+    ancestors = systematic(rng, normalise(lw), n)
+    return ancestors, lw[ancestors]
 
 
-@faulty
+add_faults(
+    faulty("carried_weight", "mean weight after selection"),
+    # Equal weights, but not those that keep the evidence.
+    WeightsForgotten=lambda rng, lw, n: (systematic(rng, normalise(lw), n), np.full(n, -np.log(n))),
+    sum_for_mean=lambda rng, lw, n: (systematic(rng, normalise(lw), n), np.full(n, np.logaddexp.reduce(lw))),
+)
+
+
+@faulty("carried_weight", "positive weights only")
+def MeanOfPositive(rng, lw, n):
+    """The evidence is the mean of the positive weights."""
+    return systematic(rng, normalise(lw), n), np.full(n, log_mean_exp(lw[lw > -np.inf]))
+
+
+@faulty("scale_of_weights_is_irrelevant", "do not add it")
 def single_precision_output(rng, lw, n):
     return systematic(rng, normalise(lw), n), np.full(n, log_mean_exp(lw)).astype(np.float32)
 
 
-@faulty
+@faulty("carried_weight", "output weights are wrong")
 def weights_of_neighbours(rng, lw, n):
     """Even draws that carry the weight of another particle."""
     even = (lw > -np.inf) / 1.0
@@ -663,160 +582,80 @@ def weights_of_neighbours(rng, lw, n):
     return ancestors, lw[np.sort(ancestors)[::-1]] + np.log(even.mean())
 
 
-@faulty
+@faulty("gives_n_particles", "float64, expected integers")
 def as_floats(rng, lw, n):
     return systematic(rng, normalise(lw), n).astype(float)
 
 
-@dataclass(frozen=True)
+@faulty("states_a_small_tolerance", "tolerance is 0.9")
 class StatesALargeBias(GreedyCalledProper):
     tolerance: ClassVar[float] = 0.9
 
 
-@dataclass(frozen=True)
-class NoDuplicates(WeightResampler):
+@faulty("gives_n_particles", "asked to make")
+def NoDuplicates(rng, lw, n):
     """Returns fewer than n without saying so."""
-
-    def select(self, rng, log_weights, n):
-        return np.unique(systematic(rng, normalise(log_weights), n)), None
+    return np.unique(systematic(rng, normalise(lw), n))
 
 
-@dataclass(frozen=True)
-class MoreThanAsked(WeightResampler):
-    exact_size: ClassVar[bool] = False
-
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights), n + 1), None
+@faulty("gives_n_particles", "asked to make", exact_size=False)
+def MoreThanAsked(rng, lw, n):
+    return systematic(rng, normalise(lw), n + 1)
 
 
-@dataclass(frozen=True)
-class CallsItDrawless(WeightResampler):
-    draws: ClassVar[bool] = False
-
-    def select(self, rng, log_weights, n):
-        return systematic(rng, normalise(log_weights), n), None
+@faulty("repeats_with_the_same_generator", "draws = False", draws=False)
+def CallsItDrawless(rng, lw, n):
+    return systematic(rng, normalise(lw), n)
 
 
-@dataclass(frozen=True)
-class MixesRuns(WeightResampler):
-    batched: ClassVar[bool] = True
-
-    def select(self, rng, log_weights, n):
-        if log_weights.ndim == 1:
-            return systematic(rng, normalise(log_weights), n), None
-        generators = rng.generators()
-        return np.array([systematic(g, normalise(log_weights.mean(axis=0)), n) for g in generators]), None
+@faulty("batched_runs_equal_single_runs", "are runs mixed", batched=True)
+def MixesRuns(rng, lw, n):
+    if lw.ndim == 1:
+        return systematic(rng, normalise(lw), n)
+    return np.array([systematic(g, normalise(lw.mean(axis=0)), n) for g in rng.generators()]), None
 
 
-@dataclass(frozen=True)
-class LosesMates(Resampler):
-    def resample(self, rng, population, n):
-        ancestors = systematic(rng, population.weights, n)
-        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
-        return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "mate"})
+# --- particles and parents ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class OldParents(Resampler):
+def changing(broken, words):
+    """Add a resampler whose correct selection a function ``(chosen, population, rng, n)`` changes."""
+
+    def add(function):
+        def resample(self, rng, population, n):
+            ancestors = rng.permutation(systematic(rng, population.weights, n))
+            chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
+            return function(chosen, population, rng, n)
+
+        cls = type(function.__name__, (Resampler,), {"resample": resample})
+        FAULTS[cls] = (broken, words)
+
+    return add
+
+
+@changing("gives_n_particles", 'no parents "ancestor"')
+def ForgetsAncestors(chosen, population, rng, n):
+    return Population(chosen.particles, chosen.log_weights)
+
+
+@changing("keeps_parents", '"mate"')
+def LosesMates(chosen, population, rng, n):
+    return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "mate"})
+
+
+@changing("keeps_parents", '"previous"')
+def OldParents(chosen, population, rng, n):
     """The parents "previous" are those of the first n particles."""
-
-    def resample(self, rng, population, n):
-        ancestors = systematic(rng, population.weights, n)
-        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
-        previous = np.resize(population.parents.get("previous", np.arange(len(population))), n)
-        return chosen.labelled({**chosen.parents, "previous": previous})
+    previous = np.resize(population.parents.get("previous", np.arange(len(population))), n)
+    return chosen.labelled({**chosen.parents, "previous": previous})
 
 
-@dataclass(frozen=True)
-class MovesSelected(Resampler):
-    """Jitters what it selects."""
-
-    def resample(self, rng, population, n):
-        ancestors = systematic(rng, population.weights, n)
-        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
-        return chosen.moved(chosen.particles + 0.01 * rng.standard_normal(n))
+@changing("keeps_parents", "not those of the ancestors")
+def MovesSelected(chosen, population, rng, n):
+    return chosen.moved(chosen.particles + 0.01 * rng.standard_normal(n))
 
 
-@dataclass(frozen=True)
-class SortsAncestors(Resampler):
+@changing("keeps_parents", "not those of the ancestors")
+def SortsAncestors(chosen, population, rng, n):
     """The ancestors are sorted after the particles were taken."""
-
-    def resample(self, rng, population, n):
-        ancestors = rng.permutation(systematic(rng, population.weights, n))
-        chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
-        return chosen.with_ancestors(np.sort(ancestors))
-
-
-#: Fault -> a property that it breaks, and words that the message says.
-FAULTS = {
-    BiasedResidual: ("carried_weight", "copies are biased"),
-    IgnoresN: ("gives_n_particles", "asked to make"),
-    PicksZeroWeights: ("zero_weights_are_never_chosen", "weight 0"),
-    ZeroAtTheEdge: ("handles_extreme_uniforms", 'side="right"'),
-    RemainderFromWeights: ("carried_weight", "copies are biased"),
-    FirstAlwaysStays: ("order_of_particles_is_irrelevant", "depends on the order"),
-    GreedyCalledProper: ("carried_weight", "copies are biased"),
-    GlobalGenerator: ("does_not_use_global_generators", "global generator"),
-    OldWeightsKept: ("carried_weight", "output weights are wrong"),
-    WeightsForgotten: ("carried_weight", "mean weight after selection"),
-    OffByOne: ("ancestors_in_range", "is 5, expected 0 to 4"),
-    OffByOneClipped: ("carried_weight", "off by one"),
-    OrderMatters: ("order_of_particles_is_irrelevant", "depends on the order"),
-    ChangesInput: ("does_not_change_input", "in place"),
-    SinglePrecisionOverflow: ("scale_of_weights_is_irrelevant", "overflow"),
-    SinglePrecisionSum: ("many_particles", "single precision"),
-    SeedIgnored: ("depends_on_the_generator", "ignores `rng`"),
-    OwnGenerator: ("repeats_with_the_same_generator", "does not come from `rng`"),
-    KeepsAll: ("carried_weight", "n = m must be resampled"),
-    Flattens: ("carried_weight", "flattened"),
-    TiesToTheFirst: ("carried_weight", "equal weight go to the first"),
-    MeanOfPositive: ("carried_weight", "positive weights only"),
-    OnePosition: ("carried_weight", "positions always goes to particle"),
-    DropsLight: ("carried_weight", "dropped"),
-    Halves: ("carried_weight", "resampled apart"),
-    OnePercent: ("largest_weight", "heaviest particle gets +"),
-    ForgetsAncestors: ("ancestors_in_range", 'no parents "ancestor"'),
-    single_is_heaviest: ("carried_weight", "5 particles to 1"),
-    thins_first: ("carried_weight", "125 particles to 5"),
-    odd_is_special: ("carried_weight", "copies are biased"),
-    more_than_there_are: ("carried_weight", "copies are biased"),
-    eight_bits: ("carried_weight", "300 particles to 300"),
-    sixteen_bits: ("many_particles", "too few bits"),
-    block_of_256: ("carried_weight", "300 particles to 300"),
-    last_is_forgotten: ("carried_weight", "copies are biased"),
-    at_most_half: ("carried_weight", "heaviest particle gets -11 %"),
-    winner_takes_all: ("carried_weight", "particles to 3"),
-    heavy_gains: ("carried_weight", "heaviest particle gets +"),
-    heaviest_of_many: ("carried_weight", "100 particles to 2"),
-    floor_of_weights: ("carried_weight", "copies are biased"),
-    dropped_by_absolute_weight: ("scale_of_weights_is_irrelevant", "log weights"),
-    zero_is_small: ("zero_weights_are_never_chosen", "weight 0"),
-    rounds_up: ("carried_weight", "copies are biased"),
-    offset_of_half: ("carried_weight", "copies are biased"),
-    last_stratum: ("carried_weight", "copies are biased"),
-    sharpens_many: ("carried_weight", "125 particles to 5"),
-    global_if_more: ("does_not_use_global_generators", "numpy's global generator"),
-    python_generator: ("does_not_use_global_generators", "Python's global generator"),
-    reseeds_the_global: ("does_not_use_global_generators", "numpy's global generator"),
-    module_generator: ("repeats_with_the_same_generator", "does not come from `rng`"),
-    seeded_by_time: ("repeats_with_the_same_generator", "does not come from `rng`"),
-    copies_the_generator: ("depends_on_the_generator", "does not advance"),
-    FirstCallCached: ("keeps_no_state", "keeps state"),
-    ResultCached: ("keeps_no_state", "keeps state"),
-    module_cache: ("carried_weight", "copies are biased"),
-    EverySecondCall: ("keeps_no_state", "keeps state"),
-    in_place_if_equal: ("does_not_change_input", "in place"),
-    sum_for_mean: ("carried_weight", "mean weight after selection"),
-    single_precision_output: ("scale_of_weights_is_irrelevant", "does not add"),
-    weights_of_neighbours: ("carried_weight", "output weights are wrong"),
-    as_floats: ("ancestors_in_range", "float64, expected integers"),
-    StatesALargeBias: ("states_a_small_tolerance", "tolerance is 0.9"),
-    NoDuplicates: ("gives_n_particles", "asked to make"),
-    MoreThanAsked: ("gives_n_particles", "asked to make"),
-    CallsItDrawless: ("draws_only_if_declared", "draws = False"),
-    MixesRuns: ("batched_runs_equal_single_runs", "are runs mixed"),
-    LosesMates: ("keeps_parents", '"mate"'),
-    OldParents: ("keeps_parents", '"previous"'),
-    MovesSelected: ("keeps_parents", "not those of the ancestors"),
-    SortsAncestors: ("keeps_parents", "not those of the ancestors"),
-}
+    return chosen.with_ancestors(np.sort(chosen.parents["ancestor"]))

@@ -5,7 +5,7 @@ Each table maps the name of a fault to a faulty component and to words of the er
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -429,11 +429,40 @@ OTHERS: dict[str, tuple[type, str, Any, Change, str]] = {
     "structure none": (Structure, "draw", SpanningTree(), lambda d: None, "returns None"),
 }
 
-RULES: dict[str, tuple[MotionRule, str]] = {
-    "writes": (WritesIntoTheTrack(), "in place"),
-    "state": (RuleDependsOnCalls(), "keeps state"),
-    "own generator": (RuleDrawsFromItsOwn(), "does not come from `rng`"),
+CORRECT = (Extrude(), MstRule(), Completes(), CompletesMany(), CompletesEach(), Moves(), Chooses(), Scores())
+
+
+def _errors() -> Iterator[tuple[str, tuple[Any, str, str]]]:
+    """Name, component, method, words."""
+    for kind, method, table in (
+        (Completes, "fill", PROBABILITIES),
+        (Moves, "candidates", MOTIONS),
+        (Chooses, "choose", CHOICES),
+        (Scores, "log_score", SCORES),
+    ):
+        for name, (change, words) in table.items():
+            yield f"{method}: {name}", (kind(change=change), method, words)
+    for name, (*definition, words) in OTHERS.items():
+        yield name, (faulty(*definition), definition[1], words)
+
+
+#: Components whose results are errors of a run and of the contract.
+ERRORS = dict(_errors())
+#: Components that a run warns of once.
+WARNINGS = {
+    **{name: (Completes(change=change), words) for name, (change, words) in STRANGE_PROBABILITIES.items()},
+    "too far": (Moves(change=TOO_FAR), "motions are in metres"),
+}
+#: Components that only the contract finds, or also a run.
+ONLY_BROKEN: dict[str, tuple[Any, str]] = {
+    **COMPLETERS,
+    "track": (WritesIntoTheTrack(), "in place"),
+    "state of a rule": (RuleDependsOnCalls(), "keeps state"),
+    "generator of a rule": (RuleDrawsFromItsOwn(), "does not come from `rng`"),
     "far": (Moves(change=TOO_FAR), "moves an object too far: by 15 m"),
 }
-
-CORRECT = (Extrude(), MstRule(), Completes(), CompletesMany(), CompletesEach(), Moves(), Chooses(), Scores())
+#: Components with correct results of other types.
+OTHER_TYPES = [
+    *(kind(change=change) for kind in (Completes, CompletesMany) for change in GOOD_PROBABILITIES.values()),
+    *(Scores(change=change) for change in GOOD_SCORES.values()),
+]

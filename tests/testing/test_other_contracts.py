@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
@@ -24,55 +23,30 @@ from mstfilter.smc import (
     observe,
     sample,
 )
-from mstfilter.testing import (
-    CodecContract,
-    DensityTransitionContract,
-    LookaheadContract,
-    ProposalContract,
-    RejuvenationContract,
-    UpdateContract,
-    run_contract,
-    scene_example,
-)
-from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, Box, optimal, predictive
-from tests.testing.other_faults import CORRECT, CORRECT_RANDOM, FAULTS, WEIGHTED_FAULTS, correct_kernel
+from mstfilter.smc.testing import CodecContract, LookaheadContract, RejuvenationContract
+from mstfilter.testing import run_contract, scene_example
+from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, Box, predictive
+from tests.testing import run_property
+from tests.testing.other_faults import CORRECT, CORRECT_RANDOM, FAULTS, NOT_FOUND, exact_ar1
 
 MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
 
 
 def vectors(rng, n):
-    return Population(rng.standard_normal((n, 1)), rng.standard_normal(n)), np.array([0.4])
+    return Population(rng.standard_normal((n, 1)), rng.standard_normal(n)), [0.4]
 
 
-class TestDynamics(DensityTransitionContract):
-    def make(self):
-        return Dynamics(MODEL)
-
-    def example(self, rng, n):
-        return vectors(rng, n)
-
-
-class TestPrior(ProposalContract):
-    def make(self):
-        return Prior(MODEL)
-
-
-class TestReweight(UpdateContract):
-    def make(self):
-        return Reweight(MODEL.log_likelihood)
-
-    def example(self, rng, n):
-        return vectors(rng, n)
+def traces(rng, n):
+    return Population({"x": rng.standard_normal(n)}, rng.standard_normal(n)), 0.4
 
 
 def boxes(rng, n):
     return Population(tuple(Box((int(k),) * 4) for k in rng.integers(3, size=n))), None
 
 
-def exact_ar1(rng, n):
-    """x_{t-1}, draws of p(x_t | x_{t-1}, y_t), y_t."""
-    previous = rng.normal(0.2, 1.0, n)
-    return Population(previous), Population(optimal(previous, 0.7).sample(rng, n)), 0.7
+def exact_traces(rng, n):
+    previous, x, y = exact_ar1(rng, n)
+    return Population({"x": previous.particles}), Population({"x": x.particles}), y
 
 
 def ar1(previous, y):
@@ -80,29 +54,14 @@ def ar1(previous, y):
     observe("y", Normal(x, TAU), y)
 
 
-def traces(rng, n):
-    return Population({"x": rng.standard_normal(n)}, rng.standard_normal(n)), 0.4
-
-
 class TestPriority(LookaheadContract):
     def make(self):
         return PriorityLookahead(predictive)
 
 
-class TestProgramLookahead(LookaheadContract):
+class TestNumbers(CodecContract):
     def make(self):
-        return ProgramLookahead(ar1, 0.5)
-
-    def example(self, rng, n):
-        return traces(rng, n)
-
-
-class TestRandomWalk(RejuvenationContract):
-    def make(self):
-        return RandomWalkMove(AR1, 0.7)
-
-    def exact(self, rng, n):
-        return exact_ar1(rng, n)
+        return ArrayCodec()
 
 
 class TestProgramMove(RejuvenationContract):
@@ -113,37 +72,28 @@ class TestProgramMove(RejuvenationContract):
         return traces(rng, n)
 
     def exact(self, rng, n):
-        previous, x, y = exact_ar1(rng, n)
-        return Population({"x": previous.particles}), Population({"x": x.particles}), y
+        return exact_traces(rng, n)
 
 
-class TestNumbers(CodecContract):
-    def make(self):
-        return ArrayCodec()
+OURS = {
+    "dynamics": (Dynamics(MODEL), vectors, None),
+    "prior": (Prior(MODEL), None, None),
+    "likelihood": (Reweight(MODEL.log_likelihood), vectors, None),
+    "lookahead of a program": (ProgramLookahead(ar1, 0.5), traces, None),
+    "random walk": (RandomWalkMove(AR1, 0.7), None, exact_ar1),
+    "codec of mappings": (ArrayCodec(), traces, None),
+    "codec of objects": (ArrayCodec(), boxes, None),
+    "codec of hypotheses": (HypothesisCodec(), scene_example, None),
+}
 
 
-class TestTraces(CodecContract):
-    def make(self):
-        return ArrayCodec()
-
-    def example(self, rng, n):
-        return traces(rng, n)
+def failures_of(component, example=None, exact=None):
+    return {r.name: r.failure for r in run_contract(component, example, exact) if r.failure}
 
 
-class TestObjects(CodecContract):
-    def make(self):
-        return ArrayCodec()
-
-    def example(self, rng, n):
-        return boxes(rng, n)
-
-
-class TestHypotheses(CodecContract):
-    def make(self):
-        return HypothesisCodec()
-
-    def example(self, rng, n):
-        return scene_example(rng, n)
+@pytest.mark.parametrize("name", OURS)
+def test_components_of_models_keep_their_contract(name):
+    assert failures_of(*OURS[name]) == {}
 
 
 @pytest.mark.parametrize(
@@ -152,30 +102,26 @@ class TestHypotheses(CodecContract):
 def test_components_of_the_package_keep_their_contract(kind):
     """All components but oracles, which need the ground truth of a recording, and front ends, which need files."""
     for name, where in REGISTRY.known(kind).items():
-        if where.startswith(("mstfilter.oracles:", "mstfilter.frontends:")):
-            continue
-        component = REGISTRY.build(kind, name)
-        assert [r for r in run_contract(component) if r.failure] == [], name
+        if not where.startswith(("mstfilter.oracles:", "mstfilter.frontends:")):
+            assert failures_of(REGISTRY.build(kind, name)) == {}, name
 
 
-@pytest.mark.parametrize(("fault", "name", "words"), FAULTS, ids=lambda f: getattr(f, "__name__", ""))
-def test_planted_faults_are_reported(fault, name, words):
-    broken = {r.name: r.failure for r in run_contract(fault(), exact=exact_ar1) if r.failure}
-    assert name in broken, broken
-    assert words in broken[name]
-
-
-@pytest.mark.parametrize(("fault", "name", "words", "exact"), WEIGHTED_FAULTS)
-def test_faults_of_weighted_distributions_are_reported(fault, name, words, exact):
+@pytest.mark.parametrize(("fault", "name", "words", "exact"), FAULTS)
+def test_planted_faults_are_reported(fault, name, words, exact):
     exact = exact or (exact_ar1 if issubclass(fault, Rejuvenation) else None)
-    broken = {r.name: r.failure for r in run_contract(fault(), exact=exact) if r.failure}
-    assert words in broken.get(name, ""), broken
+    with pytest.raises(AssertionError) as error:
+        run_property(fault(), name, exact)
+    assert words in str(error.value)
 
 
-@pytest.mark.parametrize(("component", "exact"), [*CORRECT, (correct_kernel(), exact_ar1)])
-def test_correct_weighted_distributions_pass(component, exact):
-    results = run_contract(component, exact=exact)
-    assert [r for r in results if r.failure or r.skipped] == []
+def test_no_planted_fault_is_lost():
+    assert len(FAULTS) == 103
+    assert len(NOT_FOUND) == 1
+
+
+@pytest.mark.parametrize(("component", "exact"), CORRECT)
+def test_correct_components_pass(component, exact):
+    assert [r for r in run_contract(component, exact=exact) if r.failure or r.skipped] == []
 
 
 @pytest.mark.parametrize(("component", "exact"), CORRECT_RANDOM)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,8 +21,6 @@ from mstfilter.segmentation import TreeCutProposal
 from mstfilter.testing import STAGE_OWNERS, run_contract, scene_example
 from mstfilter.tracking import StaticTest, TrackingTransition
 from tests.testing import scene_faults as faults
-
-OTHER_EVIDENCE = faults.Scores()
 
 
 @pytest.fixture(autouse=True)
@@ -60,124 +59,64 @@ def message_of(component: Any) -> str:
 
 
 def failures_of(component: Any) -> str:
-    return " ".join(r.failure for r in run_contract(component, example=scene_example) if r.failure)
+    return " ".join(r.failure for r in run_contract(component, scene_example) if r.failure)
 
 
-@pytest.mark.parametrize("kind", [faults.Completes, faults.CompletesMany, faults.CompletesEach])
+@pytest.mark.parametrize("name", faults.ERRORS)
+def test_faults_are_errors_of_a_run_and_of_the_contract(name):
+    component, method, words = faults.ERRORS[name]
+    message = message_of(component)
+    assert words in message and words in failures_of(component)
+    if "my own fault" not in words:
+        assert f"{type(component).__name__}.{method} (" in message and "scene_faults.py, line " in message
+
+
+@pytest.mark.parametrize("kind", [faults.CompletesMany, faults.CompletesEach])
 @pytest.mark.parametrize("fault", faults.PROBABILITIES)
-def test_faulty_probabilities_are_errors(kind, fault):
+def test_faulty_probabilities_of_other_methods_are_errors(kind, fault):
     change, words = faults.PROBABILITIES[fault]
-    message = message_of(kind(change=change))
     if kind is faults.CompletesEach and fault in ("axes", "one more axis", "flat", "one for the object"):
         words = "returns shape"
-    assert words in message
-    if fault != "exception":
-        assert f"{kind.__name__}." in message and "scene_faults.py, line " in message
+    message = message_of(kind(change=change))
+    assert words in message and (f"{kind.__name__}." in message or fault == "exception")
 
 
-@pytest.mark.parametrize("fault", faults.PROBABILITIES)
-def test_the_contract_reports_faulty_probabilities(fault):
-    change, words = faults.PROBABILITIES[fault]
-    assert words in failures_of(faults.Completes(change=change))
+@pytest.mark.parametrize("name", faults.ONLY_BROKEN)
+def test_the_contract_reports_what_a_run_cannot_know(name):
+    component, words = faults.ONLY_BROKEN[name]
+    assert words in failures_of(component)
 
 
-@pytest.mark.parametrize("kind", [faults.Completes, faults.CompletesMany])
-@pytest.mark.parametrize("good", faults.GOOD_PROBABILITIES)
-def test_other_types_of_probabilities_are_correct(kind, good):
-    component = kind(change=faults.GOOD_PROBABILITIES[good])
+@pytest.mark.parametrize(
+    "component", [faults.WritesIntoTheBox(), faults.DrawsUndeclared(), faults.WritesIntoTheTrack()]
+)
+def test_changed_arguments_and_undeclared_draws_are_errors(component):
+    assert re.search("in place|`stochastic` is False", message_of(component))
+
+
+@pytest.mark.parametrize("name", faults.WARNINGS)
+def test_strange_results_are_warned_of_once(name):
+    component, words = faults.WARNINGS[name]
+    with pytest.warns(InputWarning) as caught:
+        for _ in range(3):
+            scene_cache.clear()
+            step(component)
+    assert len(caught) == 1
+    assert words in str(caught[0].message) and "scene_faults.py, line " in str(caught[0].message)
+
+
+@pytest.mark.parametrize("component", faults.OTHER_TYPES, ids=repr)
+def test_other_types_are_correct(component):
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputWarning)
         step(component)
     assert failures_of(component) == ""
 
 
-@pytest.mark.parametrize("fault", faults.STRANGE_PROBABILITIES)
-def test_a_completer_that_ignores_what_is_seen_is_warned_of_once(fault):
-    change, words = faults.STRANGE_PROBABILITIES[fault]
-    with pytest.warns(InputWarning) as caught:
-        for _ in range(3):
-            scene_cache.clear()
-            step(faults.Completes(change=change))
-    assert len(caught) == 1
-    assert words in str(caught[0].message) and "scene_faults.py, line " in str(caught[0].message)
-
-
-@pytest.mark.parametrize("fault", faults.COMPLETERS)
-def test_the_contract_reports_faulty_completers(fault):
-    component, words = faults.COMPLETERS[fault]
-    assert words in failures_of(component)
-
-
-@pytest.mark.parametrize("fault", ["writes", "draws"])
-def test_faulty_completers_are_errors(fault):
-    component, words = faults.COMPLETERS[fault]
-    assert words in message_of(component)
-
-
-@pytest.mark.parametrize("fault", faults.MOTIONS)
-def test_faulty_candidates_are_errors(fault):
-    change, words = faults.MOTIONS[fault]
-    component = faults.Moves(change=change)
-    message = message_of(component)
-    assert words in message and words in failures_of(component)
-    if fault != "exception":
-        assert "Moves.candidates (" in message and "scene_faults.py, line " in message
-
-
-@pytest.mark.parametrize("fault", faults.CHOICES)
-def test_faulty_choices_are_errors(fault):
-    change, words = faults.CHOICES[fault]
-    component = faults.Chooses(change=change)
-    message = message_of(component)
-    assert words in message and words in failures_of(component)
-    assert "Chooses.choose (" in message and "scene_faults.py, line " in message
-
-
-def test_a_rule_that_moves_objects_out_of_the_workspace_is_warned_of_once():
-    component = faults.Moves(change=faults.TOO_FAR)
-    with pytest.warns(InputWarning) as caught:
-        step(component)
-        step(component)
-    assert len(caught) == 1
-    assert "motions are in metres" in str(caught[0].message)
-
-
-@pytest.mark.parametrize("fault", faults.RULES)
-def test_the_contract_reports_faulty_rules(fault):
-    component, words = faults.RULES[fault]
-    assert words in failures_of(component)
-
-
-def test_a_rule_that_changes_the_track_is_an_error():
-    assert "in place" in message_of(faults.WritesIntoTheTrack())
-
-
-@pytest.mark.parametrize("fault", faults.SCORES)
-def test_faulty_scores_are_errors(fault):
-    change, words = faults.SCORES[fault]
-    component = faults.Scores(change=change)
-    message = message_of(component)
-    assert words in message and words in failures_of(component)
-    if fault != "exception":
-        assert "Scores.log_score (" in message and "scene_faults.py, line " in message
-
-
-@pytest.mark.parametrize("good", faults.GOOD_SCORES)
-def test_other_types_of_scores_are_correct(good):
-    component = faults.Scores(change=faults.GOOD_SCORES[good])
-    step(component)
-    assert failures_of(component) == ""
+def test_scores_of_other_types_become_floats():
     population, clip = scene_example(np.random.default_rng(1), 4)
-    assert component.log_score(population.particles, clip).dtype == np.float64
-
-
-@pytest.mark.parametrize("fault", faults.OTHERS)
-def test_faults_of_other_parts_are_errors(fault):
-    *definition, words = faults.OTHERS[fault]
-    component = faults.faulty(*definition)
-    message = message_of(component)
-    assert words in message and f"Faulty.{definition[1]} (" in message
-    assert words in failures_of(component)
+    for change in faults.GOOD_SCORES.values():
+        assert faults.Scores(change=change).log_score(population.particles, clip).dtype == np.float64
 
 
 @pytest.mark.parametrize("component", faults.CORRECT, ids=lambda c: type(c).__name__)

@@ -11,15 +11,17 @@ import pytest
 import torch
 
 from mst_training import completion_data
-from mst_training.completion import CompletionTraining
+from mst_training.completion import CompletionTraining, divergence
 from mst_training.completion_data import CompletionSamples
-from mst_training.loop import calibration_error, run_training
+from mst_training.loop import run_training
 from mst_training.scenes import draw_camera, draw_scene
 from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
+from mstfilter.completion.unet import LatentLaw
 from mstfilter.errors import InputError
 from mstfilter.files import read_csv
+from mstfilter.scene import Seen
 from mstfilter.simulation.shapes import label_voxels
 from mstfilter.trained import open_model
 from tests.completion.test_completion import masks_of
@@ -102,9 +104,9 @@ def test_earlier_views_are_evidence_about_the_object():
             continue  # the crop has another place
         (_, alone, *_), (_, more, *_) = samples
         compared += 1
-        assert ((more & 1) > 0).sum() + ((more & 4) > 0).sum() >= ((alone & 1) > 0).sum() + ((alone & 4) > 0).sum()
-        assert not ((more & 4 > 0) & (more & 1 > 0)).any()
-        assert (samples[1][3] & (more & 4 > 0)).sum() <= 0.1 * samples[1][3].sum()  # errors of the motion
+        assert sum(f.among(more).sum() - f.among(alone).sum() for f in (Seen.SURFACE, Seen.FREE)) >= 0
+        assert not (Seen.FREE.among(more) & Seen.SURFACE.among(more)).any()
+        assert (samples[1][3] & Seen.FREE.among(more)).sum() <= 0.1 * samples[1][3].sum()  # errors of the motion
     assert compared >= 1
 
 
@@ -129,7 +131,7 @@ def test_training_learns_resumes_and_is_used(files, tmp_path):
         assert np.allclose(resumed.tensors[name], tensor, atol=1e-3)
 
     found = CompletionSamples.read(sorted((tmp_path / "a/samples/validation").glob("*.npz")))
-    unknown, rule = (found.bits & 4) == 0, extruded(found.bits)
+    unknown, rule = ~Seen.FREE.among(found.bits), extruded(found.bits)
     loss = 0.0
     for inside in (rule, ~rule & unknown):
         p = found.truth[inside].mean()
@@ -142,7 +144,7 @@ def test_training_learns_resumes_and_is_used(files, tmp_path):
 
     run_script("completion/compare.py", tmp_path / "a", "--most", 6, "--out", tmp_path / "out")
     rows = {row["completer"]: row for row in read_csv(tmp_path / "out/completion.csv") if row["group"] == "all"}
-    assert len(rows) == 6 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
+    assert len(rows) == 5 and float(rows["extrude"]["iou"]) > float(rows["surface"]["iou"])
 
     one = NetworkCompleter(weights=str(tmp_path / "a"))
     frame = frame_of(TWO, width=320)
@@ -163,8 +165,14 @@ def test_settings():
         CompletionTraining.recipe("fast")
 
 
-def test_calibration_error():
-    rng = np.random.default_rng(0)
-    p = rng.random(200_000)
-    assert calibration_error(p, rng.random(len(p)) < p) < 0.01
-    assert calibration_error(np.full(1000, 0.9), np.arange(1000) < 500) == pytest.approx(0.4)
+def test_divergence_of_normal_laws():
+    """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
+    torch.manual_seed(1)
+    a, b = (LatentLaw(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
+    x = a.mean + torch.randn(100_000, 3) * a.log_std.exp()
+
+    def log_density(law):
+        return (-0.5 * ((x - law.mean) * (-law.log_std).exp()) ** 2 - law.log_std).sum(dim=1)
+
+    assert float(divergence(a, b)) == pytest.approx(float((log_density(a) - log_density(b)).mean()), abs=0.03)
+    assert float(divergence(a, a)) == 0

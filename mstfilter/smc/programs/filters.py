@@ -16,7 +16,7 @@ from mstfilter.errors import InputError, check_integer, check_number
 from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
-from mstfilter.smc.interfaces import Lookahead, Proposal, Rejuvenation, Transition
+from mstfilter.smc.interfaces import Component, Lookahead, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
@@ -29,10 +29,11 @@ from mstfilter.smc.programs.handlers import (
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
-from mstfilter.smc.state_space import accept_moves, choose_rows
+from mstfilter.smc.state_space import choose_rows, moved
 from mstfilter.smc.streams import RunGenerators, child
 
 Model = Callable[..., Any]
+_Scored = tuple[ProgramRun, list[Site]]
 _HERE = str(Path(__file__).parent)
 
 
@@ -83,46 +84,67 @@ class Program:
 class _OfProgram(AtStep):
     """A component with a model, and perhaps a guide, that may depend on the step."""
 
-    @cached_property
-    def schedule(self) -> Schedule:
-        """Which steps are checked."""
-        return Schedule.of(vars(self)["model"], vars(self).get("guide"))
-
     @property
     def step_functions(self) -> Mapping[str, int | None]:  # type: ignore[override]
         functions = {name: value for name, value in vars(self).items() if name in ("model", "guide")}
         return {name: None if isinstance(value, PerParticle) else 2 for name, value in functions.items()}
 
 
-def _advance(
-    component: ProgramInitial | ProgramTransition,
-    rng: np.random.Generator,
-    past: Population | None,
-    observation: Any,
-    n: int,
-) -> Population:
-    """The population after a step."""
-    model, guide = component.model, None if observation is None else component.guide
-    previous = None if past is None else past.particles
-    # A batch compares some of its runs with single runs, which are guarded.
-    in_batch = isinstance(rng, RunGenerators)
-    guard = None if in_batch else component.schedule.guard(rng, past, observation, model, guide)
+@dataclass(frozen=True)
+class _ProgramStep(_OfProgram, Component):
+    """A step of a program: draws, by the guide if there is one, and weights."""
 
-    def step() -> tuple[Particles, np.ndarray]:
-        return _step(rng, model, guide, previous, observation, n)
+    model: Model
+    guide: Model | None = None
 
-    try:
-        particles, gain = step() if guard is None else guard.checked(_run_once, step)
-    except Exception:
-        if guard is not None:
-            component.schedule.clear()  # the next run is checked again
-        raise
-    try:
-        return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
-    except InputError:
-        if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
-            run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
-        raise
+    @property
+    def batched(self) -> bool | None:
+        return False if isinstance(self.model, PerParticle) else None
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """Which steps are checked."""
+        return Schedule.of(self.model, self.guide)
+
+    def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
+        """The population after a step."""
+        model, guide = self.model, None if observation is None else self.guide
+        previous = None if past is None else past.particles
+        # A batch compares some of its runs with single runs, which are guarded.
+        in_batch = isinstance(rng, RunGenerators)
+        guard = None if in_batch else self.schedule.guard(rng, past, observation, model, guide)
+
+        def step() -> tuple[Particles, np.ndarray]:
+            return _step(rng, model, guide, previous, observation, n)
+
+        try:
+            particles, gain = step() if guard is None else guard.checked(_run_once, step)
+        except Exception:
+            if guard is not None:
+                self.schedule.clear()  # the next run is checked again
+            raise
+        try:
+            return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
+        except InputError:
+            if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
+                run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
+            raise
+
+
+@dataclass(frozen=True)
+class ProgramInitial(_ProgramStep, Proposal):
+    """First step of a program: draws, by the guide if there is one, and weights."""
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        return self._advance(rng, None, observation, n)
+
+
+@dataclass(frozen=True)
+class ProgramTransition(_ProgramStep, Transition):
+    """A step of a program: draws, by the guide if there is one, and weights."""
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        return self._advance(rng, population, observation, len(population))
 
 
 def _step(
@@ -136,36 +158,6 @@ def _step(
     proposed = GuideHandler(rng, n)
     run_program(guide, proposed, previous, observation, n)
     return run_program(model, ReplayHandler(proposed), previous, observation, n)
-
-
-@dataclass(frozen=True)
-class ProgramInitial(_OfProgram, Proposal):
-    """First step of a program: draws, by the guide if there is one, and weights."""
-
-    model: Model
-    guide: Model | None = None
-
-    @property
-    def batched(self) -> bool | None:
-        return False if isinstance(self.model, PerParticle) else None
-
-    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return _advance(self, rng, None, observation, n)
-
-
-@dataclass(frozen=True)
-class ProgramTransition(_OfProgram, Transition):
-    """A step of a program: draws, by the guide if there is one, and weights."""
-
-    model: Model
-    guide: Model | None = None
-
-    @property
-    def batched(self) -> bool | None:
-        return False if isinstance(self.model, PerParticle) else None
-
-    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        return _advance(self, rng, population, observation, len(population))
 
 
 @dataclass(frozen=True)
@@ -224,13 +216,13 @@ class ProgramMove(_OfProgram, Rejuvenation):
         if not isinstance(self.model, PerParticle):
             particles, accepted = self._moved(rng, self.model, population.particles, past, observation, n, False)
         else:
-            moved, rates = [], []
+            traces, rates = [], []
             for i, particle in enumerate(population.particles):
                 stream, before = child(rng, "particle", i), None if past is None else past[i]
                 new, rate = self._moved(stream, self.model.function, particle, before, observation, 1, True)
-                moved.append(Trace(new))
+                traces.append(Trace(new))
                 rates.append(rate)
-            particles, accepted = tuple(moved), float(np.mean(rates))
+            particles, accepted = tuple(traces), float(np.mean(rates))
         return Population(particles, population.log_weights, population.parents, {"accepted": accepted})
 
     def _moved(
@@ -238,33 +230,34 @@ class ProgramMove(_OfProgram, Rejuvenation):
     ) -> tuple[Mapping[str, Any], float]:
         """Values after the steps, and the rate of accepted steps; `single` for one particle without particle axis."""
 
-        def score(values: Mapping[str, Any], no_axis: bool = False) -> tuple[ProgramRun, list[Site]]:
+        def score(values: Mapping[str, Any], no_axis: bool = False) -> _Scored:
             handler = ScoreHandler(values, no_axis)
             with hypothetical():
                 return _run_once(function, handler, previous, observation, n, single), handler.sites
 
-        now, sites = score(x, single)
-        taken = 0
-        for _ in range(self.steps):
+        def propose(rng: np.random.Generator, state: _Scored) -> tuple[_Scored, np.ndarray]:
+            now, sites = state
             values = self._propose(rng, now.values, sites)
             try:
                 new, new_sites = score(values)
             except InputError as error:
                 if not single or not isinstance(error.__cause__, InputError | None):
                     raise
-                continue  # other sites are reached, which have no values: rejected in both directions
+                return state, np.full(n, -np.inf)  # other sites are reached, which have no values
             if [s.name for s in new_sites] != [s.name for s in sites]:
-                continue
+                return state, np.full(n, -np.inf)
             forward = self._log_density(now.values, values, sites, n)
             backward = self._log_density(values, now.values, new_sites, n)
             with np.errstate(invalid="ignore"):
-                yes = accept_moves(rng, new.gain - now.gain + backward - forward)
-            taken += int(yes.sum())
-            if yes.all():
-                now, sites = new, new_sites
-            elif yes.any():
-                now, sites = score(choose_rows(yes, new.values, now.values))
-        return _values_of(now), taken / (self.steps * n)
+                return (new, new_sites), new.gain - now.gain + backward - forward
+
+        def choose(accepted: np.ndarray, new: _Scored, old: _Scored) -> _Scored:
+            if accepted.all() or not accepted.any():
+                return new if accepted.any() else old
+            return score(choose_rows(accepted, new[0].values, old[0].values))
+
+        (now, _), rate = moved(rng, score(x, single), propose, self.steps, choose)
+        return _values_of(now), rate
 
     def _propose(
         self, rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site]

@@ -22,6 +22,7 @@ import pickle
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import copy
 from functools import partial
 from types import CellType, FunctionType, MethodType
@@ -98,7 +99,8 @@ class Guard:
     # --- the same random numbers ------------------------------------------------------------------------------------
     def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray, runs: list[ProgramRun]) -> None:
         self.rng.bit_generator.state = self.state
-        with recorded() as repeated, np.errstate(invalid="call"), _noting_invalid() as invalid:
+        invalid: list[str] = []
+        with recorded() as repeated, np.errstate(invalid="call", call=lambda kind, _: invalid.append(kind)):
             try:
                 again, gain_again = step()
             except Exception as error:
@@ -115,20 +117,9 @@ class Guard:
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
         """Compare some particles in a run with the same particles in a run of their own."""
-        if any(shapes.ambiguous for shapes in whole.shapes.values()):
+        if any(call.ambiguous for call in whole.calls or ()):
             rows = rows[:1]
-        with recorded() as runs:
-            try:
-                few = self._run_again(run, whole, rows)
-                _check_shapes(whole, few, "")
-            except Exception as error:
-                _check_shapes(whole, runs[0], str(error))
-                try:  # a program may be written for n particles
-                    rows = np.resize(rows, whole.n)
-                    few = self._run_again(run, whole, rows)
-                except Exception as again:
-                    message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
-                    raise InputError(message, *_ALONE) from again
+        few, rows = self._run_alone(run, whole, rows)
         for call in few.calls or ():
             if call.distribution is not None:
                 _check_density(call.what, call.distribution, self.rng)
@@ -139,17 +130,23 @@ class Guard:
             if call.size:
                 raise InputError(f"{call.what} is reached by particle {rows[0]} alone only", *_ALONE)
         for name, values in whole.returned.items():
-            found = few.returned.get(name, values[rows])
-            if found.shape[1:] != values.shape[1:]:
-                raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {found.shape[1:]}")
-            different = ~_close(values[rows], found, _VALUE, _spread(values))
-            if different.any():
-                i = tuple(np.argwhere(different)[0])
-                raise InputError(
-                    f"returned {name!r} of particle {rows[i[0]]} is {values[rows][i]} among {whole.n} particles, "
-                    f"{found[i]} alone",
-                    *_ALONE,
-                )
+            _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
+
+    def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> tuple[ProgramRun, np.ndarray]:
+        """A run of some particles, and their rows: repeated to n rows if the program needs n particles."""
+        with recorded() as runs:
+            try:
+                few = self._run_again(run, whole, rows)
+                _check_shapes(whole, few, "")
+            except Exception as error:
+                _check_shapes(whole, runs[0], str(error))
+                try:
+                    rows = np.resize(rows, whole.n)
+                    few = self._run_again(run, whole, rows)
+                except Exception as again:
+                    message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
+                    raise InputError(message, *_ALONE) from again
+        return few, rows
 
     def _check_single(self, run: Run, particles: Any, gain: np.ndarray) -> None:
         """Compare two particles of a `per_particle` program with runs that keep nothing of the other particles."""
@@ -223,23 +220,18 @@ class Schedule(Counter[Any]):
     def of(cls, model: Any, guide: Any) -> Schedule:
         if len(_SCHEDULES) > 200:
             _SCHEDULES.clear()
-        kept, identity = [*_parts(model), *_parts(guide)], []
-        for value in kept:
-            identity.append(value if isinstance(value, str | int | bool | None) else id(value))
-        return _SCHEDULES.setdefault(tuple(identity), (cls(), kept))[0]  # no other object gets the id of a kept one
+        kept = [*_parts(model), *_parts(guide)]
+        key = tuple(value if isinstance(value, str | int | bool | None) else id(value) for value in kept)
+        return _SCHEDULES.setdefault(key, (cls(), kept))[0]  # no other object gets the id of a kept one
 
     def guard(
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
     ) -> Guard | None:
         """A guard if the next step is to be checked."""
-        kind = (
-            past is None,
-            observation is None,
-            guide is None,
-            type(observation) is np.ndarray and observation.shape,
-        )
-        count = self[kind] = self.get(kind, 0) + 1
-        return Guard(rng, past, observation, model, guide, count) if count in _CHECKED else None
+        shape = observation.shape if type(observation) is np.ndarray else None
+        kind = (past is None, observation is None, guide is None, shape)
+        self[kind] += 1
+        return Guard(rng, past, observation, model, guide, self[kind]) if self[kind] in _CHECKED else None
 
 
 _SCHEDULES: dict[tuple[Any, ...], tuple[Schedule, list[Any]]] = {}
@@ -252,51 +244,39 @@ def _parts(function: Any) -> list[Any]:
     """
     while isinstance(function, partial | PerParticle):
         function = function.func if isinstance(function, partial) else function.function
-    code = getattr(function, "__code__", None)
-    if code is None:
-        return [function]
     values = [*(getattr(function, "__defaults__", None) or ())]
     for cell in getattr(function, "__closure__", None) or ():
-        try:
+        with suppress(ValueError):  # an empty cell
             values.append(cell.cell_contents)
-        except ValueError:  # an empty cell
-            continue
-    return [code, *(v for v in values if not isinstance(v, float | np.ndarray))]
+    return [getattr(function, "__code__", function), *(v for v in values if not isinstance(v, float | np.ndarray))]
 
 
 def _with_copies(function: Any) -> Any:
-    """The function with copies of the values that it keeps: containers in its closure, defaults and globals."""
+    """The function with copies of the containers in its closure, defaults, globals and attributes."""
     if isinstance(function, partial):
         return partial(_with_copies(function.func), *function.args, **function.keywords)
     if isinstance(function, PerParticle):
         return _with_copies(function.function)
     if isinstance(function, MethodType):
         return MethodType(function.__func__, _with_copies(function.__self__))
-    if not isinstance(function, FunctionType):
-        return _object_with_copies(function)
     try:
-        cells = tuple(CellType(_copied(cell.cell_contents)) for cell in function.__closure__ or ())
-        names = {
-            name: _copied(function.__globals__[name])
-            for name in function.__code__.co_names
-            if name in function.__globals__
-        }
-        defaults = tuple(map(_copied, function.__defaults__ or ()))
-    except (ValueError, RecursionError):  # an empty cell, or a list in itself
+        if isinstance(function, FunctionType):
+            return _function_with_copies(function)
+        new = copy(function)
+        if new is not function:
+            new.__dict__.update(_copied(vars(function)))
+    except Exception:  # an empty cell, a list in itself, or an object that cannot be copied
         return function
-    new = FunctionType(function.__code__, {**function.__globals__, **names}, None, defaults, cells)
-    new.__kwdefaults__ = function.__kwdefaults__
     return new
 
 
-def _object_with_copies(value: Any) -> Any:
-    """A copy of an object with copies of its attributes; the object itself if it cannot be copied."""
-    try:
-        new = copy(value)
-        if new is not value:
-            new.__dict__.update(_copied(vars(value)))
-    except Exception:  # of the user's class
-        return value
+def _function_with_copies(function: FunctionType) -> FunctionType:
+    cells = tuple(CellType(_copied(cell.cell_contents)) for cell in function.__closure__ or ())
+    kept = function.__globals__
+    names = {name: _copied(kept[name]) for name in function.__code__.co_names if name in kept}
+    defaults = tuple(map(_copied, function.__defaults__ or ()))
+    new = FunctionType(function.__code__, {**kept, **names}, None, defaults, cells)
+    new.__kwdefaults__ = function.__kwdefaults__
     return new
 
 
@@ -307,17 +287,6 @@ def _copied(value: Any) -> Any:
     if type(value) is dict:
         return {key: _copied(v) for key, v in value.items()}
     return type(value)(map(_copied, value)) if type(value) in (list, set) else value
-
-
-class _noting_invalid(list[str]):
-    """The kinds of invalid operations of numpy in a block."""
-
-    def __enter__(self) -> _noting_invalid:
-        self.before = np.seterrcall(lambda kind, _: self.append(kind))
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        np.seterrcall(self.before)
 
 
 def _check_returned(run: ProgramRun) -> None:
@@ -376,18 +345,18 @@ def _first_difference(particles: Any, again: Any) -> str | None:
         if list(particles) != list(again):
             return f"the names {sorted(set(particles) ^ set(again))}"
         return next((f"values of {k!r}" for k, v in particles.items() if not _same(v, again[k])), None)
-    found = (_first_difference(dict(a), dict(b)) for a, b in zip(particles, again, strict=True))
+    found = map(_first_difference, particles, again)
     return next((f"{d} of particle {i}" for i, d in enumerate(found) if d is not None), None)
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether two values are equal; objects without a comparison are."""
+    """Whether two values are equal up to rounding; objects without a comparison are."""
     if isinstance(a, np.ndarray | np.generic | float):
         return np.shape(a) == np.shape(b) and bool(_close(a, b, 1e-9).all())
     if isinstance(a, Mapping) and isinstance(b, Mapping):
-        return _first_difference(a, b) is None
+        return list(a) == list(b) and all(map(_same, a.values(), b.values()))
     if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
+        return len(a) == len(b) and all(map(_same, a, b))
     return type(a).__eq__ is object.__eq__ or bool(np.all(a == b))
 
 
@@ -405,17 +374,17 @@ def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
     A vector with as many entries as there are particles looks like one number for each of them, and an array (n, n)
     made from (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
     """
-    for k, found in whole.shapes.items():
+    calls = alone.calls or []
+    for k, found in enumerate(whole.calls or ()):
         if not found.ambiguous:
             continue
-        if raised and k == alone.n_calls + 1:
+        if raised and k == len(calls):
             raise InputError(
                 f"{found.what}: an error with one particle, and none with {whole.n}: "
                 + raised.removeprefix(f"{found.what}: ")
             )
-        one = alone.shapes.get(k, found._replace(event=(), value=found.value and ()))
-        if k <= alone.n_calls and not (found.event == one.event and (one.value is None or one.fits)):
-            raise found.error(f"{found.what}: ")
+        if k < len(calls) and not (found.event == calls[k].event and calls[k].fits):
+            raise found.shape_error(f"{found.what}: ")
 
 
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
@@ -431,25 +400,36 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
     if not len(here):
         return
     k = position[here]
-    _equal_densities(call, rows[here], among[k], alone.densities(alone.value))
+    pairs = [(among, alone.densities(alone.value))]
     if call.distribution is not None:
-        if alone.value.shape[1:] != call.value.shape[1:]:
+        events = call.value.shape[1:], alone.value.shape[1:]
+        if events[0] != events[1]:
+            fact = f"{call.what}: an event has shape {events[0]} among the others, {events[1]} alone"
+            raise InputError(fact, *_ALONE)
+        other = call.value[k[0] - 1]  # the value of another particle
+        values = [np.full(c.value.shape, other, c.value.dtype) for c in (call, alone)]
+        pairs.append((call.densities(values[0]), alone.densities(values[1])))
+    for found, expected in pairs:
+        different = ~_close(found[k], expected, _LOG_DENSITY, 1.0)
+        if different.any():
+            i = int(np.argmax(different))
             raise InputError(
-                f"{call.what}: an event has shape {call.value.shape[1:]} among the others, {alone.value.shape[1:]} "
-                "alone",
+                f"{call.what}: particle {rows[here[i]]} has log density {found[k][i]:.6g} among the others, "
+                f"{expected[i]:.6g} alone",
                 *_ALONE,
             )
-        other = call.value[k[0] - 1]  # the value of another particle
-        among, lone = (c.densities(np.full(c.value.shape, other, c.value.dtype)) for c in (call, alone))
-        _equal_densities(call, rows[here], among[k], lone)
 
 
-def _equal_densities(call: Call, rows: np.ndarray, among: np.ndarray, alone: np.ndarray) -> None:
-    different = ~_close(among, alone, _LOG_DENSITY, 1.0)
+def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np.ndarray) -> None:
+    """Raise unless particles have the same returned values among the others and alone."""
+    if alone.shape[1:] != values.shape[1:]:
+        raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}")
+    different = ~_close(values[rows], alone, _VALUE, _spread(values))
     if different.any():
-        i = int(np.argmax(different))
+        i = tuple(np.argwhere(different)[0])
         raise InputError(
-            f"{call.what}: particle {rows[i]} has log density {among[i]:.6g} among the others, {alone[i]:.6g} alone",
+            f"returned {name!r} of particle {rows[i[0]]} is {values[rows][i]} among {len(values)} particles, "
+            f"{alone[i]} alone",
             *_ALONE,
         )
 

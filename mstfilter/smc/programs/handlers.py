@@ -53,9 +53,9 @@ class SiteHandler(ABC):
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         """Values (size, ...) of a site and what they add to the log weights (None: nothing)."""
 
-    @abstractmethod
     def row(self, index: int) -> SiteHandler:
         """The handler of one particle of a `per_particle` program."""
+        return self
 
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
         """End a pass, in which the sites have the given values."""
@@ -175,9 +175,6 @@ class CentreHandler(SiteHandler):
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         return np.broadcast_to(site.distribution.centre, site.distribution.value_shape(site.size)), None
 
-    def row(self, index: int) -> CentreHandler:
-        return self
-
 
 class CopyHandler(SiteHandler):
     """Gives the particles the values that the particles `rows` have in `values`."""
@@ -194,9 +191,6 @@ class CopyHandler(SiteHandler):
         if self.values[site.name].shape[1:] != shape[1:]:
             return np.zeros(shape), None  # an error later
         return self.values[site.name][self.rows[site.index]], None
-
-    def row(self, index: int) -> CopyHandler:
-        return self
 
 
 class ScoreHandler(SiteHandler):

@@ -168,15 +168,44 @@ def _frozen(value: Any) -> Any:
 
 
 class Call(NamedTuple):
-    """A call of `sample` or `observe`, or a branch of `switch`, in a run."""
+    """A call of `sample` or `observe`, a branch of `switch`, or a returned value, in a run."""
 
     what: str  #: description, for messages
     k: int  #: number among the calls of this description
     rows: np.ndarray | None  #: (size,) indices of the particles, ascending; None stands for all
     size: int
+    event: tuple[int, ...] = ()  #: event shape
+    observed: tuple[int, ...] | None = None  #: shape of the observed value
     log_prob: Any = 0.0  #: of an observation; (size,), or one for all
     distribution: Distribution | None = None  #: of a site
     value: Any = None  #: (size, ...) of a site
+
+    @property
+    def fits(self) -> bool:
+        """Whether an observed value is an event, or one for each particle; a number is an event of shape (1,)."""
+        event, value = self.event, self.observed
+        return value in (None, event, (1, *event), (self.size, *event)) or (value == () and event == (1,))
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the axis of the particles may be an axis of the event, or the reverse."""
+        return self.size > 1 and (self.size in self.event or self.observed == (self.size, *self.event))
+
+    def shape_error(self, prefix: str = "") -> InputError:
+        """The error of a wrong shape."""
+        hints = []
+        if self.size > 1 and self.size in self.event:
+            hints += ["arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]"]
+        if self.observed is None:
+            fact = f"an event has shape {self.event}, which changes with the number of particles"
+        else:
+            fact = f"the value has shape {self.observed}, expected {self.event}"
+            hints += [
+                "give all entries of the vector, or observe one entry by its parameters, such as x[:, 0]"
+                if len(self.observed) < len(self.event)
+                else "a vector of k entries needs parameters (n, k) or (1, k), such as Normal(x[:, None], 1.0)"
+            ]
+        return InputError(f"{prefix}{fact}", *hints)
 
     @property
     def reached(self) -> np.ndarray:
@@ -202,41 +231,6 @@ class Call(NamedTuple):
         return log_prob if log_prob.shape == (self.size,) else np.broadcast_to(log_prob, (self.size,))
 
 
-class Shapes(NamedTuple):
-    """Shapes at a site, an observation or a returned value."""
-
-    what: str  #: description, for messages
-    event: tuple[int, ...]  #: event shape
-    value: tuple[int, ...] | None  #: shape of the observed value
-    size: int  #: number of particles
-
-    @property
-    def fits(self) -> bool:
-        """Whether the value is an event, or one for each particle; a number is an event of shape (1,)."""
-        event, value = self.event, self.value
-        return value in (event, (1, *event), (self.size, *event)) or (value == () and event == (1,))
-
-    @property
-    def ambiguous(self) -> bool:
-        """Whether the axis of the particles may be an axis of the event, or the reverse."""
-        return self.size > 1 and (self.size in self.event or self.value == (self.size, *self.event))
-
-    def error(self, prefix: str = "") -> InputError:
-        """The error of a wrong shape."""
-        hints = []
-        if self.size > 1 and self.size in self.event:
-            hints += ["arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]"]
-        if self.value is None:
-            return InputError(
-                f"{prefix}an event has shape {self.event}, which changes with the number of particles", *hints
-            )
-        if len(self.value) < len(self.event):
-            hints += ["give all entries of the vector, or observe one entry by its parameters, such as x[:, 0]"]
-        else:
-            hints += ["a vector of k entries needs parameters (n, k) or (1, k), such as Normal(x[:, None], 1.0)"]
-        return InputError(f"{prefix}the value has shape {self.value}, expected {self.event}", *hints)
-
-
 class ProgramRun:
     """One pass of a program over n particles; the handler decides the values.
 
@@ -248,8 +242,6 @@ class ProgramRun:
         self.values: dict[str, np.ndarray] = {}
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
-        self.shapes: dict[int, Shapes] = {}  # of the calls that do not have a number for each particle, in order
-        self.n_calls = 0
         self._last, self.inside = ("", "", ""), False  # the last call, and whether it is being processed
         runs = _RECORDED.get()
         self.calls: list[Call] | None = None if runs is None else []  # if they are recorded
@@ -267,15 +259,19 @@ class ProgramRun:
         kind, name, where = self._last
         return f"{kind} {name!r}{where}" if kind else ""
 
+    @property
+    def _size(self) -> int:
+        """Number of particles of the branch."""
+        return self.n if self._rows is None else len(self._rows)
+
     def returns(self, name: str, value: np.ndarray) -> None:
         """Keep the shape of a returned value."""
         self._last = ("returned", name, "")
-        self.record(value.shape[1:], None, self.n)
+        self._note(event=value.shape[1:])
 
     def sample(self, name: str, distribution: Any, branch: bool = False) -> Any:
         self._last, self.inside = ("site", name, self._where), True
-        rows, distribution = self._rows, as_distribution(distribution)
-        size = self.n if rows is None else len(rows)
+        rows, size, distribution = self._rows, self._size, as_distribution(distribution)
         self._check_name(name)
         value, gain = self.handler.value(Site(name, distribution, size, rows, branch))
         value = frozen_view(np.asarray(value))
@@ -284,9 +280,7 @@ class ProgramRun:
                 check_shape("its draws", value, distribution, size)
             if self.handler.draws and not distribution.draws_numbers:
                 _check_draws(value, distribution)
-        self.record(value.shape[1:], None, size)
-        if self.calls is not None:
-            self._note(rows, size, distribution=distribution, value=value)
+        self._note(event=value.shape[1:], distribution=distribution, value=value)
         self._store(name, value, rows)
         if gain is not None:
             self._add(gain, size)
@@ -299,16 +293,13 @@ class ProgramRun:
             raise InputError("a guide does not observe, the model weights the particles", "remove it from the guide")
         if value is not None:
             distribution = as_distribution(distribution)
-            size = self.n if self._rows is None else len(self._rows)
             found: tuple[int, ...] = () if isinstance(value, float) else np.shape(value)
-            if self.single:
-                shape = distribution.parameter_shape
-                event = shape[1:] if shape[:1] == (1,) else shape
-            else:
-                event = distribution.value_shape(size)[1:]
-                if len(found) > 1 and found[0] == size and not distribution.parameter_shape:
-                    event = found[1:]  # independent entries with the same parameters
-            self.record(event, found, size)
+            event = self._event_shape(distribution, found)
+            if found != event:
+                call = Call(self.what, 0, self._rows, self._size, event, found)
+                if not call.fits:
+                    self._note(event=event, observed=found)
+                    raise call.shape_error()
             if found and any(value is v for v in self.values.values()):
                 raise InputError(
                     "the value is that of a site, which is drawn and not observed",
@@ -317,10 +308,18 @@ class ProgramRun:
             if self.calls is not None:
                 distribution.check_parameters()
             log_prob = distribution.log_prob(value)
-            if self.calls is not None:
-                self._note(self._rows, size, log_prob)
-            self._add(log_prob, size)
+            self._note(event=event, observed=found, log_prob=log_prob)
+            self._add(log_prob, self._size)
         self.inside = False
+
+    def _event_shape(self, distribution: Distribution, found: tuple[int, ...]) -> tuple[int, ...]:
+        """Event shape of a distribution of which a value of shape `found` is observed."""
+        if self.single:
+            shape = distribution.parameter_shape
+            return shape[1:] if shape[:1] == (1,) else shape
+        event = distribution.value_shape(self._size)[1:]
+        independent = len(found) > 1 and found[0] == self._size and not distribution.parameter_shape
+        return found[1:] if independent else event  # entries with the same parameters
 
     def switch(self, name: str, probs: Any, branches: Sequence[Callable[..., Any]], args: tuple[Any, ...]) -> Any:
         self._last, self.inside = ("switch", name, ""), True
@@ -329,7 +328,7 @@ class ProgramRun:
             raise InputError(f"{distribution.probs.shape[-1]} probabilities for {len(branches)} branches")
         if not self.single:
             for k, argument in enumerate(args):
-                _check_rows(argument, self.n if self._rows is None else len(self._rows), k)
+                _check_rows(argument, self._size, k)
         index = self.sample(name, distribution, branch=True)
         if self.single:
             return branches[int(index)](*args)
@@ -340,8 +339,7 @@ class ProgramRun:
             self._where = f" in branch {k} of {name!r}"
             groups.append(group)
             self._last = (f"branch {k} of switch", name, "")
-            if self.calls is not None:
-                self._note(self._rows, len(group))
+            self._note()
             try:
                 results.append(branch(*(None if a is None else take(a, group) for a in args)))
             finally:
@@ -351,18 +349,11 @@ class ProgramRun:
         self.inside = False
         return merged
 
-    def record(self, event: tuple[int, ...], value: tuple[int, ...] | None, size: int) -> None:
-        """Keep the shapes of an event and of an observed value; raise if they differ."""
-        self.n_calls += 1
-        if event or value:
-            shapes = self.shapes[self.n_calls] = Shapes(self.what, event, value, size)
-            if value is not None and not shapes.fits:
-                raise shapes.error()
-
-    def _note(self, rows: np.ndarray | None, size: int, log_prob: Any = 0.0, **site: Any) -> None:
-        assert self.calls is not None
-        k = sum(call.what == self.what for call in self.calls)
-        self.calls.append(Call(self.what, k, rows, size, log_prob, **site))
+    def _note(self, **fields: Any) -> None:
+        """Keep the present call if calls are recorded."""
+        if self.calls is not None:
+            k = sum(call.what == self.what for call in self.calls)
+            self.calls.append(Call(self.what, k, self._rows, self._size, **fields))
 
     def _check_name(self, name: str) -> None:
         """Raise if a particle may reach two sites of this name."""

@@ -1,8 +1,8 @@
-"""What all contracts share: the base classes, and helpers that describe failures.
+"""What all contracts share: the base class, its run without pytest, and helpers that describe failures.
 
-A contract is a pytest class. It defines the arguments of a call (`inputs`), the call, and what every result must
-fulfil (`check_result`). Each ``test_`` method checks one more property; the first line of its docstring states the
-property, and the message of a failed assertion states how it is violated:
+A contract is a test class for pytest. It defines the arguments of a call (`inputs`), the call, and what every result
+must fulfil (`check_result`). Each ``test_`` method checks one more property; the first line of its docstring states
+the property, and the message of a failed assertion states how it is violated:
 
 >>> class TriggerContract(Contract):
 ...     def call(self, component, rng, inputs):
@@ -12,30 +12,36 @@ property, and the message of a failed assertion states how it is violated:
 ...     def test_answers_yes_or_no(self):
 ...         \"\"\"It returns True or False.\"\"\"
 ...         self.checked_call(self.make(), self.inputs(5))
+
+pytest is not imported: `SkipTest` skips a test, in pytest too.
 """
 
 from __future__ import annotations
 
 import copy
+import functools
+import inspect
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
+from unittest import SkipTest
 
 import numpy as np
-import pytest
 
 from mstfilter.errors import InputError, describe_error
 from mstfilter.smc import (
     Always,
+    Info,
     ParticleFilter,
     Population,
     Proposal,
     Reweight,
+    State,
     Systematic,
     as_matrix,
-    batch,
+    run_many,
 )
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -51,9 +57,13 @@ def statistical(test: _Test) -> _Test:
 
 
 def prerequisite(test: _Test) -> _Test:
-    """Mark a test that the tests after it rely on. If it fails, ``mstfilter check`` skips them."""
+    """Mark a test that the tests after it rely on. If it fails, `check_properties` skips them."""
     test.prerequisite = True  # type: ignore[attr-defined]
     return test
+
+
+def seeded(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
 
 
 def number_example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
@@ -77,7 +87,7 @@ class Contract:
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         """Arguments of a typical call, without the generator: the example of `n` particles."""
-        population, observation = self.example(np.random.default_rng(seed), n)
+        population, observation = self.example(seeded(seed), n)
         return {"population": population, "observation": observation}
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
@@ -90,9 +100,21 @@ class Contract:
     def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
         """Use the component once; an exception or a wrong result is reported with a description of the inputs."""
         with reports_errors(inputs):
-            result = self.call(component, np.random.default_rng(3) if rng is None else rng, inputs)
+            result = self.call(component, seeded(3) if rng is None else rng, inputs)
         self.check_result(result, inputs)
         return result
+
+    def check_relation(
+        self,
+        inputs: dict[str, Any],
+        changes: dict[str, Any],
+        fault: str,
+        expected: Callable[[Any], Any] = lambda result: result,
+    ) -> None:
+        """Check that changed arguments give the `expected` change of the result, by default the same result."""
+        component = self.make()
+        result = expected(self.checked_call(component, inputs))
+        assert close(self.checked_call(component, {**inputs, **changes}), result), fault
 
     def variants(self) -> list[dict[str, Any]]:
         """Arguments of several calls, for properties that hold for any: six particles; for arrays also one."""
@@ -109,16 +131,17 @@ class Contract:
 
     def teardown_method(self) -> None:
         """After every test, report and undo draws from global generators."""
-        fault = _global_draws(self._global_state, global_state())
-        restore_global_state(self._global_state)
-        assert fault is None, fault
+        before, after = self._global_state, global_state()
+        restore_global_state(before)
+        assert same(before[0], after[0]), "it draws from numpy's global generator (np.random.*): draw from `rng`"
+        assert before[1] == after[1], "it draws from Python's global generator (random.*): draw from `rng`"
 
     @prerequisite
     def test_does_not_use_global_generators(self) -> None:
         """It does not use the global generators of numpy and Python."""
         for inputs in self.variants():
             with skips_errors():
-                self.call(self.make(), np.random.default_rng(7), inputs)
+                self.call(self.make(), seeded(7), inputs)
         self.teardown_method()
 
     @prerequisite
@@ -127,7 +150,7 @@ class Contract:
         for inputs in self.variants():
             before = copy.deepcopy(_plain(inputs))
             try:
-                self.call(self.make(), np.random.default_rng(3), inputs)
+                self.call(self.make(), seeded(3), inputs)
             except Exception as error:  # other tests report other errors
                 assert not _writes_to_read_only(error), "it changes its input in place: make a copy first"
             for name, value in _plain(inputs).items():
@@ -135,12 +158,17 @@ class Contract:
 
     @prerequisite
     def test_repeats_with_the_same_generator(self) -> None:
-        """Equal generators give equal results."""
+        """Equal generators give equal results; with ``draws = False`` it does not use its generator."""
         for inputs in self.variants():
             for seed in (7, 8):
+                rng = seeded(seed)
                 with skips_errors():
-                    a, b = (_plain(self.call(self.fresh(), np.random.default_rng(seed), inputs)) for _ in range(2))
+                    a, b = (_plain(self.call(self.fresh(), r, inputs)) for r in (rng, seeded(seed)))
                 assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
+                unused = rng.bit_generator.state == seeded(seed).bit_generator.state
+                assert unused or getattr(self.make(), "draws", True), (
+                    "it declares draws = False and draws from its generator"
+                )
 
     @prerequisite
     def test_keeps_no_state(self) -> None:
@@ -157,24 +185,7 @@ class Contract:
             )
 
     def _plain_call(self, component: Any, n: int, seed: int) -> Any:
-        return _plain(self.call(component, np.random.default_rng(1), self.inputs(n, seed=seed)))
-
-
-class RandomContract(Contract):
-    """Base class of contracts for components that draw random numbers."""
-
-    @prerequisite
-    def test_draws_only_if_declared(self) -> None:
-        """It does not use its generator if it declares ``draws = False``."""
-        component = self.make()
-        if getattr(component, "draws", True) is not False:
-            return
-        for inputs in self.variants():
-            rng = np.random.default_rng(7)
-            with skips_errors():
-                self.call(component, rng, inputs)
-            unused = rng.bit_generator.state == np.random.default_rng(7).bit_generator.state
-            assert unused, "it declares draws = False and draws from its generator"
+        return _plain(self.call(component, seeded(1), self.inputs(n, seed=seed)))
 
 
 @dataclass(frozen=True)
@@ -187,26 +198,36 @@ class _Examples(Proposal):
         return Population(self.example(rng, n)[0].particles)
 
 
-def check_batched(slot: str, component: Any, example: Callable[..., Any]) -> None:
-    """Check in a filter that runs of a batch equal single runs; nothing if the component is not `batched`.
+class BatchedContract(Contract):
+    """Base class of contracts for components that may work on the particles of several runs together."""
 
-    The numbers of runs include that of the particles, since arrays of another axis fit then.
-    """
-    if not component.batched:
-        return
-    y = example(np.random.default_rng(0), 2)[1]
-    slots = {"initial": _Examples(example), "update": Reweight(_row_sums), "resampler": Systematic(), slot: component}
-    for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
-        filter = ParticleFilter(n=n, **{"trigger": Always(), **slots})
-        with reports_errors(f"a batch of {n_runs} runs of {n} particles"):
-            runs = batch(filter, [y] * 3, seeds=range(n_runs))
-            alone = [filter.run([y] * 3, seed)[0].population for seed in range(n_runs)]
-        for r, expected in enumerate(alone):
-            found = runs.state(r).population
-            equal = found is not None and expected is not None and same(_plain(found)[:2], _plain(expected)[:2])
-            assert equal, (
-                f"run {r} of {n_runs} runs of {n} particles in a batch is not the run alone: are runs mixed?"
-            )
+    slot: ClassVar[str]  #: of a `ParticleFilter` that takes the component
+
+    def test_batched_runs_equal_single_runs(self) -> None:
+        """If it declares ``batched = True``, every run of a batch equals the run alone."""
+        component = self.make()
+        if not component.batched:
+            return
+        example = number_example if self.slot in ("resampler", "trigger") else self.example  # they use weights only
+        y = example(seeded(), 2)[1]
+        slots = {"initial": _Examples(example), "update": Reweight(_row_sums), "resampler": Systematic()}
+        # The numbers of runs include that of the particles, since arrays of another axis fit then.
+        for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
+            filter = ParticleFilter(n=n, **{"trigger": Always(), **slots, self.slot: component})
+            with reports_errors(f"a batch of {n_runs} runs of {n} particles"):
+                last: dict[int, Any] = {}
+                run_many(filter, [y] * 3, range(n_runs), kept=functools.partial(_keep, last))
+                alone = [filter.run([y] * 3, seed)[0].population for seed in range(n_runs)]
+            for r, expected in enumerate(alone):
+                assert same(_plain(last[r])[:2], _plain(expected)[:2]), (
+                    f"run {r} of {n_runs} runs of {n} particles in a batch is not the run alone: are runs mixed?"
+                )
+
+
+def _keep(populations: dict[int, Any], state: State, info: Info) -> float:
+    """A collector that keeps the last population of each run."""
+    populations[state.key.seed] = state.population
+    return 0.0
 
 
 def _row_sums(particles: Any, observation: Any) -> np.ndarray:
@@ -225,8 +246,84 @@ def copied(component: Any) -> Any:
 def skip_unless_properly_weighted(component: Any) -> Any:
     """The component; skips a test of the weights if it declares ``properly_weighted = False``."""
     if not component.properly_weighted:
-        pytest.skip("the component declares properly_weighted = False")
+        raise SkipTest("the component declares properly_weighted = False")
     return component
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """The outcome of one property."""
+
+    name: str  #: name of the test without ``test_``
+    statement: str  #: the property: the first line of the docstring of the test
+    #: Whether the test looks at random samples, and so fails for a correct component with probability
+    #: `FALSE_ALARM`.
+    statistical: bool
+    failure: str | None = None  #: how the property is violated; None if it holds or was not tested
+    skipped: str | None = None  #: why it was not tested
+
+
+def check_properties(
+    component: Any,
+    contract: type[Contract],
+    example: Callable[..., Any] | None = None,
+    exact: Callable[..., Any] | None = None,
+) -> list[CheckResult]:
+    """Test all properties of a component that a contract states.
+
+    ``example(rng, n)`` and ``exact(rng, n)`` take the place of the methods of the contract with these names.
+    """
+    unused = copied(component)
+    functions = {"make": lambda: component, "fresh": lambda: copied(unused), "example": example, "exact": exact}
+    methods = {name: staticmethod(function) for name, function in functions.items() if function is not None}
+    tests = type(f"Test{type(component).__name__}", (contract,), methods)
+    results: list[CheckResult] = []
+    failure: str | None
+    skipped: str | None
+    stopped = False
+    for name in _test_names(tests):
+        test = getattr(tests, name)
+        if stopped:
+            failure, skipped = None, "not tested: first fix what is broken above"
+        else:
+            failure, skipped, stopped = _outcome(tests(), name)
+        if failure is not None and any(result.failure == failure for result in results):
+            failure, skipped = None, "same failure as above"
+        statement = (inspect.getdoc(test) or name).split("\n")[0]
+        statistical = getattr(test, "statistical", False)
+        results.append(CheckResult(name.removeprefix("test_"), statement, statistical, failure, skipped))
+    return results
+
+
+def _test_names(tests: type) -> list[str]:
+    """The test methods in the order of pytest: those of the base classes first."""
+    names: dict[str, None] = {}
+    for cls in reversed(tests.__mro__):
+        for name in vars(cls):
+            if name.startswith("test_"):
+                names.pop(name, None)  # an overridden test is in the place of the derived class
+                names[name] = None
+    return list(names)
+
+
+def _outcome(contract: Contract, name: str) -> tuple[str | None, str | None, bool]:
+    """Failure and reason of a skip of a test, and whether the tests after it rely on it."""
+    failure = skipped = None
+    test = getattr(contract, name)
+    contract.setup_method()
+    try:
+        test()
+    except SkipTest as reason:
+        skipped = str(reason)
+    except AssertionError as error:
+        failure = str(error)
+    except Exception as error:
+        failure = describe_error(error)
+    try:
+        contract.teardown_method()
+    except AssertionError as error:  # a fault that every test looks for replaces the outcome of the test
+        return str(error), None, True
+    return failure, skipped, failure is not None and getattr(test, "prerequisite", False)
 
 
 @contextmanager
@@ -234,7 +331,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
     """Turn any exception of a component into an AssertionError that describes the call, or its inputs."""
     try:
         yield
-    except AssertionError:
+    except (AssertionError, SkipTest):
         raise
     except Exception as error:
         if _writes_to_read_only(error):
@@ -253,7 +350,7 @@ def skips_errors() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        pytest.skip(f"a call raises {type(error).__name__}, see the other tests")
+        raise SkipTest(f"a call raises {type(error).__name__}, see the other tests") from error
 
 
 def _description(inputs: dict[str, Any]) -> str:
@@ -271,21 +368,23 @@ def _writes_to_read_only(error: Exception) -> bool:
     return isinstance(error, ValueError) and any(word in str(error) for word in ("read-only", "its input in place"))
 
 
+def close(a: Any, b: Any) -> bool:
+    """Whether numbers, arrays, or the log weights of populations are equal up to rounding."""
+    a, b = (value.log_weights if isinstance(value, Population) else value for value in (a, b))
+    return np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=1e-9, atol=2e-9)
+
+
 def same(a: Any, b: Any) -> bool:
     """Whether two values are equal: arrays bit by bit, dataclasses by field. Without equality they count as equal."""
     if a is b:
         return True
     if type(a) is not type(b):
         return bool(isinstance(a, (float, np.floating)) and isinstance(b, (float, np.floating)) and a == b)
-    if isinstance(a, np.ndarray):
-        if a.dtype == object:
-            return a.shape == b.shape and all(same(x, y) for x, y in zip(a.ravel(), b.ravel(), strict=True))
+    if isinstance(a, np.ndarray) and a.dtype != object:
         return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
     if isinstance(a, Mapping):
         return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, str):
-        return bool(a == b)
-    if isinstance(a, Sequence):
+    if isinstance(a, Sequence | np.ndarray) and not isinstance(a, str):
         return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
     if is_dataclass(a):
         return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
@@ -306,15 +405,6 @@ def _plain(value: Any) -> Any:
 def global_state() -> tuple[Any, Any]:
     """States of the global generators of numpy and Python."""
     return np.random.get_state(), random.getstate()  # noqa: NPY002
-
-
-def _global_draws(before: tuple[Any, Any], after: tuple[Any, Any]) -> str | None:
-    """The fault if a global generator has another state than before."""
-    if not same(before[0], after[0]):
-        return "it draws from numpy's global generator (np.random.*): draw from `rng`"
-    if before[1] != after[1]:
-        return "it draws from Python's global generator (random.*): draw from `rng`"
-    return None
 
 
 def restore_global_state(state: tuple[Any, Any]) -> None:

@@ -1,35 +1,37 @@
-"""Contracts without random numbers: triggers, sizes, lookaheads, similarities, equivalences, codecs, evidence."""
+"""Contracts without random numbers: triggers, sizes, lookaheads, similarities, equivalences and codecs."""
 
 from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from mstfilter.scene import Hypothesis
 from mstfilter.smc import Population
-from mstfilter.testing.contract import Contract, check_batched, prerequisite, reports_errors, same
-from mstfilter.testing.scenes import scene_example
+from mstfilter.smc.testing.contract import (
+    BatchedContract,
+    Contract,
+    close,
+    prerequisite,
+    reports_errors,
+    same,
+    seeded,
+)
 
 _SIZES = (1, 2, 9)
 
 
-def _rng(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
-class _DecisionContract(Contract):
+class DecisionContract(Contract):
     """Properties of triggers and sizes, which give one answer per population."""
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        return {"population": self.example(_rng(seed), n)[0], "t": 2}
+        return {"population": self.example(seeded(seed), n)[0], "t": 2}
 
     def populations(self) -> list[Population]:
         """1, 2 and 12 particles with unequal weights; 12 with equal ones, a dominant one, zeros, and copies."""
-        rng = _rng()
+        rng = seeded()
         populations = [self.example(rng, n)[0] for n in (1, 2, 12)]
         particles = populations[-1].particles
         peaked = np.where(np.arange(12) == 5, 0.0, -80.0)
@@ -39,17 +41,10 @@ class _DecisionContract(Contract):
         return [*populations, *weighted, copies]
 
     def test_answers(self) -> None:
-        """It answers for any population and time: a trigger True or False, a size an integer of at least 1."""
+        """It gives one answer for any population and time: a trigger True or False, a size an integer above 0."""
         component = self.make()
         for population in self.populations():
             for t in (0, 1, 7, 10_000):
-                self.checked_call(component, {"population": population, "t": t})
-
-    def test_keeps_no_count(self) -> None:
-        """Its answer does not change when it is asked again."""
-        component = self.make()
-        for population in self.populations():
-            for t in (0, 3):
                 answers = [self.checked_call(component, {"population": population, "t": t}) for _ in range(12)]
                 assert all(answer == answers[0] for answer in answers), (
                     f"asked twelve times about the same particles it answers {answers}: it keeps state, or draws"
@@ -57,28 +52,25 @@ class _DecisionContract(Contract):
 
     def test_ignores_scale_and_order(self) -> None:
         """It does not depend on a common factor of the weights, nor on the order of the particles."""
-        component = self.make()
         for population in self.populations():
-            n = len(population)
-            answer = self.checked_call(component, {"population": population, "t": 3})
+            n, inputs = len(population), {"population": population, "t": 3}
             for shift in (3.0, -3.0, 1000.0, -1000.0, 1e5, -1e5):
                 shifted = population.reweighted(np.full(n, shift))
-                assert self.checked_call(component, {"population": shifted, "t": 3}) == answer, (
-                    f"adding {shift:g} to all log weights changes its answer"
+                self.check_relation(
+                    inputs, {"population": shifted}, f"adding {shift:g} to all log weights changes its answer"
                 )
-            for order in (np.arange(n)[::-1], np.roll(np.arange(n), 1), _rng(1).permutation(n)):
-                reordered = population.take(order)
-                assert self.checked_call(component, {"population": reordered, "t": 3}) == answer, (
-                    "another order of the particles changes its answer"
+            for order in (np.arange(n)[::-1], np.roll(np.arange(n), 1), seeded(1).permutation(n)):
+                self.check_relation(
+                    inputs,
+                    {"population": population.take(order)},
+                    "another order of the particles changes its answer",
                 )
 
 
-class TriggerContract(_DecisionContract):
+class TriggerContract(BatchedContract, DecisionContract):
     """The contract of every `Trigger`."""
 
-    def test_batched_runs_equal_single_runs(self) -> None:
-        """If it declares ``batched = True``, every run of a batch equals the run alone."""
-        check_batched("trigger", self.make(), self.example)
+    slot = "trigger"
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
         return component.wants(inputs["population"], inputs["t"])
@@ -87,7 +79,7 @@ class TriggerContract(_DecisionContract):
         assert isinstance(result, (bool, np.bool_)), f"its answer is {result!r}, expected True or False"
 
 
-class SizeContract(_DecisionContract):
+class SizeContract(DecisionContract):
     """The contract of every `Size`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
@@ -105,8 +97,8 @@ class SizeContract(_DecisionContract):
                 component.checked(population)
 
 
-class _ScoreContract(Contract):
-    """Properties of lookaheads and evidence, which give one number per particle."""
+class ScoreContract(Contract):
+    """Properties of components that give one number per particle."""
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         n = len(inputs["population"])
@@ -123,15 +115,14 @@ class _ScoreContract(Contract):
 
     def test_order_of_particles_is_irrelevant(self) -> None:
         """The order of the particles does not matter."""
-        component, inputs = self.make(), self.inputs(9)
-        order = _rng(1).permutation(9)
-        shuffled = self.checked_call(component, {**inputs, "population": inputs["population"].take(order)})
-        assert _close(shuffled, self.checked_call(component, inputs)[order]), (
-            "the same particles in another order have other scores"
+        inputs, order = self.inputs(9), seeded(1).permutation(9)
+        fault = "the same particles in another order have other scores"
+        self.check_relation(
+            inputs, {"population": inputs["population"].take(order)}, fault, lambda scores: scores[order]
         )
 
 
-class LookaheadContract(_ScoreContract):
+class LookaheadContract(ScoreContract):
     """The contract of every `Lookahead`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
@@ -139,29 +130,20 @@ class LookaheadContract(_ScoreContract):
 
     def test_copies_have_one_score(self) -> None:
         """A particle and its copy have the same score."""
-        component, inputs = self.make(), self.inputs(5)
-        twice = inputs["population"].take(np.repeat(np.arange(5), 2))
-        scores = self.checked_call(component, {**inputs, "population": twice})
-        assert _close(scores[::2], scores[1::2]), "a particle and its copy have different scores"
-
-    def test_ignores_scale(self) -> None:
-        """It does not depend on a common factor of the weights."""
-        component, inputs = self.make(), self.inputs(6)
-        scores = self.checked_call(component, inputs)
-        for shift in (3.0, 1000.0, -1000.0):
-            shifted = inputs["population"].reweighted(np.full(6, shift))
-            assert _close(self.checked_call(component, {**inputs, "population": shifted}), scores), (
-                f"adding {shift:g} to all log weights changes the priorities"
-            )
+        twice = self.inputs(5)["population"].take(np.repeat(np.arange(5), 2))
+        scores = self.checked_call(self.make(), {**self.inputs(5), "population": twice})
+        assert close(scores[::2], scores[1::2]), "a particle and its copy have different scores"
 
     def test_ignores_weights(self) -> None:
         """It does not depend on the weights, which the filter multiplies by the priorities."""
-        component, inputs = self.make(), self.inputs(6)
+        inputs = self.inputs(6)
+        for shift in (3.0, 1000.0, -1000.0):
+            shifted = inputs["population"].reweighted(np.full(6, shift))
+            fault = f"adding {shift:g} to all log weights changes the priorities"
+            self.check_relation(inputs, {"population": shifted}, fault)
         other = inputs["population"].reweighted(np.linspace(0, 2, 6))
-        scores = self.checked_call(component, inputs)
-        assert _close(self.checked_call(component, {**inputs, "population": other}), scores), (
-            "other log weights of the same particles change the priorities: the weights would count twice"
-        )
+        fault = "other log weights of the same particles change the priorities: the weights would count twice"
+        self.check_relation(inputs, {"population": other}, fault)
 
     def test_uses_the_observation(self) -> None:
         """Priorities that differ between particles depend on the observation, if that is an array of numbers."""
@@ -170,76 +152,45 @@ class LookaheadContract(_ScoreContract):
         if y.dtype.kind != "f" or np.ptp(scores) < 1e-9:
             return
         others = [self.checked_call(component, {**inputs, "observation": y + step}) for step in (1.0, -1.0, 0.1)]
-        assert not all(_close(scores, other) for other in others), (
+        assert not all(close(scores, other) for other in others), (
             "the priorities are the same for other observations: it ignores the observation"
         )
 
 
-class EvidenceContract(_ScoreContract):
-    """The contract of every `Evidence`. The default example is a scene."""
-
-    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """`n` hypotheses and a clip."""
-        return scene_example(rng, n)
-
-    def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
-        """Log scores, rounded to 9 digits."""
-        hypotheses = tuple(inputs["population"].realised().particles)
-        return np.round(component.log_score(hypotheses, inputs["observation"]), 9)
-
-    def test_copies_score_the_same(self) -> None:
-        """Equal hypotheses have equal scores."""
-        fault = "a hypothesis and its copy have different scores"
-        self._check_copies(lambda labels: labels.copy(), fault)
-
-    def test_names_of_labels_are_irrelevant(self) -> None:
-        """The numbers of the labels do not matter."""
-        rng = _rng(2)
-
-        def renamed(labels: np.ndarray) -> np.ndarray:
-            table = np.concatenate([[0], 3 + 5 * rng.permutation(int(labels.max()))])
-            return table.astype(np.uint16)[labels]
-
-        self._check_copies(renamed, "other numbers for the same labels give other scores")
-
-    def _check_copies(self, change: Callable[[np.ndarray], np.ndarray], fault: str) -> None:
-        """Check that hypotheses and copies with changed labels have the same scores."""
-        inputs = self.inputs(9)
-        hypotheses = tuple(inputs["population"].realised().particles)
-        copies = tuple(Hypothesis.from_labels(change(h.labels), h.grid) for h in hypotheses)
-        scores = self.checked_call(self.make(), {**inputs, "population": Population(hypotheses + copies)})
-        assert _close(scores[:9], scores[9:]), fault
-
-
-class _ParticlesContract(Contract):
+class ParticlesContract(Contract):
     """Properties of components that take particles without weights."""
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        return {"population": self.example(_rng(seed), n)[0].realised()}
+        return {"population": self.example(seeded(seed), n)[0].realised()}
 
 
-class _PairsContract(_ParticlesContract):
+class PairsContract(ParticlesContract):
     """Properties of similarities and equivalences, which relate pairs of particles."""
 
     def relation(self, result: np.ndarray) -> np.ndarray:
         """(n, n) relation of all pairs."""
-        raise NotImplementedError
+        return result
 
     def test_pairs_do_not_depend_on_others(self) -> None:
-        """The relation of two particles does not depend on the others, nor on their order."""
-        component, rng = self.make(), _rng(4)
+        """The relation of two particles does not depend on the others, nor on their order; copies are equal."""
+        component, rng = self.make(), seeded(4)
+        selections = {
+            "if only these are given": [rng.permutation(9)[:k] for k in (5, 2)],
+            "in another order": [rng.permutation(9)],
+            "if there are copies": [np.repeat(np.arange(9), 2), np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 3, 0])],
+        }
         for seed in range(4):
-            population = self.inputs(9, seed)["population"].take(np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 3, 0]))
+            population = self.inputs(9, seed)["population"]
             every = self.relation(self.checked_call(component, {"population": population}))
-            for k in (5, 2, 11):
-                rows = rng.permutation(11)[:k]
-                some = self.relation(self.checked_call(component, {"population": population.take(rows)}))
-                assert np.allclose(some, every[np.ix_(rows, rows)], atol=1e-9), (
-                    f"{k} of eleven particles have other similarities or classes if only these are given"
-                )
+            for when, selected in selections.items():
+                for rows in selected:
+                    some = self.relation(self.checked_call(component, {"population": population.take(rows)}))
+                    assert np.allclose(some, every[np.ix_(rows, rows)], atol=1e-6), (
+                        f"of nine particles, {len(set(rows.tolist()))} have other similarities or classes {when}"
+                    )
 
 
-class SimilarityContract(_PairsContract):
+class SimilarityContract(PairsContract):
     """The contract of every `Similarity`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
@@ -249,11 +200,8 @@ class SimilarityContract(_PairsContract):
         n = len(inputs["population"])
         assert result.shape == (n, n), f"similarities of {n} particles have shape {result.shape}, expected ({n}, {n})"
 
-    def relation(self, result: np.ndarray) -> np.ndarray:
-        return result
-
     def test_similarities_are_shares(self) -> None:
-        """It gives an (n, n) matrix of finite numbers in [0, 1], 1 on the diagonal."""
+        """It gives a symmetric (n, n) matrix of finite numbers in [0, 1], 1 on the diagonal."""
         component = self.make()
         for n in _SIZES:
             S = self.checked_call(component, self.inputs(n))
@@ -263,27 +211,13 @@ class SimilarityContract(_PairsContract):
             assert np.allclose(np.diag(S), 1.0, atol=1e-9), (
                 f"a particle has similarity {np.diag(S).min():.3g} to itself, expected 1"
             )
-
-    def test_copies_are_equal(self) -> None:
-        """A particle and its copy have similarity 1, and the same similarity to others."""
-        twice = self.inputs(5)["population"].take(np.repeat(np.arange(5), 2))
-        S = self.checked_call(self.make(), {"population": twice})
-        own = np.diag(S[::2, 1::2])
-        assert np.allclose(own, 1.0, atol=1e-6), f"a particle has similarity {own.min():.4g} to its copy, expected 1"
-        assert np.allclose(S[::2], S[1::2], atol=1e-6), (
-            "a particle and its copy have other similarities to a third one"
-        )
-
-    def test_is_symmetric(self) -> None:
-        """It is symmetric."""
-        S = self.checked_call(self.make(), self.inputs(9))
-        i, j = np.unravel_index(np.argmax(np.abs(S - S.T)), S.shape)
-        assert abs(S[i, j] - S[j, i]) <= 1e-9, (
-            f"the similarity of particles {i} and {j} is {S[i, j]:.4g}, that of {j} and {i} is {S[j, i]:.4g}"
-        )
+            i, j = np.unravel_index(np.argmax(np.abs(S - S.T)), S.shape)
+            assert abs(S[i, j] - S[j, i]) <= 1e-9, (
+                f"the similarity of particles {i} and {j} is {S[i, j]:.4g}, that of {j} and {i} is {S[j, i]:.4g}"
+            )
 
 
-class EquivalenceContract(_PairsContract):
+class EquivalenceContract(PairsContract):
     """The contract of every `Equivalence`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
@@ -306,14 +240,8 @@ class EquivalenceContract(_PairsContract):
             highest = np.maximum.accumulate(np.concatenate([[-1], found]))
             assert (found >= 0).all() and (found <= highest[:-1] + 1).all(), f"classes are {found.tolist()}"
 
-    def test_copies_are_equal(self) -> None:
-        """A particle equals its copy."""
-        twice = self.inputs(5)["population"].take(np.repeat(np.arange(5), 2))
-        found = self.checked_call(self.make(), {"population": twice})
-        assert (found[::2] == found[1::2]).all(), "a particle and its copy are in different classes"
 
-
-class CodecContract(_ParticlesContract):
+class CodecContract(ParticlesContract):
     """The contract of every `Codec`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
@@ -329,14 +257,8 @@ class CodecContract(_ParticlesContract):
             assert not array.dtype.hasobject, f"{name!r} is an array of Python objects, which needs pickle"
 
     @prerequisite
-    def test_encodes_as_arrays(self) -> None:
-        """It encodes particles as named arrays without Python objects."""
-        component = self.make()
-        for n in _SIZES:
-            self.checked_call(component, self.inputs(n))
-
     def test_decoded_particles_are_equal(self) -> None:
-        """Particles read from a file equal the stored ones bit by bit."""
+        """It encodes particles as named arrays; those read from a file equal the stored ones bit by bit."""
         component = self.make()
         for n in (*_SIZES, 300):
             population = self.inputs(n)["population"]
@@ -372,7 +294,3 @@ def _from_file(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     file.seek(0)
     with np.load(file, allow_pickle=False) as data:
         return {name.removeprefix("particles/"): data[name] for name in data.files}
-
-
-def _close(a: np.ndarray, b: np.ndarray) -> bool:
-    return np.allclose(a, b, rtol=1e-9, atol=2e-9)

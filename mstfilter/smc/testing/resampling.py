@@ -1,11 +1,11 @@
 """Contracts of resamplers.
 
 A resampler must be properly weighted: a particle of normalised weight W_i gets n W_i copies on average, or copies
-that carry W_i together if their weights differ. `mstfilter.testing.copies` lists the weights and numbers of particles
-for which this is tested: n = m, n < m and n > m, ties, zeros, heavy and light weights.
+that carry W_i together if their weights differ. `mstfilter.smc.testing.copies` lists the weights and numbers of
+particles for which this is tested: n = m, n < m and n > m, ties, zeros, heavy and light weights.
 
-A scheme that makes new particles instead of copies, such as the ensemble transform, has another law: it keeps the
-weighted mean of the particles, and its output weights are equal (`TransformContract`).
+A scheme that makes new particles instead of copies is a `TransformResampler` and has another law: it keeps the
+weighted mean of the particles, and its output weights are equal.
 
 A scheme may be correct and slow: the cost of rejection grows with max w / mean w. The generator of the statistical
 tests counts what is drawn, and a case is left out as "too slow at this weight" if it exceeds the budget. The clock is
@@ -14,29 +14,26 @@ not used, so the outcome of a check does not depend on the machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+from unittest import SkipTest
 
 import numpy as np
-import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, as_matrix, log_mean_exp
-from mstfilter.testing.contract import (
+from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, as_matrix
+from mstfilter.smc.testing.contract import (
     FALSE_ALARM,
-    RandomContract,
-    check_batched,
-    global_state,
-    number_example,
+    BatchedContract,
+    Contract,
     prerequisite,
-    reports_errors,
-    restore_global_state,
     same,
+    seeded,
     skip_unless_properly_weighted,
     statistical,
 )
-from mstfilter.testing.copies import (
+from mstfilter.smc.testing.copies import (
     BUDGET,
     CASES,
     HEAVY_CASES,
@@ -51,11 +48,10 @@ from mstfilter.testing.copies import (
     log_of,
 )
 
-_OTHER_ORDER = (2, 0, 4, 1, 3)
 _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 
 
-class ResamplerContract(RandomContract):
+class ResamplerContract(Contract):
     """The contract of every `Resampler`. Its statistical tests have a false-alarm rate of at most 1e-6 each.
 
     The particles of the example differ. The tests allow the bias `tolerance` that a component states. They find a
@@ -72,7 +68,7 @@ class ResamplerContract(RandomContract):
     def population(self, weights: Any) -> Population:
         """The particles of the example with given weights, and with parents that identify them."""
         n = len(weights)
-        particles = self.example(np.random.default_rng(0), n)[0].realised().particles
+        particles = self.example(seeded(0), n)[0].realised().particles
         index = np.arange(n)
         return Population(particles, log_of(weights), {"previous": index[::-1], "proposed": index, "mate": index + n})
 
@@ -90,7 +86,9 @@ class ResamplerContract(RandomContract):
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         assert isinstance(result, Population), f"resample returns {type(result).__name__}, expected a Population"
         ancestors = result.parents.get("ancestor")
-        assert ancestors is not None, 'the result has no parents "ancestor"'
+        assert ancestors is not None, (
+            'the result has no parents "ancestor": a scheme that makes new particles inherits TransformResampler'
+        )
         m = len(inputs["population"])
         wrong = ancestors[(ancestors < 0) | (ancestors >= m)]
         assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
@@ -99,23 +97,15 @@ class ResamplerContract(RandomContract):
         return self.checked_call(component, {"population": population, "n": n}, rng)
 
     @prerequisite
-    def test_ancestors_in_range(self) -> None:
-        """Ancestors are indices of particles that exist."""
-        component = self.make()
-        for m, n in ((5, 5), (5, 3), (5, 12), (2, 9)):
-            for seed in range(40):
-                self.resample(component, self.population(np.linspace(1, 2, m)), n, np.random.default_rng(seed))
-
-    @prerequisite
     def test_gives_n_particles(self) -> None:
-        """It returns n particles for any n; at most n if ``exact_size`` is False."""
+        """It returns n particles for any n, at most n if ``exact_size`` is False; their ancestors exist."""
         component = self.make()
-        for m in (1, 4, 7):
+        for m in (1, 2, 4, 7):
             for n in (1, 2, m, 2 * m + 3, 50):
-                rng = np.random.default_rng(n)
-                found = len(self.resample(component, self.population(np.linspace(1, 3, m)), n, rng))
-                enough = found == n if component.exact_size else 1 <= found <= n
-                assert enough, f"asked to make {n} particles of {m} it returns {found}"
+                for seed in range(10):
+                    found = len(self.resample(component, self.population(np.linspace(1, 3, m)), n, seeded(seed)))
+                    enough = found == n if component.exact_size else 1 <= found <= n
+                    assert enough, f"asked to make {n} particles of {m} it returns {found}"
 
     def test_states_a_small_tolerance(self) -> None:
         """Its `tolerance` is a bias of less than 0.1 of the weight."""
@@ -125,51 +115,30 @@ class ResamplerContract(RandomContract):
             "properly_weighted = False"
         )
 
-    def test_takes_one_particle(self) -> None:
-        """It works for a single particle, whose weight it keeps."""
-        component = self.make()
-        for n in (1, 2, 5):
-            chosen = self.resample(component, self.population([np.exp(-3.0)]), n, np.random.default_rng(0))
-            if component.properly_weighted and component.exact_size:
-                found = chosen.log_mean_weight
-                assert abs(found + 3.0) <= 1e-9, f"the only particle had log weight -3 and has {found:.4g} afterwards"
-
     def test_zero_weights_are_never_chosen(self) -> None:
-        """A particle of weight zero is never selected."""
-        component = self.make()
-        for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
-            for seed in range(60):
-                n = (1, 4, 5, 11)[seed % 4]
-                chosen = self.resample(component, self.population(weights), n, np.random.default_rng(seed))
-                wrong = _without_weight(chosen, weights)
-                assert not len(wrong), f"of weights {weights} it selects particle {wrong[0]}, weight 0"
-
-    def test_handles_extreme_uniforms(self) -> None:
-        """It handles the smallest and the largest uniform number, 0 and 1 - 2^-53."""
+        """A particle of weight zero is never selected, also by the uniform numbers 0 and 1 - 2^-53."""
         component, slow = self.make(), []
-        for value in (0.0, 1 - 2.0**-53):
-            for weights in (*_ZEROS, (0.1, 0.2, 0.3)):
-                for n in (1, 3, 10):
-                    rng = ConstantGenerator(value, 200_000)
-                    try:
-                        chosen = self.resample(component, self.population(weights), n, rng)
-                    except pytest.skip.Exception:
-                        slow.append(f"it does not end if rng.random() always gives {value:.17g}")
-                        continue
-                    wrong = _without_weight(chosen, weights)
-                    assert not len(wrong), (
-                        f"if rng.random() gives {value:.17g}, of weights {weights} it selects particle {wrong[0]}, "
-                        'weight 0: use np.searchsorted with side="right", and end at a particle with weight'
-                    )
+        for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
+            for when, rng, n in _typical_and_extreme():
+                try:
+                    ancestors = self.resample(component, self.population(weights), n, rng).parents["ancestor"]
+                except SkipTest:
+                    slow.append(f"it does not end if {when}")
+                    continue
+                wrong = ancestors[np.asarray(weights)[ancestors] == 0]
+                assert not len(wrong), (
+                    f"if {when}, of weights {weights} it selects particle {wrong[0]}, weight 0: use "
+                    'np.searchsorted with side="right", and end at a particle with weight'
+                )
         if slow:
-            pytest.skip(slow[0])
+            raise SkipTest(slow[0])
 
     def test_keeps_parents(self) -> None:
         """Selected particles are those of the ancestors and keep their parents."""
         component = self.make()
         for n in (1, 4, 5, 12):
             population = self.population((1.0, 2.0, 1.5, 0.5, 2.0))
-            chosen = self.resample(component, population, n, np.random.default_rng(1))
+            chosen = self.resample(component, population, n, seeded(1))
             expected = population.take(chosen.parents["ancestor"])
             for name, index in expected.parents.items():
                 assert name in chosen.parents and np.array_equal(chosen.parents[name], index), (
@@ -183,9 +152,9 @@ class ResamplerContract(RandomContract):
         """Different generators give different results, if n W_i are not integers."""
         component = skip_unless_properly_weighted(self.make())
         population = self.population((0.41, 0.24, 0.2, 0.1, 0.05))
-        one = np.random.default_rng(0)
+        one = seeded(0)
         for fault, generators in (
-            ("forty generators with different seeds give", [np.random.default_rng(seed) for seed in range(40)]),
+            ("forty generators with different seeds give", [seeded(seed) for seed in range(40)]),
             ("it does not advance `rng`: forty calls with one generator give", [one] * 40),
         ):
             chosen = [self.resample(component, population, 2, rng) for rng in generators]
@@ -198,21 +167,17 @@ class ResamplerContract(RandomContract):
         for seed in range(10):
             population = self.population(((0.11, 0.36, 0.15, 0.38), (0.11, 0.36, 0.0, 0.38))[seed // 5])
             n = (6, 4, 1)[seed % 3]
-            a = self.resample(component, population, n, np.random.default_rng(seed))
+            a = self.resample(component, population, n, seeded(seed))
             for shift in (0.5, 100.0, -100.0, 1e4, -1e4):
-                shifted = population.reweighted(np.full(4, shift))
+                changed = f"log weights + {shift:g} (overflow or underflow?)"
                 with np.errstate(all="ignore"):
                     try:
-                        b = self.resample(component, shifted, n, np.random.default_rng(seed))
+                        b = self.resample(component, population.reweighted(np.full(4, shift)), n, seeded(seed))
                     except AssertionError as error:
-                        raise AssertionError(f"log weights + {shift:g} (overflow or underflow?): {error}") from error
-                assert np.array_equal(a.parents["ancestor"], b.parents["ancestor"]), (
-                    f"adding {shift:g} to all log weights changes the selection (overflow or underflow?)"
-                )
-                if component.properly_weighted:
-                    assert np.allclose(b.log_weights - shift, a.log_weights, atol=1e-8), (
-                        f"adding {shift:g} to all log weights does not add it to those of the result"
-                    )
+                        raise AssertionError(f"{changed}: {error}") from error
+                assert same(a.parents["ancestor"], b.parents["ancestor"]), f"{changed} change the selection"
+                kept = np.allclose(b.log_weights - shift, a.log_weights, atol=1e-8)
+                assert kept or not component.properly_weighted, f"{changed} do not add it to those of the result"
 
     # --- proper weighting ---
 
@@ -226,24 +191,6 @@ class ResamplerContract(RandomContract):
         """The heaviest particle carries its weight on average, to 1 %, and the others carry theirs."""
         self._check_cases(self.heavy_cases)
 
-    @statistical
-    def test_order_of_particles_is_irrelevant(self) -> None:
-        """The order of the particles does not change what each carries on average."""
-        component = skip_unless_properly_weighted(self.make())
-        cases = [Case(CASES[1].weights, n) for n in (4, 5)]
-        for case in cases:
-            samples = [
-                self._carried(component, case, 2 * len(cases), seed, order)
-                for seed, order in enumerate((np.arange(5), np.array(_OTHER_ORDER)))
-            ]
-            W, (a, b) = samples[0].expected[:5], (s.carried.mean(axis=0)[:5] for s in samples)
-            i = int(np.argmax(np.abs(a - b)))
-            wrong = any(_excess(s, component, 2 * len(cases)) > 0 for s in samples)
-            assert not wrong or abs(a - b)[i] < 0.5 * max(abs(a - W).max(), abs(b - W).max()), (
-                f"the result depends on the order of the particles: the one of W = {W[i]:.3g} carries "
-                f"{a[i]:.3f} of the weight as number {i}, and {b[i]:.3f} as number {_OTHER_ORDER.index(i)}"
-            )
-
     def _check_cases(self, cases: tuple[Case, ...]) -> None:
         """Compare what each particle and each group of particles carries on average with its weight."""
         component = skip_unless_properly_weighted(self.make())
@@ -251,7 +198,7 @@ class ResamplerContract(RandomContract):
         for seed, case in enumerate(cases):
             try:
                 sample = self._carried(component, case, len(cases), seed)
-            except pytest.skip.Exception as reason:
+            except SkipTest as reason:
                 slow.append(str(reason))
                 continue
             W = sample.expected[: len(case.weights)]
@@ -263,33 +210,41 @@ class ResamplerContract(RandomContract):
             evidence = sample.evidence(component.tolerance)
             assert _excess(sample, component, len(cases)) <= 0, fault_message(sample, int(np.argmax(evidence)))
         if slow:
-            pytest.skip(slow[0] if len(cases) == 1 else f"{slow[0]} ({len(slow)} of {len(cases)} cases, others hold)")
+            raise SkipTest(
+                slow[0] if len(cases) == 1 else f"{slow[0]} ({len(slow)} of {len(cases)} cases, others hold)"
+            )
 
-    def _carried(
-        self, component: Resampler, case: Case, n_cases: int, seed: int, order: np.ndarray | None = None
-    ) -> Sample:
-        """What each particle and each group carries in many calls, with the particles in an order.
+    def _carried(self, component: Resampler, case: Case, n_cases: int, seed: int) -> Sample:
+        """What each particle and each group carries in many calls.
 
         Calls are added while a mean is suspicious and the evidence is not sufficient.
         """
         m = len(case.weights)
-        positions = np.arange(m) if order is None else order
-        population = self.population(case.weights).reweighted(np.full(m, 3.0))
-        given, mean = population.take(positions), log_mean_exp(population.log_weights)
+        given = self.population(case.weights)
+        population = Population(given.particles, given.log_weights + 3.0)  # faster without parents
         spread = m * max(case.weights) / sum(case.weights)
         slow = f"too slow at this weight: {m} particles to {case.n}, max w / mean w = {spread:.3g}"
         rng, sample = CountingGenerator(seed, BUDGET, slow), Sample(case)
         calls = case.calls
         while True:
             while sample.calls < calls:
-                chosen = self.checked_call(component, {"population": given, "n": case.n}, rng)
+                chosen = self.checked_call(component, {"population": population, "n": case.n}, rng)
                 if sample.calls == 0 and rng.drawn * calls > BUDGET:
-                    pytest.skip(f"{slow}: a call draws {rng.drawn:.3g} random numbers")
-                sample.add(positions[chosen.parents["ancestor"]], np.exp(chosen.log_weights - mean))
+                    raise SkipTest(f"{slow}: a call draws {rng.drawn:.3g} random numbers")
+                sample.add(chosen.parents["ancestor"], np.exp(chosen.log_weights - population.log_mean_weight))
             clear = sample.evidence(component.tolerance).max() == 0 or _excess(sample, component, n_cases) > 0
             if clear or calls >= MOST_CALLS * case.calls:
                 return sample
             calls *= 2
+
+
+def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
+    """What a generator does, the generator, and a number of particles to select."""
+    for seed in range(60):
+        yield f"the generator has seed {seed}", seeded(seed), (1, 4, 5, 11)[seed % 4]
+    for value in (0.0, 1 - 2.0**-53):
+        for n in (1, 3, 10):
+            yield f"rng.random() gives {value:.17g}", ConstantGenerator(value, 200_000), n
 
 
 def _excess(sample: Sample, component: Resampler, n_cases: int) -> float:
@@ -298,26 +253,12 @@ def _excess(sample: Sample, component: Resampler, n_cases: int) -> float:
     return float(evidence.max() - np.log(2 * len(evidence) * n_cases / FALSE_ALARM))
 
 
-class WeightResamplerContract(ResamplerContract):
+class WeightResamplerContract(BatchedContract, ResamplerContract):
     """The contract of every `WeightResampler`: that of a `Resampler`, and properties of `select`."""
 
+    slot = "resampler"
     cases = CASES
     heavy_cases = HEAVY_CASES_OF_WEIGHTS
-
-    @prerequisite
-    def test_select_returns_integers(self) -> None:
-        """`select` returns (n,) integer ancestors."""
-        component: WeightResampler = self.make()
-        for m, n in ((5, 3), (2, 9), (4, 4)):
-            with reports_errors(f"{m} particles to {n}"):
-                ancestors = np.asarray(component.select(np.random.default_rng(0), log_of(np.linspace(1, 2, m)), n)[0])
-            assert ancestors.ndim == 1 and np.issubdtype(ancestors.dtype, np.integer), (
-                f"ancestors are {ancestors.dtype} of shape {ancestors.shape}, expected int ({n},)"
-            )
-
-    def test_batched_runs_equal_single_runs(self) -> None:
-        """If it declares ``batched = True``, every run of a batch equals the run alone."""
-        check_batched("resampler", self.make(), number_example)
 
     @statistical
     def test_many_particles(self) -> None:
@@ -353,16 +294,16 @@ class WeightResamplerContract(ResamplerContract):
         return np.array(copies)
 
 
-class TransformResamplerContract(RandomContract):
+class TransformResamplerContract(Contract):
     """The contract of every `TransformResampler`: n new particles of equal weight whose mean is the weighted mean.
 
-    A `Resampler` whose result has no ancestors and is no selection from its input has the same contract. For n other
-    than the number of particles it may raise InputError. The example has particles that are arrays of numbers, or
-    mappings of such arrays. Reich (2013), "A nonparametric ensemble transform method for Bayesian inference".
+    For n other than the number of particles it may raise InputError. The example has particles that are arrays of
+    numbers, or mappings of such arrays. Reich (2013), "A nonparametric ensemble transform method for Bayesian
+    inference".
     """
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        particles = self.example(np.random.default_rng(seed), 20)[0].realised().particles
+        particles = self.example(seeded(seed), 20)[0].realised().particles
         return {"population": Population(particles, log_of(np.linspace(1, 2 + seed, 20))), "n": 20}
 
     def call(self, component: TransformResampler, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
@@ -427,38 +368,12 @@ class TransformResamplerContract(RandomContract):
         self, component: Any, weights: Any, n: int, shift: float = 0.0
     ) -> tuple[Population, Population] | None:
         """The particles before and after; None if the component refuses n other than their number."""
-        particles = self.example(np.random.default_rng(0), len(weights))[0].realised().particles
+        particles = self.example(seeded(0), len(weights))[0].realised().particles
         population = Population(particles, log_of(weights) + shift)
         inputs = {"population": population, "n": n}
         if n != len(weights):
             try:
-                self.call(component, np.random.default_rng(3), inputs)
+                self.call(component, seeded(3), inputs)
             except InputError:
                 return None
         return population, self.checked_call(component, inputs)
-
-
-def makes_particles(component: Resampler, example: Callable[..., Any]) -> bool:
-    """Whether a resampler makes new particles: its result has no ancestors and is no selection from its input."""
-    given = example(np.random.default_rng(0), 7)[0].realised()
-    population = Population(given.particles, np.log(np.linspace(1.0, 3.0, 7)))
-    before = global_state()
-    try:
-        made = component.resample(np.random.default_rng(0), population, 7).realised()
-        if "ancestor" in made.parents:
-            return False
-        old, new = (
-            [population.take(np.array([i])).particles for i in range(7)],
-            [made.take(np.array([i])).particles for i in range(len(made))],
-        )
-    except Exception:  # the contract reports it
-        return False
-    finally:
-        restore_global_state(before)
-    return not all(any(same(a, b) for b in old) for a in new)
-
-
-def _without_weight(chosen: Population, weights: tuple[float, ...]) -> np.ndarray:
-    """Ancestors whose weight is zero."""
-    ancestors = chosen.parents["ancestor"]
-    return ancestors[np.asarray(weights)[ancestors] == 0]

@@ -3,36 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
+from unittest import SkipTest
 
 import numpy as np
-import pytest
 
 from mstfilter.smc import DensityTransition, Population, as_matrix, union
 from mstfilter.smc.population import take
-from mstfilter.testing.contract import (
-    FALSE_ALARM,
-    check_batched,
+from mstfilter.smc.testing.contract import (
+    BatchedContract,
     reports_errors,
     same,
+    seeded,
     skip_unless_properly_weighted,
     statistical,
 )
-from mstfilter.testing.copies import quantile
-from mstfilter.testing.exact import (
+from mstfilter.smc.testing.copies import quantile
+from mstfilter.smc.testing.exact import (
     SINGLE,
     ExactContract,
     check_mean_weight,
+    check_same_law,
+    check_uncorrelated,
     compare_factors,
-    rank_correlation,
-    seeded,
     without_copies,
 )
 
 _N = 6
 
 
-class TransitionContract(ExactContract):
+class TransitionContract(BatchedContract, ExactContract):
     """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
 
     One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
@@ -40,29 +41,25 @@ class TransitionContract(ExactContract):
     by the observation, the population of x_t has these weights.
     """
 
+    slot = "transition"
+    moves = True
+
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.predict(rng, inputs["population"], inputs["observation"])
 
-    def test_batched_runs_equal_single_runs(self) -> None:
-        """If it declares ``batched = True``, every run of a batch equals the run alone."""
-        check_batched("transition", self.make(), self.example)
-
     def test_parents_are_valid(self) -> None:
-        """It keeps the number of particles, or sets parents "previous" to indices of old particles."""
+        """It keeps the number of particles, or sets parents "previous"; also if the observation is missing."""
         component = self.make()
         for n in (1, 2, _N):
-            moved = self.checked_call(component, self.inputs(n))
-            previous = moved.parents.get("previous")
-            if previous is None:
-                assert len(moved) == n, f'{n} particles became {len(moved)}, and there are no parents "previous"'
-            else:
-                assert ((previous >= -1) & (previous < n)).all(), (
-                    f'parents "previous" contain {int(np.max(previous))}, and there were {n} particles'
-                )
-
-    def test_takes_a_missing_observation(self) -> None:
-        """It moves particles if the observation is missing (None)."""
-        self.checked_call(self.make(), {**self.inputs(_N), "observation": None})
+            for absent in ({}, {"observation": None}):
+                moved = self.checked_call(component, {**self.inputs(n), **absent})
+                previous = moved.parents.get("previous")
+                if previous is None:
+                    assert len(moved) == n, f'{n} particles became {len(moved)}, and there are no parents "previous"'
+                else:
+                    assert ((previous >= -1) & (previous < n)).all(), (
+                        f'parents "previous" contain {int(np.max(previous))}, and there were {n} particles'
+                    )
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights is kept and has no other effect."""
@@ -122,9 +119,9 @@ class TransitionContract(ExactContract):
         component, inputs = self.make(), self.inputs(_N)
         population = inputs["population"]
         if not isinstance(population.particles, (np.ndarray, dict)):
-            pytest.skip("the particles are objects, whose moves are not compared")
+            raise SkipTest("the particles are objects, whose moves are not compared")
         if len(self.checked_call(component, inputs)) != _N:
-            pytest.skip("the number of particles changes")
+            raise SkipTest("the number of particles changes")
         backwards = np.arange(_N)[::-1]
         a = self._moves(component, inputs)
         b = self._moves(component, {**inputs, "population": population.take(backwards)}, 1000)[:, ::-1]
@@ -135,18 +132,22 @@ class TransitionContract(ExactContract):
             assert np.abs(noise[:, :, c] - noise[:, :1, c]).max() > 1e-6 * spread[c], (
                 "all particles get the same noise: draw one random number for each, size=len(population)"
             )
-            self._check_uncorrelated(np.concatenate([a[:, :, c], b[:, :, c]]), len(drawn))
+            both = np.concatenate([a[:, :, c], b[:, :, c]])
+            for i, k in combinations(range(_N), 2):
+                check_uncorrelated(both[:, i], both[:, k], 4 * _N**2 * len(drawn), f"moves of particles {i} and {k}")
         for i in range(_N):
-            self._check_same_law(a[:, i], b[:, i], f"as number {backwards[i]}", i)
+            check_same_law(a[:, i], b[:, i], 4 * _N, f"particle {i} moves differently as number {backwards[i]}")
         if component.properly_weighted and not a[:, :, -1].any():
             reweighted = replace(population, log_weights=np.linspace(0.0, 8.0, _N))
-            other_moves = self._moves(component, {**inputs, "population": reweighted}, 3000)
+            other = self._moves(component, {**inputs, "population": reweighted}, 3000)
             for k in range(_N):
-                self._check_same_law(a[:, k], other_moves[:, k], "if the weights are others", k)
+                check_same_law(
+                    a[:, k], other[:, k], 4 * _N, f"particle {k} moves differently if the weights are others"
+                )
         self._check_missing(component, inputs, a[:, :, drawn])
         if self._first_moves_alone(component, inputs):
             one = self._moves(component, {**inputs, "population": population.take(np.arange(1))}, 2000)
-            self._check_same_law(a[:, 0], one[:, 0], "alone (n = 1)", 0)
+            check_same_law(a[:, 0], one[:, 0], 4 * _N, "particle 0 moves differently alone (n = 1)")
 
     def _moves(self, component: Any, inputs: dict[str, Any], seed: int = 0) -> np.ndarray:
         """(300, n, d + 1) results of 300 calls: coordinates, and the change of the log weight.
@@ -158,30 +159,6 @@ class TransitionContract(ExactContract):
             moved = self.checked_call(component, inputs, seeded(seed + k))
             moves.append(np.column_stack([as_matrix(moved.particles), moved.log_weights - given.log_weights]))
         return np.round(np.array(moves), 9)
-
-    @staticmethod
-    def _check_same_law(x: np.ndarray, y: np.ndarray, place: str, i: int) -> None:
-        """Kolmogorov-Smirnov tests of each column of the moves of particle i."""
-        from scipy.stats import ks_2samp
-
-        for j in range(x.shape[1]):
-            assert ks_2samp(x[:, j], y[:, j], method="asymp").pvalue >= FALSE_ALARM / (4 * _N * x.shape[1]), (
-                f"particle {i} moves differently {place} (mean {x[:, j].mean():.3g} and {y[:, j].mean():.3g}, "
-                f"sd {x[:, j].std():.3g} and {y[:, j].std():.3g})"
-            )
-
-    @staticmethod
-    def _check_uncorrelated(x: np.ndarray, n_columns: int) -> None:
-        """Check the rank correlations of (calls, n) moves of different particles."""
-        from scipy.stats import t
-
-        for i in range(_N):
-            for k in range(i):
-                r = rank_correlation(x[:, i], x[:, k])
-                z = abs(r) * np.sqrt((len(x) - 2) / max(1 - r * r, 1e-12))
-                assert 2 * t.sf(z, len(x) - 2) >= FALSE_ALARM / (4 * _N**2 * n_columns), (
-                    f"particles do not move independently: moves of particles {k} and {i} have correlation {r:.3g}"
-                )
 
     def _check_missing(self, component: Any, inputs: dict[str, Any], moves: np.ndarray) -> None:
         """Check that particles are not still without an observation if they move at random with one."""
@@ -212,20 +189,15 @@ class TransitionContract(ExactContract):
 class DensityTransitionContract(TransitionContract):
     """The contract of every `DensityTransition`: that of a `Transition`, and properties of `log_prob`."""
 
-    def test_log_prob_of_own_moves_is_finite(self) -> None:
-        """`log_prob` gives one finite number for each move that `predict` makes."""
-        component = self.make()
+    def test_log_prob_is_of_each_move(self) -> None:
+        """`log_prob` gives one finite number for each move that `predict` makes, whatever the others are."""
+        component, rows = self.make(), np.array([4, 0, 3])
         for n in (1, _N):
             inputs = self.inputs(n)
-            found = self._log_prob(component, inputs, self.checked_call(component, inputs))
+            moved = self.checked_call(component, inputs)
+            found = self._log_prob(component, inputs, moved)
             assert found.shape == (n,), f"log densities of {n} moves have shape {found.shape}, expected ({n},)"
             assert np.isfinite(found).all(), f"log density of a move is {found[~np.isfinite(found)][0]}"
-
-    def test_log_prob_of_a_move_does_not_depend_on_others(self) -> None:
-        """`log_prob` treats every pair of rows alone."""
-        component, inputs = self.make(), self.inputs(_N)
-        moved, rows = self.checked_call(component, inputs), np.array([4, 0, 3])
-        found = self._log_prob(component, inputs, moved)
         fewer_inputs = {**inputs, "population": inputs["population"].take(rows)}
         fewer = self._log_prob(component, fewer_inputs, moved.take(rows))
         assert np.allclose(fewer, found[rows], atol=1e-9), "three of six moves have other log densities alone"
@@ -240,13 +212,13 @@ class DensityTransitionContract(TransitionContract):
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
-            pytest.skip("the particles are objects")
+            raise SkipTest("the particles are objects")
         population, observation = self.example(seeded(1), n)
         given = Population(population.take(np.argsort(as_matrix(population.particles)[:, 0])).particles)
         inputs = {"population": given, "observation": observation}
         moved = self.checked_call(component, inputs, seeded(2))
         if np.ptp(moved.log_weights) > 0:
-            pytest.skip("moves are weighted: their density is another one")
+            raise SkipTest("moves are weighted: their density is another one")
         own = self._log_prob(component, inputs, moved)
         for shift in 2 ** np.arange(2, 14):
             other = {**inputs, "population": given.take(np.arange(n) ^ shift)}
@@ -265,7 +237,7 @@ class DensityTransitionContract(TransitionContract):
             return np.asarray(component.log_prob(old, moved.particles, inputs["observation"]))
 
 
-class ProposalContract(ExactContract):
+class ProposalContract(BatchedContract, ExactContract):
     """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n exact draws of what the weighted particles of the
@@ -273,18 +245,13 @@ class ProposalContract(ExactContract):
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
     """
 
+    slot = "initial"
+
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {"observation": self.example(seeded(0), 2)[1], "n": n}
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.sample(rng, inputs["observation"], inputs["n"])
-
-    def columns(self, j: int, n_columns: int) -> str:
-        return f"coordinate {j} of x"
-
-    def test_batched_runs_equal_single_runs(self) -> None:
-        """If it declares ``batched = True``, every run of a batch equals the run alone."""
-        check_batched("initial", self.make(), self.example)
 
     def test_gives_n_particles(self) -> None:
         """It returns n particles for any n."""
@@ -321,7 +288,7 @@ class ProposalContract(ExactContract):
             self.check_single(lambda row: as_matrix(sampled(1, row + 10).particles)[0], exact)
 
 
-class UpdateContract(ExactContract):
+class UpdateContract(BatchedContract, ExactContract):
     """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of
@@ -329,6 +296,8 @@ class UpdateContract(ExactContract):
     with their constant factor, which is part of the evidence. With exact draws the factor is free, unless a fourth
     item of `exact` is log p(y), a number.
     """
+
+    slot = "update"
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         predicted, observation = self.example(seeded(seed), n)
@@ -338,28 +307,19 @@ class UpdateContract(ExactContract):
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.update(rng, **inputs)
 
-    def test_batched_runs_equal_single_runs(self) -> None:
-        """If it declares ``batched = True``, every run of a batch equals the run alone."""
-        check_batched("update", self.make(), self.example)
-
     def test_takes_any_of_its_inputs(self) -> None:
-        """It accepts predicted particles, proposed ones, or both."""
+        """It accepts predicted particles, proposed ones, or both; parents are indices of them, or -1."""
         component, inputs = self.make(), self.inputs(_N)
-        for absent in ({"proposed": None}, {"predicted": None}, {}):
-            self.checked_call(component, {**inputs, **absent})
-
-    def test_parents_exist(self) -> None:
-        """Parents are indices of particles that exist, or -1."""
-        inputs = self.inputs(_N)
-        sizes = {"previous": len(inputs["predicted"]), "proposed": len(inputs["proposed"])}
         for name, population in (("previous", "predicted"), ("proposed", "proposed")):
-            inputs[population] = replace(inputs[population], parents={name: np.arange(sizes[name])})
-        out = self.checked_call(self.make(), inputs)
-        for name, n in sizes.items():
-            index = out.parents.get(name, np.array([-1]))
-            assert ((index >= -1) & (index < n)).all(), (
-                f'parents "{name}" contain {int(np.max(index))}, and there were {n} particles'
-            )
+            n = len(inputs[population])
+            inputs[population] = replace(inputs[population], parents={name: np.arange(n)})
+        for absent in ({"proposed": None}, {"predicted": None}, {}):
+            out = self.checked_call(component, {**inputs, **absent})
+            for name, n in (("previous", _N), ("proposed", len(inputs["proposed"]))):
+                index = out.parents.get(name, np.array([-1]))
+                assert ((index >= -1) & (index < n)).all(), (
+                    f'parents "{name}" contain {int(np.max(index))}, and there were {n} particles'
+                )
 
     def test_parents_belong_to_their_particles(self) -> None:
         """A predicted particle that it keeps has that particle as parent "previous"."""
@@ -386,9 +346,9 @@ class UpdateContract(ExactContract):
 
         every = factors(np.arange(_N))
         if every is None:
-            pytest.skip("it makes other particles than the predicted ones")
+            raise SkipTest("it makes other particles than the predicted ones")
         if not same(every, factors(np.arange(_N), seed=4)):
-            pytest.skip("its weights are random")
+            raise SkipTest("its weights are random")
         order = [k for k in np.argsort(-every) if np.isfinite(every[k])]  # no population is without weight
         for rows in map(np.array, (order[1:4] or order, order[-1:])):
             some = factors(rows)
@@ -422,9 +382,6 @@ class UpdateContract(ExactContract):
                 factors = np.exp(lw - predicted.log_mean_weight - log_evidence)
                 dropped = np.zeros(max(n - len(lw), 0))
                 check_mean_weight(np.append(factors, dropped) * (max(n, len(lw)) / len(out)), np.ones(n))
-
-    def columns(self, j: int, n_columns: int) -> str:
-        return f"coordinate {j} of x"
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights is kept and has no other effect."""
@@ -481,9 +438,9 @@ class RejuvenationContract(ExactContract):
             self.check_independent(found)
         self.check_single(lambda row: moved(SINGLE, row)[0], exact)
 
-    def columns(self, j: int, n_columns: int) -> str:
-        previous = self.exact_case(1, 1)[0]
-        return super().columns(j, n_columns) if previous is not None else f"coordinate {j} of x_t"
+    @property
+    def moves(self) -> bool:  # type: ignore[override]
+        return self.exact_case(1, 1)[0] is not None
 
 
 def _columns(previous: Population | None, population: Population) -> np.ndarray:

@@ -1,0 +1,236 @@
+"""Paths of states given all observations, one at a time: conditional SMC.
+
+>>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
+>>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
+
+`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant, for any number of particles,
+also for programs (Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint log density of a path and the
+observations. `particle_gibbs` uses both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError, check_integer
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import split_input
+from mstfilter.smc.interfaces import DensityTransition, Transition
+from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
+from mstfilter.smc.programs.handlers import CopyHandler, GuideHandler, ReplayHandler, SampleHandler, ScoreHandler
+from mstfilter.smc.programs.sites import PerParticle
+from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.smoothing import draw_log
+from mstfilter.smc.state_space import Dynamics, Prior
+from mstfilter.smc.streams import Key
+
+_FIRST = np.zeros(1, np.int64)  # the row of the particle that follows the given path
+
+
+def conditional_path(
+    filter: ParticleFilter, observations: Sequence[Any], seed: int | Key = 0, path: Particles | None = None
+) -> Particles:
+    """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
+
+    One particle follows `path`, the others are drawn as usual, and one of the final particles is traced back.
+    Ancestors are multinomial at every step: `resampler` and `trigger` of the filter are not used. The particle that
+    follows the path draws its ancestors, too, if the density of the transition is known; a program must then keep
+    nothing but its sites.
+
+    Parameters
+    ----------
+    filter : ParticleFilter
+        Bootstrap or guided filter of a model or a program, with at least two particles.
+    path : T particles, optional
+        The present path: row t is the particle at time t. Without it the path is drawn by an ordinary filter.
+
+    Returns
+    -------
+    array (T, ...), mapping of such, or tuple of T objects
+    """
+    _check_conditional(filter)
+    ys = list(observations)
+    if not ys or (path is not None and count_particles(path) != len(ys)):
+        states = "" if path is None else f" for a path of {count_particles(path)} states"
+        raise InputError(f"there are {len(ys)} observations{states}")
+    key = seed if isinstance(seed, Key) else Key(seed)
+    rng = key.child("ancestors").generator()
+    populations: list[Population] = []
+    parents: list[np.ndarray] = []
+    past: Population | None = None
+    for t, observation in enumerate(ys):
+        y, u = split_input(observation)
+        now = filter.at_step(t, u)
+        given = None if path is None else take(path, np.array([t]))
+        if past is not None:
+            others, _ = Multinomial().select(rng, past.log_weights, filter.n - 1)
+            index = np.append(_ancestor(rng, now.transition, past, given, y), others)
+            parents.append(index)
+            past = Population(take(past.particles, index))
+        past = _moved(now, key.child("step", t), past, given, y)
+        if now.update is not None and y is not None:
+            update_rng = key.child("step", t, "update").generator() if now.update.draws else rng
+            past = now.update.update(update_rng, past, None, y)
+        populations.append(past)
+    rows = [int(draw_log(rng, populations[-1].log_weights[None])[0])]
+    for index in reversed(parents):
+        rows.append(int(index[rows[-1]]))
+    chosen = zip(populations, reversed(rows), strict=True)
+    return _joined([take(p.realised().particles, np.array([row])) for p, row in chosen])
+
+
+def _check_conditional(filter: ParticleFilter) -> None:
+    for slot in ("proposal", "lookahead", "rejuvenation", "size"):
+        if getattr(filter, slot) is not None:
+            raise InputError(
+                f"conditional SMC does not know a filter with `{slot}`", "use a bootstrap or guided filter"
+            )
+    if not filter.properly_weighted:
+        raise InputError("a component of the filter is not properly weighted: its paths have another law")
+    check_integer("n", filter.n, "one particle follows the present path", at_least=2)
+
+
+def _ancestor(
+    rng: np.random.Generator, transition: Transition | None, past: Population, given: Particles | None, y: Any
+) -> int:
+    """Index of the parent of particle 0, which follows the given path."""
+    if given is None:
+        return int(draw_log(rng, past.log_weights[None])[0])
+    density = _log_density(transition, past.particles, take(given, np.zeros(len(past), np.int64)), y)
+    if density is None:
+        return 0
+    # Lindsten, Jordan, Schön (2014), equation 16.
+    return int(draw_log(rng, (past.log_weights + density)[None])[0])
+
+
+def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
+    """(n,) log f(new | old), for programs with log p(y | new, old); None if it is not known."""
+    if isinstance(transition, ProgramTransition):
+        if isinstance(transition.model, PerParticle):
+            return None
+        handler = ScoreHandler(dict(new))
+        particles, density = run_program(transition.model, handler, old, y, count_particles(old))
+        # A value that the program returns is a function of the previous particle, and has no density.
+        return density if {site.name for site in handler.sites} == set(particles) else None
+    if isinstance(transition, Dynamics):
+        found = transition.model.log_transition
+        return None if found is None else np.asarray(found(old, new), np.float64)
+    if isinstance(transition, DensityTransition):
+        return np.asarray(transition.log_prob(old, new, y), np.float64)
+    return None
+
+
+def _moved(
+    filter: ParticleFilter, streams: Key, past: Population | None, given: Particles | None, y: Any
+) -> Population:
+    """The particles of a step before the update; particle 0 is the given one, with its weight."""
+    component: Any
+    slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
+    particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
+    if len(log_weights) != filter.n:
+        raise InputError(
+            f"{slot} made {len(log_weights)} particles of {filter.n}: conditional SMC needs one for each"
+        )
+    if given is None:
+        return Population(particles, log_weights)
+    log_weights = np.array(log_weights)
+    old = None if past is None else take(past.particles, _FIRST)
+    if isinstance(component, ProgramInitial | ProgramTransition):
+        given, log_weights[0] = _given_to_program(component, old, given, y)
+    elif isinstance(component, Prior):
+        log_weights[0] = component.log_weight(given, y)[0]
+    elif isinstance(component, Dynamics):
+        log_weights[0] = component.log_weight(old, given, y)[0]
+    elif log_weights.any():
+        raise InputError(
+            f"{slot} is a {type(component).__name__} that weights its particles, so the weight of a given "
+            "particle is not known",
+            "use Prior, Dynamics or a Program",
+        )
+    return Population(_with_first(particles, given), log_weights)
+
+
+def _drawn(
+    rng: np.random.Generator, component: Any, past: Population | None, y: Any, n: int
+) -> tuple[Particles, np.ndarray]:
+    """Particles and log weights of a step, all drawn. A program runs without the checks of a filter."""
+    if not isinstance(component, ProgramInitial | ProgramTransition):
+        if past is None:
+            moved = component.sample(rng, y, n)
+        else:
+            moved = past if component is None else component.predict(rng, past, y)
+        return moved.particles, moved.log_weights
+    previous = None if past is None else past.particles
+    if component.guide is None or y is None:
+        return run_program(component.model, SampleHandler(rng), previous, y, n)
+    guide = GuideHandler(rng, n)
+    run_program(component.guide, guide, previous, y, n)
+    return run_program(component.model, ReplayHandler(guide), previous, y, n)
+
+
+def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:
+    """The given particle (one row) with the values that the program returns, and its log weight."""
+    values = given if isinstance(given, Mapping) else {name: np.asarray(a)[None] for name, a in given[0].items()}
+    if component.guide is None or y is None:
+        particle, gain = run_program(component.model, CopyHandler(values, _FIRST), old, y, 1)
+        return particle, gain[0]
+    _, log_q = run_program(component.guide, ScoreHandler(values), old, y, 1)
+    particle, log_p = run_program(component.model, ScoreHandler(values), old, y, 1)
+    return particle, log_p[0] - log_q[0]
+
+
+def _with_first(particles: Particles, first: Particles) -> Particles:
+    """The particles with another one at index 0."""
+    if isinstance(particles, Mapping):
+        return {name: _with_first(a, first[name]) for name, a in particles.items()}
+    if not isinstance(particles, np.ndarray):
+        return (first[0], *tuple(particles)[1:])
+    particles = np.array(particles)
+    particles[0] = first[0]
+    return particles
+
+
+def _joined(rows: list[Particles]) -> Particles:
+    """Particles of all times, from one particle each; values that a program does not have at a time are NaN or 0."""
+    if isinstance(rows[0], np.ndarray):
+        return np.concatenate(rows)
+    if not isinstance(rows[0], Mapping):
+        return tuple(row[0] for row in rows)
+    examples = {name: a for row in rows for name, a in row.items()}
+    blank = {name: np.full_like(a, np.nan if a.dtype.kind == "f" else 0) for name, a in examples.items()}
+    return {name: np.concatenate([row.get(name, blank[name]) for row in rows]) for name in examples}
+
+
+def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Particles) -> float:
+    """log p(x_0 .. x_T, y_0 .. y_T) of a path of `conditional_path`, by the model or the program of a filter.
+
+    The filter is made from a `StateSpaceModel` with its log densities or from a `Program`.
+    """
+    total, previous = 0.0, None
+    for t, observation in enumerate(observations):
+        y, u = split_input(observation)
+        row = take(path, np.array([t]))
+        total += _step_log_prob(filter.at_step(t, u), previous, row, y)
+        previous = row
+    return total
+
+
+def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Particles, y: Any) -> float:
+    """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
+    component = filter.initial if previous is None else filter.transition
+    if isinstance(component, ProgramInitial | ProgramTransition):
+        if isinstance(component.model, PerParticle):
+            raise InputError("the density of a path of a per_particle program is not available")
+        values = row if isinstance(row, Mapping) else row[0]
+        _, gain = run_program(component.model, ScoreHandler(values), previous, y, 1)
+        return float(gain[0])
+    if not isinstance(component, Prior | Dynamics):
+        raise InputError("the filter is not made from a StateSpaceModel or a Program: its densities are not known")
+    model = component.model
+    density = model.density("log_initial" if previous is None else "log_transition")
+    found = density(row) if previous is None else density(previous, row)
+    return float(found[0]) + (0.0 if y is None else float(model.log_likelihood(row, y)[0]))

@@ -1,0 +1,311 @@
+"""Models with Gaussian noise, and filters that use it: EKF- and UKF-guided, Rao-Blackwellised.
+
+>>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
+
+A model with Gaussian noise and nonlinear functions has good proposals: the updates of the extended and the unscented
+Kalman filter.
+
+>>> filter = rao_blackwellised(model, n=100)
+>>> state, infos = filter.run(observations, seed=0)
+>>> state.population.particles["mean"].shape           # (n, d)
+
+In a Rao-Blackwellised filter part of the state, u_t (a regime, a contact, an association), is drawn. Given u_0 .. u_t
+the rest is linear and Gaussian:
+
+    z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
+
+A particle holds u with the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
+arrays, moved by a Transition (draw u, predict z) and an Update (weight by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}),
+correct z). Reference: Doucet, de Freitas, Murphy, Russell (2000).
+
+`mstfilter.smc.exact` has linear models and their exact answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.smc.distributions import MultivariateNormal
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import AtStep, step_parameters, with_step
+from mstfilter.smc.interfaces import Proposal, Transition, Update
+from mstfilter.smc.population import Population, union
+from mstfilter.smc.state_space import StateSpaceModel
+from mstfilter.smc.streams import Rows
+
+_Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d)
+
+
+def nonlinear_gaussian(
+    f: Callable[..., Any], Q: Any, h: Callable[..., Any], R: Any, m0: Any, P0: Any
+) -> StateSpaceModel:
+    """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
+
+    `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
+    row. They may have the further parameters ``t`` and ``u``; `Q` and `R` may have a first axis of T entries.
+
+    `Q` and `P0` may be singular, as that of noise that acts on the velocity only. x_t then has no density given
+    x_{t-1}: the model has no `log_transition` (for `P0`: no `log_initial`), and what needs it raises InputError. A
+    conditional path is then drawn without ancestor sampling.
+    """
+    m0 = np.asarray(m0, np.float64)
+    p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
+    moved, seen = _OfStep(f), _OfStep(h)
+    moves, sees = {**moved.parameters, **q.parameters}, {**seen.parameters, **r.parameters}
+
+    def transition(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
+        return moved(x, step) + q.at(**step).draw(rng, len(x))
+
+    def log_likelihood(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
+        noise = r.at(**step)
+        return noise.log_prob(vectors("observation", y, noise.size) - seen(x, step))
+
+    def log_transition(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
+        return q.at(**step).log_prob(new - moved(old, step))
+
+    return StateSpaceModel(
+        lambda rng, n: m0 + p.draw(rng, n),
+        with_step(transition, moves),
+        with_step(log_likelihood, sees),
+        None if p.singular else lambda x: p.log_prob(x - m0),
+        None if any(noise.singular for noise in q.entries) else with_step(log_transition, moves),
+        batched=True,
+    )
+
+
+class _Noise:
+    """Normal noise of mean 0 and one covariance (k, k)."""
+
+    def __init__(self, name: str, cov: np.ndarray, k: int | None, semidefinite: bool) -> None:
+        root, self.singular = _covariance(name, cov, k, semidefinite)
+        self.size, self.root = len(root), root.T
+        if not self.singular:
+            self.whiten = np.linalg.inv(root).T
+            self.constant = np.log(np.diag(self.whiten)).sum() - 0.5 * self.size * np.log(2 * np.pi)
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n, k) draws."""
+        return rng.standard_normal((n, self.size)) @ self.root
+
+    def log_prob(self, residual: np.ndarray) -> np.ndarray:
+        """(n,) log densities of residuals (n, k)."""
+        z = residual @ self.whiten
+        return self.constant - 0.5 * np.einsum("...j,...j->...", z, z)
+
+
+class _Noises:
+    """Noise with one covariance (k, k) for all steps, or with one for each step, (T, k, k)."""
+
+    def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
+        cov = np.asarray(given, np.float64)
+        self.name, self.parameters = name, {"t": True} if cov.ndim == 3 else {}
+        self.entries = [_Noise(name, m, k, semidefinite) for m in (cov if self.parameters else cov[None])]
+
+    def at(self, t: int = 0, u: Any = None) -> _Noise:
+        return entry(self.name, self.entries, t) if self.parameters else self.entries[0]
+
+
+class _OfStep:
+    """A function of particles and, if it has such parameters, of the step `t` and its input `u`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.parameters = function, step_parameters(function, 1)
+
+    def __call__(self, x: np.ndarray, step: dict[str, Any]) -> Any:
+        if not self.parameters:
+            return self.function(x)
+        return self.function(x, **{name: value for name, value in step.items() if name in self.parameters})
+
+
+def entry(name: str, given: Any, t: int) -> Any:
+    """Entry `t` of a list with one for each step; InputError if there is none."""
+    if t >= len(given):
+        raise InputError(f"{name} has {len(given)} entries, and none for step {t}")
+    return given[t]
+
+
+def vectors(what: str, given: Any, size: int) -> np.ndarray:
+    """An observation or input (size,) of all particles, or (m, size) of the rows of a batch."""
+    vector = np.asanyarray(given, np.float64)
+    if vector.shape == (size,) and not isinstance(vector, Rows):
+        return vector
+    by_row = isinstance(vector, Rows)
+    if vector.ndim == by_row:
+        vector = vector[..., None]
+    if vector.shape[by_row:] != (size,):
+        raise InputError(f"the {what} has shape {vector.shape[by_row:]}, expected ({size},)")
+    return vector
+
+
+def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool = False) -> tuple[np.ndarray, bool]:
+    """A square root of a covariance: the Cholesky factor, or one by eigenvalues if it is singular; whether it is."""
+    cov = np.asarray(given, dtype=np.float64)
+    if cov.ndim != 2 or cov.shape != (d or len(cov), d or len(cov)):
+        expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
+        raise InputError(f"{name} has shape {cov.shape}, expected {expected}")
+    if np.allclose(cov, cov.T):
+        values, axes = np.linalg.eigh(cov)
+        rounding = 1e-14 * max(values.max(), 0.0)
+        if (values > rounding).all():
+            return np.linalg.cholesky(cov), False
+        if semidefinite and (values >= -rounding).all():
+            return axes * np.sqrt(np.maximum(values, 0.0)), True
+    kind = "semidefinite" if semidefinite else "definite"
+    raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive {kind}")
+
+
+class Linear(NamedTuple):
+    """Matrices of the linear part for each particle, or without the particle axis if shared by all."""
+
+    F: Any  #: (n, d, d)
+    Q: Any
+    H: Any  #: (n, k, d)
+    R: Any  #: (n, k, k)
+    b: Any = 0.0  #: (n, d)
+
+
+@dataclass(frozen=True)
+class ConditionallyLinear(AtStep):
+    """A model that is linear and Gaussian given the part u, which is drawn.
+
+    ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
+    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
+    have a further parameter ``t``, the index of the step, or ``u`` after a first one of another name, its input.
+    """
+
+    sample_initial: Callable[[np.random.Generator, int], np.ndarray]
+    sample_transition: Callable[[np.random.Generator, np.ndarray], np.ndarray]
+    linear: Callable[[np.ndarray], Linear]
+    mean: Any
+    cov: Any
+
+    step_functions: ClassVar = {"sample_initial": 2, "sample_transition": 2, "linear": 1}
+
+
+@dataclass(frozen=True)
+class _Initial(Proposal):
+    model: ConditionallyLinear
+    step_functions: ClassVar = {"model": None}
+
+    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
+        mean, cov = np.asarray(self.model.mean, np.float64), np.asarray(self.model.cov, np.float64)
+        return Population(
+            {"u": self.model.sample_initial(rng, n), "mean": np.tile(mean, (n, 1)), "cov": np.tile(cov, (n, 1, 1))}
+        )
+
+
+@dataclass(frozen=True)
+class _Predict(Transition):
+    model: ConditionallyLinear
+    step_functions: ClassVar = {"model": None}
+
+    def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
+        """Draw u_t, then predict mean and covariance."""
+        u = self.model.sample_transition(rng, population.particles["u"])
+        m = self.model.linear(u)
+        F, n = np.asarray(m.F, np.float64), len(population)
+        mean = (F @ population.particles["mean"][..., None])[..., 0] + m.b
+        cov = F @ population.particles["cov"] @ np.swapaxes(F, -1, -2) + m.Q
+        particles = {"u": u, "mean": mean, "cov": np.broadcast_to(cov, (n, *cov.shape[-2:]))}
+        return Population(particles, population.log_weights, population.parents)
+
+
+@dataclass(frozen=True)
+class _Correct(Update):
+    model: ConditionallyLinear
+    draws: ClassVar[bool] = False
+    step_functions: ClassVar = {"model": None}
+
+    def update(
+        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
+    ) -> Population:
+        """Weight by the predictive density N(y; H m, S), then correct mean and covariance (Joseph form)."""
+        population = union(predicted, proposed)
+        p: Any = population.particles
+        y = np.atleast_1d(np.asarray(observation, dtype=np.float64))
+        m = self.model.linear(p["u"])
+        H, R = np.asarray(m.H, np.float64), np.asarray(m.R, np.float64)
+        expected = (H @ p["mean"][..., None])[..., 0]
+        S = H @ p["cov"] @ np.swapaxes(H, -1, -2) + R
+        log_p = MultivariateNormal(expected, S).log_prob(y)
+        gain = np.swapaxes(np.linalg.solve(S, H @ p["cov"]), -1, -2)
+        keep = np.eye(p["mean"].shape[1]) - gain @ H
+        cov = keep @ p["cov"] @ np.swapaxes(keep, -1, -2) + gain @ R @ np.swapaxes(gain, -1, -2)
+        mean = p["mean"] + (gain @ (y - expected)[..., None])[..., 0]
+        particles = {"u": p["u"], "mean": mean, "cov": cov}
+        return Population(particles, population.log_weights + log_p, population.parents)
+
+
+def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> ParticleFilter:
+    """The Rao-Blackwellised filter of a model with `n` particles.
+
+    `components` are further fields of `ParticleFilter`, such as ``resampler``.
+    """
+    return ParticleFilter(
+        initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **components
+    )
+
+
+def _definite(name: str, given: Any) -> np.ndarray:
+    """A covariance that must be positive definite."""
+    _covariance(name, given)
+    return np.asarray(given, np.float64)
+
+
+def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[np.ndarray, Any], MultivariateNormal]:
+    """A proposal for `guided`: the update of the extended Kalman filter from each particle.
+
+    Given x_{t-1} the state is N(f(x_{t-1}), Q); `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000, section
+    II D). The arguments are as in `nonlinear_gaussian`; `jacobian` gives the derivatives of `h`, (n, k, d) or (k, d).
+    It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
+    """
+    Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
+
+    def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
+        mean = f(x)
+        H = np.asarray(jacobian(mean), np.float64)
+        cross = Q @ np.swapaxes(H, -1, -2)
+        return _conditional(mean, Q, h(mean), H @ cross + R, cross, y)
+
+    return proposal
+
+
+def ukf_proposal(
+    f: _Map, Q: Any, h: _Map, R: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
+) -> Callable[[np.ndarray, Any], MultivariateNormal]:
+    """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
+
+    Needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are those of
+    filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread. The other
+    arguments are as in `nonlinear_gaussian`.
+    """
+    from filterpy.kalman import MerweScaledSigmaPoints
+
+    Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
+    points = MerweScaledSigmaPoints(len(Q), alpha, beta, kappa)
+    offsets = points.sigma_points(np.zeros(len(Q)), Q)
+
+    def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
+        mean = f(x)
+        sigma = mean[:, None] + offsets
+        z = np.reshape(h(sigma.reshape(-1, len(Q))), (*sigma.shape[:2], len(R)))
+        centre = np.einsum("s,nsk->nk", points.Wm, z)
+        z = z - centre[:, None]
+        S = np.einsum("s,nsi,nsj->nij", points.Wc, z, z) + R
+        return _conditional(mean, Q, centre, S, np.einsum("s,si,nsj->nij", points.Wc, offsets, z), y)
+
+    return proposal
+
+
+def _conditional(
+    mean: np.ndarray, cov: np.ndarray, predicted: np.ndarray, S: np.ndarray, cross: np.ndarray, y: Any
+) -> MultivariateNormal:
+    """The normal distribution of x given y, from their joint moments."""
+    gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(cross, -1, -2)), -1, -2)
+    residual = np.atleast_1d(np.asarray(y, np.float64)) - predicted
+    return MultivariateNormal(mean + (gain @ residual[..., None])[..., 0], cov - gain @ S @ np.swapaxes(gain, -1, -2))

@@ -1,0 +1,159 @@
+"""Recording quantities of a run.
+
+A collector is a function ``(state, info) -> number or array``, called after every step. `ess`, `unique_ancestors`,
+`weight_entropy`, `log_evidence`, `mean`, `resampled` and `n_particles` are collectors, and
+`mstfilter.smc.diagnostics.selection_distance`.
+
+>>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
+>>> history["ess"]                                   # (T,)
+>>> history.to_xarray()                              # needs xarray
+
+`mstfilter.smc.run_many` takes the same collectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mstfilter.errors import InputError
+from mstfilter.smc.export import Table, flat_columns, library
+from mstfilter.smc.interfaces import Info, State
+
+Collector = Callable[[State, Info], Any]
+
+
+def ess(state: State, info: Info) -> float:
+    """Effective sample size after the update."""
+    return info.ess
+
+
+def unique_ancestors(state: State, info: Info) -> int:
+    """Number of particles of the previous population that have descendants."""
+    assert state.population is not None
+    return state.population.unique_ancestors
+
+
+def weight_entropy(state: State, info: Info) -> float:
+    """Entropy of the normalised weights in nats: log n if they are equal, 0 if one particle has all weight."""
+    assert state.population is not None
+    w = state.population.weights
+    w = w[w > 0]
+    return float(-(w @ np.log(w)))
+
+
+def log_evidence(state: State, info: Info) -> float:
+    """Log evidence so far; NaN if the filter does not report it."""
+    found = state.log_evidence
+    return np.nan if found is None else found
+
+
+def resampled(state: State, info: Info) -> bool:
+    """Whether the step resampled."""
+    return info.resampled
+
+
+def n_particles(state: State, info: Info) -> int:
+    """Particles after the step."""
+    return info.n
+
+
+def mean(state: State, info: Info) -> Any:
+    """Weighted mean of array particles."""
+    assert state.population is not None
+    particles = state.population.particles
+    if not isinstance(particles, np.ndarray):
+        raise InputError(
+            f"the mean of particles of type {type(particles).__name__} is not defined",
+            "write a collector: lambda state, info: state.population.weights @ state.population.particles['x']",
+        )
+    return np.tensordot(state.population.weights, particles, axes=1)
+
+
+@dataclass(frozen=True, eq=False)
+class History(Mapping[str, np.ndarray], Table):
+    """Collected arrays by name."""
+
+    values_: Mapping[str, np.ndarray]  #: name -> array whose first axes are `dims`
+    dims: tuple[str, ...] = ("time",)  #: ("time",) for one run, ("seed", "time") or ("arm", "seed", "time") for many
+    coords: Mapping[str, Any] = field(default_factory=dict)  #: labels along the axes
+    state: State | None = None  #: the last state of a single run
+    #: Seed, or (arm, seed), -> reason, of runs that are lost.
+    lost: Mapping[Any, str] = field(default_factory=dict)
+    #: Arm -> why `run_many` made its runs one by one; the arm of a single filter is "filter".
+    single: Mapping[str, str] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.values_:
+            raise KeyError(f"nothing was collected as {name!r}; there are: {', '.join(self.values_) or 'no arrays'}")
+        return self.values_[name]
+
+    def __iter__(self) -> Any:
+        return iter(self.values_)
+
+    def __len__(self) -> int:
+        return len(self.values_)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        return next(iter(self.values_.values()), np.zeros(0)).shape[: len(self.dims)]
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{name} {size}" for name, size in zip(self.dims, self._shape, strict=False))
+        lines = [f"History: {sizes}" + f", {len(self.lost)} runs lost" * bool(self.lost)]
+        lines += [_summary(name, a) for name, a in self.values_.items()]
+        return "\n  ".join(lines if len(lines) <= 5 else [*lines[:4], "also " + ", ".join(list(self.values_)[3:])])
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of `to_pandas`: the labels of the axes and the collected values, one row per step."""
+        labels = np.meshgrid(*(np.asarray(self.coords[name]) for name in self.dims), indexing="ij")
+        named = dict(zip(self.dims, labels, strict=True))
+        return flat_columns({**named, **self.values_}, axes=len(self._shape))
+
+    def to_xarray(self) -> Any:
+        """An ``xarray.Dataset`` with named dimensions; MissingLibraryError if xarray is not installed."""
+        xarray = library("xarray")
+        data = {
+            name: ((*self.dims, *(f"{name}_{k}" for k in range(a.ndim - len(self.dims)))), a)
+            for name, a in self.values_.items()
+        }
+        return xarray.Dataset(data, coords=dict(self.coords))
+
+
+def _summary(name: str, a: np.ndarray) -> str:
+    """One line: name, shape and range of an array."""
+    found = a[np.isfinite(a)] if a.dtype.kind in "fiu" else a[:0]
+    return f"{name} {a.dtype} {a.shape}" + (f", {found.min():.4g} to {found.max():.4g}" if found.size else "")
+
+
+def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:
+    """Iterate over a run, ``filter.iterate(observations, seed)``, and keep the results of the collectors.
+
+    Each collector is a function of (state, info), whose result has the same shape at every step.
+    """
+    rows: dict[str, list[Any]] = {name: [] for name in collectors}
+    state, times = None, []
+    for state, info in steps:
+        times.append(info.t)
+        for name, collector in collectors.items():
+            rows[name].append(np.asarray(collector(state, info)))
+    values = {name: stacked(name, row) for name, row in rows.items()}
+    return History(values, ("time",), {"time": np.array(times, dtype=np.int64)}, state)
+
+
+def stacked(name: str, rows: list[np.ndarray]) -> np.ndarray:
+    """What a collector returned at each step, as one array."""
+    check_one_shape(name, [row.shape for row in rows])
+    return np.stack(rows) if rows else np.zeros(0)
+
+
+def check_one_shape(name: str, shapes: list[tuple[int, ...]]) -> None:
+    """Raise InputError if the results of a collector have different shapes."""
+    if len(set(shapes)) > 1:
+        raise InputError(
+            f"collector {name!r} returned arrays of different shapes: {sorted(set(shapes))}",
+            "reduce them to one shape, for example to a mean",
+        )

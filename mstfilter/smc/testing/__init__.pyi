@@ -1,0 +1,27 @@
+from mstfilter.smc.testing.contract import (
+    FALSE_ALARM as FALSE_ALARM,
+    CheckResult as CheckResult,
+    Contract as Contract,
+    check_properties as check_properties,
+    number_example as number_example,
+)
+from mstfilter.smc.testing.moves import (
+    DensityTransitionContract as DensityTransitionContract,
+    ProposalContract as ProposalContract,
+    RejuvenationContract as RejuvenationContract,
+    TransitionContract as TransitionContract,
+    UpdateContract as UpdateContract,
+)
+from mstfilter.smc.testing.resampling import (
+    ResamplerContract as ResamplerContract,
+    TransformResamplerContract as TransformResamplerContract,
+    WeightResamplerContract as WeightResamplerContract,
+)
+from mstfilter.smc.testing.values import (
+    CodecContract as CodecContract,
+    EquivalenceContract as EquivalenceContract,
+    LookaheadContract as LookaheadContract,
+    SimilarityContract as SimilarityContract,
+    SizeContract as SizeContract,
+    TriggerContract as TriggerContract,
+)
