@@ -47,8 +47,9 @@ def _lines(kind: str) -> Iterator[str]:
     for name in REGISTRY.known(kind):
         try:
             cls = REGISTRY.find_class(kind, name)
-        except MissingLibraryError as error:
-            yield f"{name:<20}not available: {error.hints[0]}"
+        except InputError as error:
+            why = error.hints[0] if isinstance(error, MissingLibraryError) else error.message
+            yield f"{name:<20}not available: {why}"
             continue
         truth = " (uses the ground truth)" if issubclass(cls, UsesTruth) else ""
         summary = (cls.__doc__ or "").strip().split("\n")[0].rstrip(".")
