@@ -74,10 +74,10 @@ def source_of(module: str, name: str) -> str:
 
 def test_the_package_does_not_grow():
     """A new capability replaces code more often than it adds some. Lower a bound when code is removed."""
-    assert n_lines(FILES) <= 45_120
+    assert n_lines(FILES) <= 45_140
     assert len(FILES) <= 190
     smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
-    assert n_lines(smc) <= 9_630
+    assert n_lines(smc) <= 9_640
     assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 22  # programs/ is one
     assert max(n_lines([path]) for path in FILES) <= 650
 
