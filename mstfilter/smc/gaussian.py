@@ -232,7 +232,10 @@ class _Correct(Update):
         H, R = np.asarray(m.H, np.float64), np.asarray(m.R, np.float64)
         expected = (H @ p["mean"][..., None])[..., 0]
         S = H @ p["cov"] @ np.swapaxes(H, -1, -2) + R
-        log_p = MultivariateNormal(expected, S).log_prob(y)
+        root = np.linalg.cholesky(S)
+        z = np.linalg.solve(root, (y - expected)[..., None])[..., 0]
+        log_det = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+        log_p = -0.5 * (z * z).sum(axis=-1) - log_det - 0.5 * len(y) * np.log(2 * np.pi)
         gain = np.swapaxes(np.linalg.solve(S, H @ p["cov"]), -1, -2)
         keep = np.eye(p["mean"].shape[1]) - gain @ H
         cov = keep @ p["cov"] @ np.swapaxes(keep, -1, -2) + gain @ R @ np.swapaxes(gain, -1, -2)

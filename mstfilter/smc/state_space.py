@@ -296,7 +296,8 @@ def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
     """Rows of `new` where `accepted` is True, else of `old`: arrays, or mappings of such."""
     if isinstance(old, Mapping):
         return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
-    return np.where(accepted.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+    rows = accepted if old.ndim == 1 else accepted.reshape(-1, *(1,) * (old.ndim - 1))
+    return np.where(rows, new, old)
 
 
 def metropolis(
@@ -339,11 +340,11 @@ def moved(
     choose: Callable[[np.ndarray, _Chains, _Chains], _Chains] = choose_rows,
 ) -> tuple[_Chains, float]:
     """The state after `steps` steps of `metropolis`, and the share of accepted proposals."""
-    shares = []
+    taken = proposed = 0
     for after, accepted in metropolis(rng, state, propose, steps, choose):
         state = after
-        shares.append(accepted.mean())
-    return state, float(np.mean(shares))
+        taken, proposed = taken + int(np.count_nonzero(accepted)), proposed + len(accepted)
+    return state, taken / proposed
 
 
 def bootstrap(
