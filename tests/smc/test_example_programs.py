@@ -9,10 +9,7 @@ import pytest
 
 from tests.conftest import REPOSITORY
 
-PROGRAMS = [
-    *sorted((REPOSITORY / "models" / "programs").glob("*.py")),
-    REPOSITORY / "experiments" / "miniature" / "program.py",
-]
+PROGRAMS = sorted((REPOSITORY / "models" / "programs").glob("*.py"))
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: p.stem)
