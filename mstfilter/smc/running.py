@@ -115,7 +115,7 @@ def run_many(
             advance(len(found), len(arms) * len(job.seeds))
     for arm, why in single.items():
         component = getattr(arms[arm], why.partition(":")[0], None)
-        if component is not None and component.batched is True:
+        if getattr(component, "batched", None) is True:
             warnings.warn(InputWarning(f"the runs of {arm!r} are made one by one: {why}"), stacklevel=2)
     return job.history(found, single, isinstance(filters, Mapping))
 
