@@ -14,7 +14,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
 from mstfilter.fusion import FreeSpace, FusionUpdate, Projection, log_quality
 from mstfilter.fusion.division import divided
 from mstfilter.fusion.update import scored
@@ -71,10 +70,6 @@ class Union(Update):
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.fusion, FusionUpdate):
-            raise InputError(f"union.fusion is a {type(self.fusion).__name__}, expected a FusionUpdate")
 
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip

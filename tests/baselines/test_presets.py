@@ -110,7 +110,7 @@ def test_changes_to_a_preset_reach_the_baselines(tmp_path, monkeypatch):
         ('base = "mst"\nwrap = ["update.fusion=unoin"]', "there is no update 'unoin'"),
         (
             'base = "mst_rules"\nwrap = ["update.fusion=union", "update.fusion=union"]',
-            "is a Union, expected a FusionUpdate",
+            "expected a FusionUpdate",
         ),
     ],
 )
