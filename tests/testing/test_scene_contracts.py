@@ -105,7 +105,7 @@ def test_strange_results_are_warned_of_once(name):
     assert words in str(caught[0].message) and "scene_faults.py, line " in str(caught[0].message)
 
 
-@pytest.mark.parametrize("component", faults.OTHER_TYPES, ids=repr)
+@pytest.mark.parametrize("component", faults.OTHER_TYPES, ids=lambda component: type(component).__name__)
 def test_other_types_are_correct(component):
     with warnings.catch_warnings():
         warnings.simplefilter("error", InputWarning)
