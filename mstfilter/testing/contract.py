@@ -22,7 +22,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import pytest
@@ -35,10 +35,12 @@ from mstfilter.smc import (
     Population,
     Proposal,
     Reweight,
+    RunGenerators,
     State,
     Systematic,
     as_matrix,
     run_many,
+    union,
 )
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -186,8 +188,13 @@ class _Examples(Proposal):
 
     example: Callable[..., Any]
 
-    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return Population(self.example(rng, n)[0].particles)
+    batched: ClassVar[bool] = True
+
+    def sample(self, rng: Any, observation: Any, n: int) -> Population:
+        if not isinstance(rng, RunGenerators):
+            return Population(self.example(rng, n)[0].particles)
+        parts = [Population(self.example(g, n // len(rng))[0].particles) for g in rng.generators()]
+        return functools.reduce(union, parts)
 
 
 def check_batched(slot: str, component: Any, example: Callable[..., Any]) -> None:
@@ -198,7 +205,12 @@ def check_batched(slot: str, component: Any, example: Callable[..., Any]) -> Non
     if not component.batched:
         return
     y = example(np.random.default_rng(0), 2)[1]
-    slots = {"initial": _Examples(example), "update": Reweight(_row_sums), "resampler": Systematic(), slot: component}
+    slots = {
+        "initial": _Examples(example),
+        "update": Reweight(_row_sums, True),
+        "resampler": Systematic(),
+        slot: component,
+    }
     for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
         filter = ParticleFilter(n=n, **{"trigger": Always(), **slots})
         with reports_errors(f"a batch of {n_runs} runs of {n} particles"):
