@@ -34,9 +34,9 @@ from mstfilter.smc.population import Population, identity
 from mstfilter.smc.streams import (
     Key,
     RunGenerators,
-    SlotStreams,
     by_run,
     flat,
+    generators_of_step,
     of_runs,
     resampled_runs,
     rows_of,
@@ -133,6 +133,7 @@ class _Sweep:
         self.check, self.rounding = check, rounding
         self.given = [[split_input(y) for y in run] for run in ys]
         self.n_steps = len(ys[0])
+        self.keys = [Key(seed) for seed in seeds]
         self.runs = np.arange(len(seeds))  # the run of each row
         self.particles: Any = None
         self.log_weights = self.ess = self.log_mean = np.zeros(0)  # the last two after the last update
@@ -140,7 +141,6 @@ class _Sweep:
         self.resampled = np.zeros(len(seeds), bool)
         self.ancestors: np.ndarray | None = None  # (R, n) of the resampling of the step, if a collector sees them
         self.traced = not set(collectors.values()) <= {log_evidence, ess, resampled}
-        self.streams: dict[str, SlotStreams] = {}
         self.checked: dict[str, tuple[int, int]] = {}  # slot -> number of rows at its last check, number of checks
         self.lost: dict[int, tuple[int, str]] = {}  # run -> step, reason
         self.found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in collectors}
@@ -241,7 +241,7 @@ class _Sweep:
         runs, n = self.runs[rows], self.filter.n
         y, u = (self.by_row(rows, t, k) for k in (0, 1))
         component = getattr(self.filters.rows(runs).at_step(t, u), slot)
-        rng = RunGenerators(self.states(t, slot, runs), n) if component.draws else None
+        rng = RunGenerators(self.generators(t, slot, rows), n) if component.draws else None
         population, log_weights = None, self.log_weights
         if slot != "initial":
             everything = len(rows) == len(self.runs) and rows[0] == 0
@@ -376,7 +376,7 @@ class _Sweep:
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
         if resampler.batched:
-            streams: Any = RunGenerators(self.states(t, "resampler", self.runs[rows]))
+            streams: Any = RunGenerators(self.generators(t, "resampler", rows))
             return resampler.select(streams, self.log_weights[rows], n)
         drawn = [
             resampler.select(self.key(t, "resampler", row).generator(), self.log_weights[row], n)
@@ -385,16 +385,14 @@ class _Sweep:
         out = [log_weights for _, log_weights in drawn if log_weights is not None]
         return np.stack([index for index, _ in drawn]), np.stack(out) if out else None
 
-    # --- streams and results --------------------------------------------------------------------------------------
+    # --- results --------------------------------------------------------------------------------------
     def key(self, t: int, slot: str, row: int) -> Key:
         """The key of a component of one run."""
-        return Key(self.seeds[self.runs[row]]).child("step", t).child(slot)
+        return self.keys[self.runs[row]].child(slot, t)
 
-    def states(self, t: int, slot: str, runs: np.ndarray) -> np.ndarray:
-        """The states of the streams of some runs at a step."""
-        if slot not in self.streams:
-            self.streams[slot] = SlotStreams(self.seeds, slot, self.n_steps)
-        return self.streams[slot].states(t, runs)
+    def generators(self, t: int, slot: str, rows: np.ndarray) -> list[np.random.Generator]:
+        """The generators of a component that is called for some runs."""
+        return generators_of_step([self.keys[run] for run in self.runs[rows].tolist()], slot, t)
 
     def record(self, t: int) -> None:
         """Keep what the collectors return for each run."""
@@ -426,7 +424,7 @@ class _Sweep:
             ess=float(self.ess[row]),
             resampled=bool(self.resampled[row]),
         )
-        return State(t + 1, population, Key(self.seeds[self.runs[row]]), filter.properly_weighted), info
+        return State(t + 1, population, self.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
         """(T, R, ...) results of a collector; those of lost runs are undefined."""

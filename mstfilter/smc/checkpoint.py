@@ -82,7 +82,7 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
             raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
         particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
         population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
-        key = Key(int(head["seed"]), tuple(int(part) for part in head["path"]))
+        key = Key(int(head["seed"]), tuple(head["path"]))
         return State(int(head["t"]), population, key, bool(head["properly_weighted"])), head
 
 

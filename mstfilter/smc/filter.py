@@ -54,7 +54,7 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.streams import Key, step_generator
+from mstfilter.smc.streams import Key
 
 _SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "lookahead", "rejuvenation", "size")
 _WITHOUT_STEP = ("resampler", "trigger", "size")  # they see the population only
@@ -253,7 +253,7 @@ class _Step:
 
     def rng(self, slot: str) -> np.random.Generator:
         """The random stream of a component in this step."""
-        return step_generator(self.state.key, self.state.t, slot)
+        return self.state.key.child(slot, self.state.t).generator()
 
     def select_before(self) -> tuple[Population | None, bool]:
         """Select: the particles x_{t-1} to move, and whether they were resampled."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -49,10 +48,9 @@ from mstfilter.smc import (
     unique_ancestors,
 )
 from mstfilter.smc.population import Population
-from mstfilter.smc.streams import Key, pcg64_states, summaries
+from mstfilter.smc.streams import Key, summaries
 from tests.smc.models import AR1, ar1_observations, hmm
 from tests.smc.test_particle_filter import MODEL, observations
-from tests.smc.test_streams import words_of
 
 T = 5
 YS = [0.3, 1.1, -0.2, None, 0.4]
@@ -387,7 +385,7 @@ def test_inputs_of_each_run_are_given_by_row():
 # --- generators ---------------------------------------------------------------------------------------------------
 def test_generators_of_runs_draw_what_their_streams_draw():
     seeds = list(range(6))
-    ours = RunGenerators(pcg64_states(words_of(seeds, "a")))
+    ours = RunGenerators([Key(seed).child("a").generator() for seed in seeds])
     singles = [Key(seed).child("a").generator() for seed in seeds]
     means = np.arange(12.0).reshape(6, 2)
     for draw in (
@@ -415,20 +413,6 @@ def test_summaries_are_those_of_populations():
     for row in range(50):
         population = Population(np.zeros(37), log_weights[row])
         assert (ess[row], log_mean[row]) == (population.ess, population.log_mean_weight)
-
-
-def test_threads_do_not_mix_their_streams():
-    """Threads that draw at the same time draw what each of them draws alone."""
-
-    def drawn(first):
-        rng = RunGenerators(pcg64_states(words_of(range(first, first + 50), "a")))
-        return np.stack([rng.standard_normal((50, 40)) for _ in range(40)])
-
-    alone = [drawn(first) for first in (0, 100, 200, 300)]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(drawn, (0, 100, 200, 300)))
-    for a, b in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 # --- chains -------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Populations: validation, selection, lazy candidates, streams."""
+"""Populations: validation, selection, lazy candidates."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from mstfilter.errors import InputError
 from mstfilter.smc import (
     Always,
     Candidates,
-    Key,
     Population,
     WeightResampler,
     bootstrap,
-    child,
-    key_of,
     log_mean_exp,
 )
 from tests.smc.models import AR1
@@ -122,30 +119,14 @@ def test_candidates_are_built_once_and_only_when_looked_at():
     assert built == [7, 500]
 
 
-def test_streams_depend_on_their_name_alone():
-    key = Key(4)
-    a = key.child(3, "transition").generator().random(4)
-    np.testing.assert_array_equal(a, Key(4).child(3).child("transition").generator().random(4))
-    assert not np.array_equal(a, key.child(3, "proposal").generator().random(4))
-    rng = key.child("x").generator()
-    before = child(rng, "object", 1).random(3)
-    rng.random(100)
-    np.testing.assert_array_equal(before, child(rng, "object", 1).random(3))
-    assert key_of(rng) == key.child("x")
-
-
-def test_streams_do_not_meet_spawned_or_foreign_ones():
-    plain = np.random.default_rng(7)
-    spawned = plain.spawn(2)
-    drawn = {tuple(g.random(2)) for g in (*spawned, child(plain, 0), child(plain, 1), child(spawned[0], 0))}
-    drawn.add(tuple(Key(7).child(0).generator().random(2)))
-    assert len(drawn) == 6
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, "a", True])
-def test_bad_seeds(seed):
-    with pytest.raises(InputError, match="seed"):
-        Key(seed)
+def test_moved_particles_keep_weights_and_parents():
+    population = Population(np.zeros(3), np.log([1.0, 2.0, 3.0]), {"previous": np.arange(3)}, {"note": 1})
+    moved = population.moved(np.ones((3, 2)))
+    assert moved.ess == population.ess and moved.notes == {} and moved.parents is population.parents
+    with pytest.raises(ValueError, match="read-only"):
+        moved.particles[0] = 2
+    with pytest.raises(InputError, match="3 particles became 2"):
+        population.moved(np.zeros(2))
 
 
 @dataclass(frozen=True)

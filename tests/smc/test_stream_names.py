@@ -26,7 +26,6 @@ from mstfilter.smc import (
     Systematic,
     auxiliary,
     bootstrap,
-    filter as filter_module,
     guided,
     key_of,
     observe,
@@ -110,7 +109,6 @@ def used_twice(monkeypatch, filter, observations) -> list[Key]:
         return spy
 
     monkeypatch.setattr(Key, "generator", recorded(Key.generator))
-    monkeypatch.setattr(filter_module, "step_generator", recorded(filter_module.step_generator))
     filter.run(observations, 3)
     assert len(made) >= len(observations)
     return [key for key, times in made.items() if times > 1]
