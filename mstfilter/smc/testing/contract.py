@@ -38,10 +38,12 @@ from mstfilter.smc import (
     Population,
     Proposal,
     Reweight,
+    RunGenerators,
     State,
     Systematic,
     as_matrix,
     run_many,
+    union,
 )
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -194,8 +196,13 @@ class _Examples(Proposal):
 
     example: Callable[..., Any]
 
-    def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        return Population(self.example(rng, n)[0].particles)
+    batched: ClassVar[bool] = True
+
+    def sample(self, rng: Any, observation: Any, n: int) -> Population:
+        if not isinstance(rng, RunGenerators):
+            return Population(self.example(rng, n)[0].particles)
+        parts = [Population(self.example(g, n // len(rng))[0].particles) for g in rng.generators()]
+        return functools.reduce(union, parts)
 
 
 class BatchedContract(Contract):
@@ -210,7 +217,7 @@ class BatchedContract(Contract):
             return
         example = number_example if self.slot in ("resampler", "trigger") else self.example  # they use weights only
         y = example(seeded(), 2)[1]
-        slots = {"initial": _Examples(example), "update": Reweight(_row_sums), "resampler": Systematic()}
+        slots = {"initial": _Examples(example), "update": Reweight(_row_sums, True), "resampler": Systematic()}
         # The numbers of runs include that of the particles, since arrays of another axis fit then.
         for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
             filter = ParticleFilter(n=n, **{"trigger": Always(), **slots, self.slot: component})
