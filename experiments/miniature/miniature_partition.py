@@ -25,7 +25,7 @@ from miniature_world import Miniature, Observation
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from mstfilter.completion import Completion
+from mstfilter.completion import Completer, Completion
 from mstfilter.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
 from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
@@ -100,6 +100,7 @@ def shifted(values: np.ndarray, step: tuple[int, int], empty: float) -> np.ndarr
     return out
 
 
+@Completer.register  # it completes rows of cells, not boxes of voxels
 @dataclass(eq=False)
 class TableCompleter:
     """The share of cases in which a cell belonged to the object, by what was seen of it.

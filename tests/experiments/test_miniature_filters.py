@@ -65,7 +65,7 @@ def test_the_evidence_is_unbiased(name, world):
     """On data whose estimates are not skewed (spread below a half), so that few runs show their mean."""
     _, observations = world.simulate(np.random.default_rng(4), 4)
     exact = exact_filter(world, observations).log_evidence[-1]
-    n = {"bootstrap": 2000, "guided": 60, "balanced": 300}[name]
+    n = {"bootstrap": 4000, "guided": 60, "balanced": 300}[name]
     for extra in ({}, {"resampler": FearnheadClifford(), "trigger": Always()}):
         filter = PROPER[name](world, n, **extra)
         ratio = np.exp([filter.run(observations, seed)[0].log_evidence - exact for seed in range(80)])
@@ -76,16 +76,19 @@ def test_the_evidence_is_unbiased(name, world):
 @pytest.mark.parametrize("name", PROPER)
 @ids
 def test_proper_filters_converge(name, world):
-    """The distance falls like 1 / sqrt(n) once n is large: 16 times the particles, a quarter of it (0.4 allowed)."""
+    """The distance falls like 1 / sqrt(n) once n is large: 16 times the particles, a quarter of it (0.4 allowed).
+
+    The median over twelve data sets is compared: the mean depends on a few with weights that vary much.
+    """
     sizes, distances = (1000, 16_000), []
     for n in sizes:
         tv = []
-        for seed in range(8):
+        for seed in range(12):
             _, observations = world.simulate(np.random.default_rng(seed), 3)
             state, _ = PROPER[name](world, n).run(observations, seed)
             exact = exact_filter(world, observations).posterior[-1]
             tv.append(total_variation(state_weights(world, state.population), exact))
-        distances.append(np.mean(tv))
+        distances.append(np.median(tv))
     assert distances[1] < 0.4 * distances[0]
     assert distances[1] < 0.15
 
