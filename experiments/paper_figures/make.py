@@ -22,7 +22,6 @@ from mstfilter.errors import InputError
 FIGURES = (
     "merging",
     "teaser",
-    "initial",
     "sampled_cuts",
     "quality_over_time",
 )

@@ -25,7 +25,7 @@ from mstfilter.scene import Camera, Recording
 from mstfilter.scoring import object_status, overlap
 from mstfilter.simulation import cached_recording
 
-#: The scene of the figures `initial` and `sampled_cuts`.
+#: The scene of the figure `sampled_cuts`.
 FAMILY, SEED = "s2", 0
 FEW = {"n_objects_min": 5, "n_objects_max": 5, "n_twins": 1, "n_stacked": 1, "n_hidden": 1}
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02, **FEW}

@@ -14,7 +14,7 @@ from tests.report.test_study_report import make_study
 from tests.segmentation.trees import all_cuts, random_tree
 
 FOLDER = EXPERIMENTS / "paper_figures"
-SIMULATED = ("teaser.png", "initial.png", "sampled_cuts.png")
+SIMULATED = ("teaser.png", "sampled_cuts.png")
 REAL = ("merging.png", "merge_forms.csv")
 
 
@@ -30,7 +30,7 @@ def script(name):
 
 
 def test_simulated_figures(tmp_path):
-    make(tmp_path, "teaser", "initial", "sampled_cuts")
+    make(tmp_path, "teaser", "sampled_cuts")
     assert all((tmp_path / "out" / name).stat().st_size > 2000 for name in SIMULATED)
     assert all(0 <= float(row["IoU"]) <= 1 for row in read_csv(tmp_path / "out/teaser.csv"))
 
@@ -69,7 +69,7 @@ def test_the_licence_of_the_r1_data_names_its_owner():
 
 
 def test_figures_use_tuning_seeds():
-    assert all(script(name).SEED < 100 for name in ("teaser", "initial", "sampled_cuts"))
+    assert all(script(name).SEED < 100 for name in ("teaser", "sampled_cuts"))
 
 
 def test_drawn_tree_holds_every_node_of_the_cuts():

@@ -38,12 +38,6 @@ def test_smoothing(tmp_path):
     assert all(0 < error < 0.5 for error in rows.values())
 
 
-def test_waste_free(tmp_path):
-    run_script("benchmarks/waste_free.py", "--smoke", "--out", tmp_path / "waste_free.csv")
-    without, waste_free = read_csv(tmp_path / "waste_free.csv")
-    assert float(waste_free["evaluations"]) > 20 and without["waste_free"] == "False"
-
-
 def test_partition_fit(tmp_path):
     """What is known of a pair beats knowing nothing (log 2), and weighing the past limits what a wrong one costs."""
     run_script("partition_fit/run.py", "--smoke", "--out", tmp_path)
@@ -64,13 +58,6 @@ def test_calibration_of_the_partition_update(tmp_path):
     assert float(rows["occupied_log_odds", "0.0"]["loss"]) < math.log(2)
     losses = [float(row["loss"]) for (_, value), row in rows.items() if value != "held out"]
     assert float(rows["occupied_log_odds", "held out"]["loss"]) >= min(losses) - 1e-4
-
-
-def test_front_ends(tmp_path):
-    assert "demo-1" in run_script("front_ends/run.py", "--smoke", "--out", tmp_path)
-    rows = read_csv(tmp_path / "summary.csv")
-    assert {row["score"] for row in rows} == {"quality", "mean_quality", "recalibrated_log_loss"}
-    assert {row["n"] for row in rows} == {"2"}
 
 
 def test_controls(tmp_path):
