@@ -199,6 +199,6 @@ def test_images_are_paired_by_the_stamps_of_their_headers(tmp_path):
 def test_without_rosbags(tmp_path, monkeypatch):
     path = with_messages()(tmp_path / "session")
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(InputError, match="need rosbags") as caught:
+    with pytest.raises(InputError, match="needs rosbags") as caught:
         Bag().open(path)
     assert "mstfilter[bags]" in caught.value.hints[0]
