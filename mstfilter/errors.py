@@ -76,7 +76,7 @@ def reason(error: BaseException) -> str:
 def printable(text: str) -> str:
     """One line of at most 1500 characters; the control characters of a terminal become escape sequences.
 
-    Names and values in files of strangers may contain them.
+    Names and values in files of unknown origin may contain them.
     """
     line = " ".join(part.strip() for part in text.split("\n"))
     line = line if len(line) <= 1500 else f"{line[:1400]} ... {line[-80:]}"

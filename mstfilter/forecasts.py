@@ -220,8 +220,8 @@ def is_negative_type(distances: ArrayLike) -> bool:
     """Whether a distance is of negative type on n points.
 
     ``sum_ij c_i c_j d_ij <= 0`` for all c with ``sum_i c_i = 0`` (Schoenberg 1938). If this holds for all points, the
-    energy score with d is proper; if it fails, two distributions on these points exist for which the wrong
-    forecast has the lower expected score (Sejdinovic et al. 2013).
+    energy score with d is proper. If it fails, two distributions on these points exist for which the wrong forecast
+    has the lower expected score (Sejdinovic et al. 2013).
 
     Parameters
     ----------

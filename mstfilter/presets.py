@@ -9,8 +9,10 @@ file with the fields of `ParticleFilter`, one table for each component. It may e
 ``models/base.toml``, which holds what `mst` and its baselines share:
 
     base = "base"                           # fields that are not named here are those of the base
+
     transition = "identity"                 # naming a component resets its fields
     proposal.completer = "extrude"          # naming a field keeps the others
+
     wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
 
 ``base`` itself has no update: it can be extended but is no preset.

@@ -3,9 +3,9 @@
 >>> with environment(OMP_NUM_THREADS="1"):
 ...     pool = ProcessPoolExecutor(2)
 
-New interpreters put the working folder in front of the path of modules. In a folder that a stranger has filled, a
-file ``multiprocessing.py`` would run there. Processes that are started in the block do not search the working folder
-first; the modules of the caller are found, because `multiprocessing` and joblib pass the path of modules on.
+New interpreters put the working folder in front of the path of modules. In a folder with unknown files, a file
+``multiprocessing.py`` would run there. Processes that are started in the block do not search the working folder
+first. The modules of the caller are found, because `multiprocessing` and joblib pass the path of modules on.
 """
 
 from __future__ import annotations

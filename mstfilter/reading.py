@@ -1,4 +1,4 @@
-"""Reading files that a stranger may have made.
+"""Reading files of unknown origin.
 
 >>> info = read_json(folder / "info.json", "a run folder")
 >>> arrays = read_arrays(folder / "truth.npz", "true volumes")

@@ -12,8 +12,8 @@ several filter seeds on one scene are averaged first. A difference has a t inter
 and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume
 that the differences are symmetric about zero under the null hypothesis; squared errors are skewed, and their
 differences often are. A claim therefore needs both intervals to exclude 0 and a small `Difference.p_claim`, which
-takes the larger p value and multiplies it by 1 + abs(skewness). p values of one table are adjusted by Holm's method.
-`experiments/comparison` has the error rates and the power of this rule.
+takes the larger p value and multiplies it by 1 + abs(skewness). The p values of one table are adjusted by Holm's
+method. `experiments/comparison` has the error rates and the power of this rule.
 """
 
 from __future__ import annotations
@@ -139,9 +139,9 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
     NaN for fewer than five values. The random generator is fixed, so the same values give the same result. A resample
     of equal values has an infinite t ratio, so a limit is infinite if most values are equal.
 
-    The p value is the larger of two: the equal-tailed one, which follows the skew like the interval (Efron,
-    Tibshirani 1993, section 12.5), and that of the absolute t ratio, which is larger for symmetric values with heavy
-    tails (Hall 1992, section 3.6).
+    The p value is the larger of two. The equal-tailed one follows the skew like the interval (Efron, Tibshirani 1993,
+    section 12.5). That of the absolute t ratio is larger for symmetric values with heavy tails (Hall 1992, section
+    3.6).
     """
     n, mean = len(values), float(values.mean())
     if n < 5:

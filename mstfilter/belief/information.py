@@ -18,8 +18,8 @@ True
 Outcomes that differ in far fewer than tau cells count as one, and those that differ in far more count as two. I_0 is
 the information without noise; I_tau decreases to 0 as tau grows. Suppose that every cell is read with an independent
 error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual information
-with the reading (Kolchinsky, Tracey 2017, *Estimating mixture entropy with pairwise distances*, with the
-Bhattacharyya distance).
+with the reading. The bound is that of Kolchinsky, Tracey (2017), *Estimating mixture entropy with pairwise
+distances*, with the Bhattacharyya distance.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def demo(
     ] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
-    """Simulate a robot at a cluttered table, filter the recording with and without its past, write a report."""
+    """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
     from mstfilter.report import read_numbers, write_report

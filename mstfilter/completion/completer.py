@@ -12,7 +12,7 @@ and the result is the probability of each voxel. `complete` clears voxels that a
 visible surface. A method that is faster for many boxes together overrides `fill_many`. Results are checked
 (`mstfilter.results`): an array of another shape, or of numbers that are no probabilities, is an error.
 
-`arbitrate` makes the label grid. If several completions claim a voxel:
+`arbitrate` makes the label grid. If several completions contain a voxel:
 
 1. A voxel with readings belongs to the object with most readings in it.
 2. Otherwise it belongs to the object with the largest probability, if that reaches the threshold.
@@ -102,9 +102,9 @@ class Completer(Checked, ABC):
     ----------
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface and
-        less than `depth` voxels behind it, along the optical axis. A test of the centre, and not of any reading in
-        the voxel, keeps objects from growing by half a voxel on all sides (rendered boxes: volume 1.13 of the truth
-        instead of 1.41, quality .82 instead of .71; the two values were chosen on these).
+        less than `depth` behind it, along the optical axis. The test of the centre, and not of any reading in the
+        voxel, keeps objects from growing by half a voxel on all sides. On rendered boxes the volume is 1.13 of the
+        truth instead of 1.41, the quality .82 instead of .71. The two values were chosen on these boxes.
     free_margin : float
         A voxel is free if its centre is this far in front of the measured surface, in voxels ...
     free_sigmas : float
@@ -304,9 +304,9 @@ def occupancy_of(
 ) -> Occupancy | None:
     """The probabilities of the completions of one hypothesis; None if all are 0 or 1.
 
-    A voxel is free or belongs to one of the objects that claim it. The odds of an object against free space are those
-    of its completion. `labels` (X, Y, Z) are those of `arbitrate`. Objects with fewer readings in a voxel than the
-    labelled one do not claim it, nor do objects without a label, and probabilities below `least` count as 0.
+    A voxel is free or belongs to one of its candidate objects. The odds of an object against free space are those of
+    its completion. `labels` (X, Y, Z) are those of `arbitrate`. Objects with fewer readings in a voxel than the
+    labelled one are no candidates, nor are objects without a label. Probabilities below `least` count as 0.
     """
     if all(((one.probability == 0) | (one.probability == 1)).all() for one in completions):
         return None

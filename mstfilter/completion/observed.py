@@ -5,8 +5,8 @@
 >>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
 
 **Earlier frames.** The views of an object are moved with it, and read at the nearest voxel. Its surface, the space
-behind it and the space that was free around it are evidence about its shape for ever; other objects and the space
-that they hid are not, since they may have moved. The latest frame decides where it measures the object's surface.
+behind it and the space that was free around it remain evidence about its shape. Other objects and the space that they
+hid do not, since they may have moved. The latest frame decides where it measures the object's surface.
 """
 
 from __future__ import annotations
@@ -150,9 +150,9 @@ def observed_again(
 ) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:
     """The box of a mask, which may be empty, and of earlier views of the object.
 
-    Returns its offset (3,), what the frame shows of it, that together with the views (`recall`), and these views:
-    those that the frame contradicts are left out, unless `refute` is false. The box is empty if nothing of the object
-    lies inside the grid.
+    Returns the offset (3,) of the box, what the frame shows of the object, what the frame and the views show together
+    (`recall`), and the views. Views that the frame contradicts are left out, unless `refute` is false. The box is
+    empty if nothing of the object lies inside the grid.
     """
     if views and refute:
         voxels = _surface_voxels(frame, mask, views, grid)

@@ -21,11 +21,11 @@ from mstfilter.scene import as_labels, occupied_box
 class ModeFilter(Bounded):
     """Majority filter over label grids.
 
-    The label of an occupied voxel is replaced by the most frequent other label in its window, if the count of this
-    label exceeds that of its own by at least `margin`. Of equally frequent labels the larger one is used. Free cells
-    are not counted as a label, but an occupied voxel with more than `isolation` free cells in its window becomes
-    free. All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects that are
-    thinner than half a window, for example a 2 cm book or a rod, are removed.
+    An occupied voxel takes the most frequent other label in its window, if the count of this label exceeds that of
+    its own label by at least `margin`. Of equally frequent labels the larger one is used. Free cells are not counted
+    as a label, but an occupied voxel with more than `isolation` free cells in its window becomes free. All voxels of
+    a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects that are thinner than half a
+    window, for example a 2 cm book or a rod, are removed.
 
     Parameters
     ----------

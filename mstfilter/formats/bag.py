@@ -3,8 +3,8 @@
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
 A topic must be named only if several topics fit. The camera matrix is read from the ``camera_info`` topic beside the
-colour topic (for rectified images, its P). A colour and a depth image form a frame if each is the nearest of the
-other by the time stamp of the header and they are at most `tolerance_s` apart. Depth must be registered to colour:
+colour topic (for rectified images, its P). A frame is a colour and a depth image of which each is nearest to the
+other by the time stamp of the header. The stamps differ by at most `tolerance_s`. Depth must be registered to colour:
 same size and same ``frame_id``. Transforms (tf) are not read: the camera is assumed to stand still, and its pose is
 found from the table.
 

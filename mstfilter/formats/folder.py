@@ -9,8 +9,10 @@ The layout::
 
     manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
     camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
+
     rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
     instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
+
     voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
     poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
     SHA256SUMS           hashes of these files

@@ -120,8 +120,8 @@ class Still(PauseRule):
     Changes that all blocks share (exposure, flicker) do not count. The noise of each block is measured in the video,
     which must be at rest for a quarter of its time.
 
-    A robot that holds still in the image, or that moves by less than a grey level in a whole interval, is also taken
-    for a pause: check the pauses, and give them explicitly if they are wrong.
+    An interval in which a robot holds still in the image, or moves by less than a grey level, also gives a pause.
+    Check the pauses, and give them explicitly if they are wrong.
 
     Parameters
     ----------

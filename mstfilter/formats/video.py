@@ -13,9 +13,9 @@ in memory use `Recording.from_arrays`.
 >>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
-The camera pose is found from the support plane of the first pause unless it is given. If the layout stores the motion
-of the camera, only the motion relative to the first pause is used, because the world of a trajectory seldom has its
-table at z = 0. Cameras have no distortion: distorted images are undistorted when they are read.
+The camera pose is found from the support plane of the first pause unless it is given. A stored motion of the camera
+is used relative to the first pause only, because the world of a trajectory seldom has its table at z = 0. Cameras
+have no distortion: distorted images are undistorted when they are read.
 """
 
 from __future__ import annotations

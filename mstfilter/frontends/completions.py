@@ -5,6 +5,7 @@
 The layout; numbers are those of the pauses (`Clip.index`), from 0::
 
     shapes/000001/cup/mask.png         the mask of the object in the image of the pause, not 0
+
     shapes/000001/cup/a.ply  b.npz     its shape; several files are draws
     shapes/000001/cup/weights.json     optional, beside the draws: {"a.ply": 2, "b.npz": 1}
 

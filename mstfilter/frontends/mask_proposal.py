@@ -128,7 +128,7 @@ class MaskBoundary(ClipBoundary, UsesFiles):
     """The probability that a segmentation drawn from a folder of masks has a border at a pixel.
 
     The law is that of `MaskProposal` with `ExactCuts` at temperature 1. Borders are borders of masks, so they do not
-    have the statistics of image gradients: combine the model with the tree ``ucm``, not with ``learned``, whose
+    have the statistics of image gradients. Combine the model with the tree ``ucm``, not with ``learned``, whose
     weights were fitted to `ColourDepthBoundary`.
 
     Parameters

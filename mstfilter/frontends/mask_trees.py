@@ -80,8 +80,8 @@ def _tree_of(
 ) -> tuple[Tree, np.ndarray]:
     """The tree of nested masks, and the probabilities (N,) to stop at its nodes.
 
-    `innermost` (H, W) is the smallest mask of each pixel, -1 without mask; `container` (n,) the smallest mask that
-    contains a mask, -1 for none; `ascending` lists the masks in order of their area.
+    `innermost` (H, W) is the smallest mask of each pixel, -1 without mask. `container` (n,) is the smallest mask that
+    contains a mask, -1 for none. `ascending` lists the masks in order of their area.
     """
     n = len(scores)
     inner = np.zeros(n, dtype=bool)
@@ -130,10 +130,10 @@ def nested_masks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The masks of a set that overlaps arbitrarily, made disjoint or nested; returns masks and scores.
 
-    For the output of automatic mask generators. Masks are considered in order of falling score. A mask is kept if it
-    and every mask kept before fulfil one of these conditions: they share at most ``1 - share`` of the smaller one, or
-    at least `share` of it, and their areas differ by more than this factor. Otherwise it is dropped. The smaller mask
-    then loses the pixels outside the mask that contains it; pixels of two neighbours go to the higher score.
+    For the output of automatic mask generators. Masks are considered in order of falling score. A mask is compared
+    with every mask kept before. Each pair must share at most ``1 - share`` of the smaller mask, or at least `share`
+    of it if its area is less than `share` of the larger one. Otherwise the mask is dropped. The smaller mask then
+    loses the pixels outside the mask that contains it; pixels of two neighbours go to the higher score.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

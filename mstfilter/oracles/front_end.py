@@ -5,8 +5,9 @@
 >>> completer = TrueCompletion()                 # the true voxels of what a mask shows
 
 A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general a
-true voxel belongs to the mask that holds its pixel: of all pixels that show its object, the one nearest in the image
-to the projection of the voxel. So parts of an object get their part of it, and a mask over two objects gets both.
+true voxel belongs to the mask that holds its pixel. Of all pixels that show its object, this is the one nearest in
+the image to the projection of the voxel. So parts of an object get their part of it, and a mask over two objects gets
+both.
 """
 
 from __future__ import annotations
@@ -77,10 +78,10 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     Parameters
     ----------
     form : {"crisp", "cleaned"}
-        *crisp*: 1 on both sides of every true border, 0 elsewhere, for `UcmTree`. *cleaned*: the measured strength
-        near true borders, 0 elsewhere, for the learned tree, which is fitted to measured strengths. Quality of the
-        best cut on 16 simulated images with measured, crisp and cleaned boundaries: .914, .485, .952 for the learned
-        tree; .868, .998, .901 for `UcmTree`.
+        *crisp* has 1 on both sides of every true border, 0 elsewhere, for `UcmTree`. The form *cleaned* has the
+        measured strength near true borders, 0 elsewhere, for the learned tree, which is fitted to measured strengths.
+        Quality of the best cut on 16 simulated images with measured, crisp and cleaned boundaries: .914, .485, .952
+        for the learned tree; .868, .998, .901 for `UcmTree`.
     measured : BoundaryModel
         Model of the measured strength.
     """

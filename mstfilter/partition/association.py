@@ -4,14 +4,14 @@
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
-A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one:
-an edge of the conflict graph (paper, section IV-D, where edges join objects that share voxels). The *main object* of
-a segment is the one with which it shares most readings. An object that is the main object of no segment and has very
-few readings is in no conflict: these are readings of other objects that lie near it. In each connected component, a
-predicted object is continued by at most one segment:
+A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one.
+Conflicts are the edges of the conflict graph (in the paper, section IV-D, edges join objects that share voxels). The
+*main object* of a segment is the one with which it shares most readings. An object that is the main object of no
+segment and has very few readings is in no conflict: these are readings of other objects that lie near it. In each
+connected component, a predicted object is continued by at most one segment:
 
-- by the segment that has more than 80 % of those of its readings that lie in segments with this main object (readings
-  at which another object now occludes it do not count);
+- by the segment that has more than 80 % of its readings in segments with this main object; readings at which another
+  object now occludes it do not count;
 - without such a segment, by the one that has more than 80 % of all its readings.
 
 If a segment and an object are in conflict with each other only, more than 50 % is enough. It follows:

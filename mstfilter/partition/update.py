@@ -19,7 +19,7 @@ estimated anew from all that was seen of it.
    more than 80 % of its readings, or by none; the other segments are new objects. The paper draws which conflicts end
    in a merge; here the partition decides.
 4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
-   probability (Q_j q)^lambda; q is the share of its own voxels that the frame does not observe as free. It is
+   probability (Q_j q)^lambda. Here q is the share of its own voxels that the frame does not observe as free. It is
    completed from its views alone, and removed if the frame refutes all of them.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
    completed from its readings in this frame and from the views of the objects that it continues. Evidence is

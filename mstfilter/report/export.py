@@ -70,9 +70,10 @@ def hypothesis_mesh(
     """Meshes of all objects of a hypothesis as one ``open3d.geometry.TriangleMesh``, in world metres.
 
     `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. The style "blocky" has the faces
-    of the voxels, which enclose exactly the volume of the voxels. "smooth" is the isosurface of the occupancy at 0.5
-    (open3d's dual contouring), smoothed by Taubin's filter, which shrinks it little (G. Taubin, "Curve and surface
-    smoothing without shrinkage", ICCV 1995). Raises MissingLibraryError if open3d cannot be imported.
+    of the voxels, which enclose exactly the volume of the voxels. The style "smooth" is the isosurface of the
+    occupancy at 0.5 (open3d's dual contouring), smoothed by Taubin's filter, which shrinks it little (G. Taubin,
+    "Curve and surface smoothing without shrinkage", ICCV 1995). Raises MissingLibraryError if open3d cannot be
+    imported.
     """
     o3d = import_open3d()
     if colours is None:

@@ -7,11 +7,11 @@
 ((51, 111, 185), (238, 145, 56))
 
 The first six colours of the palette were chosen by hand. Each further one is the colour that is farthest from all
-earlier ones; the distance is the smallest Oklab distance in three views: normal vision, protanopia and deuteranopia
+earlier ones. The distance is the smallest Oklab distance in three views: normal vision, protanopia and deuteranopia
 (Machado, Oliveira, Fernandes 2009, severity 1).
 
-Voxels are rendered by ray casting: the first face that a ray meets gives the normal, blurred occupancy gives soft
-shadows in corners and on the table, and lines are drawn where objects or faces meet.
+Voxels are rendered by ray casting. The first face that a ray meets gives the normal. Blurred occupancy gives soft
+shadows in corners and on the table. Lines are drawn where objects or faces meet.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 >>> write_study_report("studies/first")                     # studies/first/report.html
 
 The report is made from the study folder alone, of a finished or an unfinished study, and runs no code of the user.
-Conclusions are sentences that claim no more than the intervals show.
+Conclusions are sentences that state no more than the intervals show.
 """
 
 from __future__ import annotations

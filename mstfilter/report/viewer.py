@@ -182,7 +182,7 @@ def show_rerun(path: str | Path) -> None:
     """
     import_rerun()
     environment = {k: v for k, v in os.environ.items() if k != "FORCE_RERUN_ANALYTICS"} | {"CI": "1"}
-    # -P: the module is not searched in the working folder, which may be that of a stranger.
+    # -P: the module is not searched in the working folder, which may hold unknown files.
     command = [sys.executable, "-P", "-m", "rerun_cli", str(path), "--bind", "127.0.0.1", "--port", "auto"]
     done = subprocess.run(command, env=environment)
     if done.returncode:

@@ -6,10 +6,13 @@
 Layout::
 
     run.json                 configuration, seed, versions, recording, status
+
     pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
     pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
+
     pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
     pauses/000/instance.png  true label image, if known      pauses/000/SHA256SUMS       hashes, not of seconds.json
+
     metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
     compare/without-past     run folders of other filters on the same recording, if asked for
 

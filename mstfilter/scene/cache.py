@@ -54,9 +54,9 @@ class Cache:
         parameter that matters. Together they determine the value completely, so `compute` draws no random numbers.
         The value must not be changed afterwards.
 
-        `stored_as` is the type of a value that is also stored on disk (see `on_disk`): an array, a dataclass whose
-        fields are arrays, strings or None, or a tuple of these. Only for values that take much longer to compute than
-        to read.
+        `stored_as` is the type of a value that is also stored on disk (see `on_disk`). It is an array, a dataclass
+        whose fields are arrays, strings or None, or a tuple of these. Only for values that take much longer to
+        compute than to read.
         """
         return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
 

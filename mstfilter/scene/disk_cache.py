@@ -71,7 +71,7 @@ class DiskCache:
 
     Several processes may use the folder at the same time. An entry that cannot be read counts as missing. If the
     folder cannot be written, the disk is full or another process keeps the folder locked, nothing is stored and no
-    error is raised; a locked folder is reported by an InputWarning.
+    error is raised. A locked folder is reported by an InputWarning.
 
     A new folder is for this user only. Raises InputError if the folder belongs to somebody else or others may write
     into it: its entries become results.

@@ -75,10 +75,10 @@ class NoFreeSpace(Projection):
 class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
-    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins: for the
-    extent of the voxel, and for the noise of the sensor at that range (`mstfilter.scene.depth_sigma`). Voxels without
-    a measurement (no reading, the robot, outside the image, behind a surface) are unknown and stay. A voxel with a
-    measured point inside stays.
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. One is
+    for the extent of the voxel, the other for the noise of the sensor at that range (`mstfilter.scene.depth_sigma`).
+    Voxels without a measurement (no reading, the robot, outside the image, behind a surface) are unknown and stay. A
+    voxel with a measured point inside stays.
 
     With several cameras (`Frame.views`) a voxel is free if one of them observes it as free and none has a measured
     point in it.

@@ -5,8 +5,8 @@
 
 Wrong units, a camera matrix of another image size, a moved camera, or depth that is not registered to colour give
 confident hypotheses of the wrong objects, and no error. `examine` compares the frames at the pauses with what a
-camera over a table gives. Where the result cannot be right, the finding stops the run; the others are warnings. The
-limits are chosen from the right and wrong recordings of ``experiments/plausibility``.
+camera over a table gives. Where the result cannot be correct, the finding stops the run; the others are warnings. The
+limits are chosen from the correct and wrong recordings of ``experiments/plausibility``.
 """
 
 from __future__ import annotations
@@ -254,7 +254,8 @@ def _other_support(first: Look) -> Iterator[Finding]:
     """A wall or the floor at z = 0: a large plane in front of it is the table.
 
     A table is parallel to the floor and higher above it than objects above a table. A table in front of a wall meets
-    it at a right angle and reaches far from it; its normal points to the top of the image, that of a wall does not.
+    it at a right angle and reaches far from it. The normal of a table points to the top of the image, that of a wall
+    does not.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
@@ -347,7 +348,7 @@ class _Corners:
 def drift(first: Look, look: Look) -> tuple[float, float, float]:
     """Tilt (degrees), height (m) and shift (m) of the camera against its pose, from the first pause to another.
 
-    Tilt and height are those of the table, where few readings are left at z = 0; the shift is that of corners of the
+    Tilt and height are those of the table, where few readings are left at z = 0. The shift is that of corners of the
     image on the table and outside the workspace.
     """
     tilt = height = shift = 0.0
@@ -412,9 +413,9 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """How well edges of depth and colour agree at all pauses.
 
-    Returns the best agreement minus the median over shifts; the share of it that is lost without a shift; the best
-    shift (rows, columns) of colour in pixels of an image of 320 columns; and by how much the agreement rises if depth
-    belongs to other pauses (in reverse, or one earlier or later).
+    Returns the best agreement minus the median over shifts, and the share of it that is lost without a shift. The
+    third value is the best shift (rows, columns) of colour in pixels of an image of 320 columns. The fourth is by how
+    much the agreement rises if depth belongs to other pauses (in reverse, or one earlier or later).
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -462,7 +463,7 @@ def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
-    """A video of a change with one pause: the past is not used."""
+    """A video of a change with one pause: earlier images are not used."""
     if len(pauses) > 1 or len(frames) == 1:
         return
     change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))

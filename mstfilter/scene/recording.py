@@ -167,7 +167,7 @@ class Recording:
             Frames at which nothing moves; a hypothesis is estimated at each. A rule or its text finds them: "still",
             "ends", "every", or "0s,4.2s". Default: "still" if `times` are given, as on the command line; else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
-            Pose of the camera, or its pose in every frame if it moves; the table must be at z = 0. Default: from the
+            Pose of the camera, or its pose in every frame if it moves. The table must be at z = 0. Default: from the
             support plane of the first pause.
         grid : VoxelGrid, optional
             Workspace. Default: 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
@@ -181,7 +181,7 @@ class Recording:
         Raises
         ------
         InputError
-            If the arrays cannot be used, or `examine` finds that hypotheses cannot be right.
+            If the arrays cannot be used, or `examine` finds that hypotheses cannot be correct.
         """
         if depth is None:
             raise InputError(
@@ -261,7 +261,7 @@ class Recording:
     def clips(self) -> tuple[Clip, ...]:
         """One clip per pause: the first pause alone, then from each pause to the next.
 
-        Warns if the input is not plausible, and raises InputError if no hypothesis can be right
+        Warns if the input is not plausible, and raises InputError if no hypothesis can be correct
         (`mstfilter.scene.examine`), unless it was done before.
         """
         self._examined  # noqa: B018

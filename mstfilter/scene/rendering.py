@@ -5,7 +5,7 @@
 >>> labels, depth = render(label_grid, grid, camera)
 
 The ray of each pixel is followed from voxel to voxel. In free space it jumps. If the nearest occupied voxel is at
-chessboard distance D, the cube of half-width D - 1 around the current voxel is empty, and the ray continues where it
+chessboard distance D, the cube of half-width D - 1 around the current voxel is empty. The ray continues where it
 leaves that cube. With D = 1 this is the voxel traversal of Amanatides and Woo (1987). The jumps save steps and do not
 change the result.
 """

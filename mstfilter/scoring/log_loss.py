@@ -5,19 +5,20 @@
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise: hypotheses of labels alone have no
+**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses of labels alone have no
 uncertainty of shape, so noise at their borders makes forecasts less sure where they are often wrong. Recalibration
 removes this. Forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log
 loss in nats; lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster
 that adds such noise itself gains nothing (`experiments/information` shows it for all methods), and forecasters are
-compared by what they tell apart. Noise of another kind, or more of it than the largest rate, can still help a little.
+compared by what they distinguish. Noise of another kind, or more of it than the largest rate, can still help a
+little.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 
     ES = sum_i w_i d(h_i, y) - 1/2 sum_ij w_i w_j d(h_i, h_j)
 
-It is proper, and it is never shown without its floor: the same hypotheses, with one draw of noise at the border of
-each, at the rate that is best on other scenes.
+It is proper, and it is never shown without its floor. The floor is the score of the same hypotheses with one draw of
+noise at the border of each, at the rate that is best on other scenes.
 
 Counts of forecasts and outcomes are kept by category of the question, so that losses can be split. A split is a
 description: taken alone it is no proper score, because the truth decides which questions belong to it.

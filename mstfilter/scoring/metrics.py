@@ -135,10 +135,12 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
 def object_metrics(table: Overlap) -> dict[str, float]:
     """Metrics of the objects of one hypothesis: columns of the table against the truth, see the module.
 
-    *split*: true objects that contain more than half of each of two or more objects of the hypothesis, which have at
-    least a tenth of its size. *merged*: objects of the hypothesis that contain more than half of each of two or more
-    true objects. *missed*: true objects of which no object of the hypothesis contains more than half, and that
-    contain more than half of none. *invented*: the same with the roles exchanged (as in Hoover et al. 1996).
+    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis, which have
+      at least a tenth of its size.
+    - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
+    - *missed*: true objects of which no object of the hypothesis contains more than half, and that contain more than
+      half of none.
+    - *invented*: the same with the roles exchanged (as in Hoover et al. 1996).
 
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
     (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if both are empty.

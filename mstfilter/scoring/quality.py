@@ -11,8 +11,8 @@ Three forms, by name:
     Objects only (label 0 is no region); ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2`` with V the volume of
     all objects of that segmentation. Symmetric; missing, invented, split and merged objects all reduce it.
 ``paper``
-    The published text taken literally (Price et al. 2021, section V): every label is a region, free space
-    too, and both sides are divided by the size of the grid. Nearly 1 for any input, because free space dominates.
+    The published text taken literally (Price et al. 2021, section V). Every label is a region, free space too, and
+    both sides are divided by the size of the grid. Nearly 1 for any input, because free space dominates.
 ``authors``
     The authors' program: objects only, but both sides are divided by the volume of the FIRST argument. Not
     symmetric; it is too high if the first argument is too small.

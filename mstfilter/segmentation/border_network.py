@@ -6,9 +6,9 @@
 
 The network works on images of 320 pixels per row (`encode_image`); a frame is reduced to that size, and the maps are
 interpolated. Its blocks work at a half, a quarter and an eighth of this resolution; 2 x 2 pixels enter and leave as
-channels. The outputs are the log odds that a pixel is at the border of an object and that it belongs to an object,
-and the offset to the object's centre in the image (after D. Neven, B. De Brabandere, M. Proesmans, L. Van Gool,
-"Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+channels. The outputs are the log odds that a pixel is at the border of an object and that it belongs to an object. A
+further output is the offset to the object's centre in the image (after D. Neven, B. De Brabandere, M. Proesmans, L.
+Van Gool, "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ grows. A file of the model names the features and their weights, which were fitt
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
 >>> w = MergeLogOdds().values(tree, frame)
 
-Features of the size of a region are in pixels of a 640 px wide image, disparity is in sensor units (1/8 px at f = 525
+Features of the size of a region are in pixels of a 640 px wide image. Disparity is in sensor units (1/8 px at f = 525
 px), lengths are in metres. "Front" is the region that is nearer to the camera at the border.
 """
 

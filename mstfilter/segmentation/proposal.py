@@ -5,7 +5,7 @@
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
 
 There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. If
-several objects of a hypothesis claim a voxel, one of them gets it, in every hypothesis separately.
+several objects of a hypothesis contain a voxel, one of them gets it, in every hypothesis separately.
 
 `ObjectRule` decides which regions of a cut are objects:
 
@@ -130,8 +130,9 @@ class TreeCutProposal(Proposal):
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
-        "equal": equal weights, which is correct for cuts drawn from p. "p": log weight ``log p(c) - log p(c*)`` as in
-        the paper and the authors' program; p then counts twice, in the draw and in the weight.
+        With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is
+        ``log p(c) - log p(c*)`` as in the paper and the authors' program; p then counts twice, in the draw and in the
+        weight.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -237,7 +238,7 @@ def hypothesis_of(
     """One hypothesis from completed segments of a frame, at the pause `birth`.
 
     Labels are 1, 2, ... in order; segments without voxels get no record. `threshold` is the smallest probability of
-    an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments claim.
+    an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

@@ -262,8 +262,8 @@ def linkage_tree(
     """Watershed and average linkage of a pixel graph: higra's tree, merge heights (N,), leaf image (H, W).
 
     `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` gives the strength of the borders between the
-    watershed regions, with `arcs` (E,) the border of each edge, -1 within a region; by default the mean weight of its
-    edges. None if there is only one region.
+    watershed regions; the default is the mean weight of the edges of a border. `arcs` (E,) is the border of each
+    edge, -1 within a region. None if there is only one region.
     """
     import higra as hg
 

@@ -1,7 +1,7 @@
 """Rays of the renderer and the light that they meet, updated only where something moved.
 
 `Stage` holds the poses that are rendered. `PixelRays` casts one ray through each pixel and keeps what it meets.
-`LightMap` holds light on the table. A ray's result holds until a body moves that the ray meets before or after; the
+`LightMap` holds light on the table. A ray's result holds until a body moves that the ray meets before or after. The
 light at a point holds, for each light source, until a body moves between them. Both are decided by conservative
 bounds (`solids.may_meet`), so the images equal those of casting every ray in every frame.
 """

@@ -1,6 +1,6 @@
 """Drawing of flat charts: printed cartons and labels, wood, cloth, speckle, glaze, peel.
 
-Each function takes a generator and the size of the chart in metres and returns an RGB uint8 image with 0.4 mm per
+Each function takes a generator and the size of the chart in metres. It returns an RGB uint8 image with 0.4 mm per
 pixel; `textures` scales the charts to the resolution of the camera. Colours have low saturation, like real packaging
 under office light seen by a cheap sensor.
 

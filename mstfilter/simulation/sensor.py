@@ -1,7 +1,7 @@
 """Models of a structured-light depth sensor and of a colour camera.
 
 Depth: pixels on depth edges are shifted sideways, some neighbours together. Disparity has Gaussian noise and is
-rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm), which gives
+rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). This gives
 sigma = 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the
 left of objects), at some depth edges, on surfaces seen at a grazing angle, and out of range.
 Colour: exposure, blur of the optics, photon noise, the sRGB curve.

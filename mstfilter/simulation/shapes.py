@@ -1,7 +1,7 @@
 """Household objects made of convex pieces: their shapes, the sizes they are drawn with, the voxels they fill.
 
-`draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body (origin at the middle of the bounding
-box, z up in the main pose), the poses in which it rests, its mass and the layout of its texture.
+`draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body, the poses in which it rests, its mass
+and the layout of its texture. The origin of the frame is the middle of the bounding box; z is up in the main pose.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -9,12 +9,13 @@ box, z up in the main pose), the poses in which it rests, its mass and the layou
 >>> len(shape.pieces), shape.family
 (1, 'can')
 
-Sizes and masses follow objects of the YCB set (B. Calli, A. Walsman, A. Singh, S. Srinivasa, P. Abbeel, A. M. Dollar,
-"Benchmarking in manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3),
-2015, table of objects), rounded: cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl,
-banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not
-in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than
-the real ones: a thinner wall falls between the centres of 1 cm voxels and would be missing from the true volume.
+Sizes and masses follow objects of the YCB set, rounded. The set is that of B. Calli, A. Walsman, A. Singh, S.
+Srinivasa, P. Abbeel, A. M. Dollar, "Benchmarking in manipulation research: the YCB object and model set", IEEE
+Robotics & Automation Magazine 22(3), 2015, table of objects. The objects are cracker, sugar, pudding and gelatin box,
+soup, tuna and coffee can, mug, bowl, banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits,
+bricks, bottle, soap and angle are not in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls
+of bowl and mug are 1 cm, thicker than the real ones. A thinner wall falls between the centres of 1 cm voxels and
+would be missing from the true volume.
 
 `label_voxels` gives the true volume: the voxels of each object, hidden ones included.
 

@@ -247,8 +247,8 @@ class PhysicsWorld:
 
         `groups` are the visible geoms: 0 the room, 1 objects, 2 finger and arm. `data` is another state of the same
         model; by default the state of the world after `forward`. Returns the first geom (n,) int32 that each ray
-        meets, -1 for none; the distance (n,) in units of the length of the direction; and the normal (n, 3) of the
-        surface.
+        meets, -1 for none, the distance (n,), and the normal (n, 3) of the surface. The distance is in units of the
+        length of the direction.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)

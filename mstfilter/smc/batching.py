@@ -2,16 +2,16 @@
 
 Run r equals ``filter.run(observations, seeds[r])`` bit for bit: it draws from the same streams.
 
-The components are called once per step with the particles of all runs, as one population of R n particles, if the
-`batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`, programs). A
-component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its arguments, as
-in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream. Observations and
-inputs that differ between runs are repeated for each row.
+The components are called once per step with the particles of all runs, as one population of R n particles. This is
+done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
+programs). A component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its
+arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
+Observations and inputs that differ between runs are repeated for each row.
 
 This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
-compared with a call for that run alone; at the first call of a component, up to 64 runs with a call for them in
-another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if they
-differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
+compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a call for
+them in another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if
+they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
 """
 
 from __future__ import annotations

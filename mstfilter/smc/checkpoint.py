@@ -186,7 +186,7 @@ def _describe_to(add: Callable[[bytes], None], value: Any, outer: frozenset[int]
 
 
 def _parts(value: Any) -> Iterable[Any]:
-    """What describes a value apart from its type."""
+    """What describes a value besides its type."""
     if isinstance(value, Mapping):
         return (part for pair in value.items() for part in pair)
     if isinstance(value, (Sequence, np.ndarray)):

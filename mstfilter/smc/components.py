@@ -5,9 +5,9 @@
 >>> update = CrossVectors(log_likelihood)
 >>> transition = Branching(Dynamics(model), branches=4)
 
-`ProjectOnto` and `CrossVectors` make published filters from `ParticleFilter`: the manifold filter (Koval, Pollard,
-Srinivasa 2015, 2017), which projects particles onto the states that a contact allows, and the evolutionary filter
-(Kwok, Fang, Zhou 2005), which crosses vectors. Neither is properly weighted, so no evidence is reported.
+`ProjectOnto` and `CrossVectors` make published filters from `ParticleFilter`. The manifold filter (Koval, Pollard,
+Srinivasa 2015, 2017) projects particles onto the states that a contact allows. The evolutionary filter (Kwok, Fang,
+Zhou 2005) crosses vectors. Neither is properly weighted, so no evidence is reported.
 
 A trigger decides when to resample, a size to how many particles:
 

@@ -186,8 +186,8 @@ def run_variance(
     added. This reduces the noise of the estimates and keeps them valid when all particles share one ancestor. The
     bias is small if the model forgets its state in L steps.
 
-    All estimates are of first order in 1 / n, and too low for few particles: with 300 particles within 15 % of the
-    variance over seeds; where 30 particles give the log evidence a variance of 2, those of means are 90 % too low
+    All estimates are of first order in 1 / n, and too low for small n. With 300 particles they are within 15 % of the
+    variance over seeds. Where 30 particles give the log evidence a variance of 2, those of means are 90 % too low
     (`experiments/run_variance/sizes.csv`). Take more particles if the variance of the log evidence is above .3.
 
     Parameters

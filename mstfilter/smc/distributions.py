@@ -11,13 +11,14 @@ Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,), the ent
 their log densities are summed. `log_prob` is always (n,), or a number if nothing has rows.
 
 Frozen distributions of scipy.stats and objects of torch.distributions can be used in place of these
-(`as_distribution`); they take three to six times as long. Neither library is imported before it is used. torch draws
-from a global generator, so its distributions are drawn by their inverse distribution function at uniforms of our
+(`as_distribution`); they take three to six times as long. Neither library is imported before it is used. The
+generator of torch is global, so its distributions are drawn by their inverse distribution function at uniforms of our
 generator, or, without an inverse, from their probabilities.
 
-A parameter out of range, in any row, raises InputError when the distribution is made; the arrays of `Normal` and
-`Student`, when it is sampled, since their log density at such a row is NaN. Moves and lookaheads evaluate values that
-a model may exclude: inside `hypothetical` such a row has the log density NaN, which a move rejects.
+A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
+`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves and
+lookaheads evaluate values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
+move rejects.
 """
 
 from __future__ import annotations

@@ -91,11 +91,15 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
 class Chopthin(WeightResampler):
     """Bounds the ratio of the output weights: light particles are thinned, heavy ones chopped into copies.
 
-    With a threshold a, a particle of weight w gets on average h(w) copies: w / a if w < a (then the copy has weight
-    a), 1 if w is between a and ratio a / 2, and 2 w / (ratio a) if w is larger (each copy then has an equal share of
-    w). a solves sum h(w_i) = n; the numbers are floor or ceil of h, rounded systematically. Exactly n particles are
-    returned, and all weights lie in [a, ratio a]. If the ratio of the given weights is at most ratio / 2 and n of n
-    are selected, nothing changes.
+    With a threshold a, a particle of weight w gets on average h(w) copies:
+
+    - w / a if w < a; the copy then has weight a;
+    - 1 if w is between a and ratio a / 2;
+    - 2 w / (ratio a) if w is larger; each copy then has an equal share of w.
+
+    The threshold solves sum h(w_i) = n. The numbers are floor or ceil of h, rounded systematically. Exactly n
+    particles are returned, and all weights lie in [a, ratio a]. If the ratio of the given weights is at most
+    ratio / 2 and n of n are selected, nothing changes.
 
     Parameters
     ----------

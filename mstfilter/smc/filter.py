@@ -93,8 +93,8 @@ class ParticleFilter(AtStep):
     n_proposed : int
         Number of particles that `proposal` draws at each step. 0: as many as `n`.
     resample : {"after", "before"}
-        "after": resample after the update, as in MST. "before": resample before the next prediction, as in textbooks;
-        the population after a step then has the weights of its observation.
+        With "after", particles are resampled after the update, as in MST. With "before", they are resampled before
+        the next prediction, as in textbooks; the population after a step then has the weights of its observation.
     """
 
     initial: Proposal | None = None
@@ -474,7 +474,7 @@ def keep_freed_memory() -> None:
     """Free one large block, once per process.
 
     After this, glibc keeps freed arrays of up to 32 MB, its largest value, instead of returning them to the system
-    after every step, which takes a fifth of the time of a filter of 10,000 particles and a third of a resampling of a
-    million. The memory of the block itself is never touched. Other C libraries are not affected.
+    after every step. Returning them takes a fifth of the time of a filter of 10,000 particles and a third of a
+    resampling of a million. The memory of the block itself is never touched. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

@@ -49,7 +49,7 @@ def nonlinear_gaussian(
     `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
     row. They may have the further parameters ``t`` and ``u``; `Q` and `R` may have a first axis of T entries.
 
-    `Q` and `P0` may be singular, as that of noise that acts on the velocity only. x_t then has no density given
+    `Q` and `P0` may be singular, as that of noise that acts on the velocity only. Then x_t has no density given
     x_{t-1}: the model has no `log_transition` (for `P0`: no `log_initial`), and what needs it raises InputError. A
     conditional path is then drawn without ancestor sampling.
     """

@@ -12,10 +12,10 @@ A model with parameters is a function that returns a filter:
   parameters is kept until a proposal is accepted; so the chain has the exact posterior, for any number of particles
   (Andrieu, Doucet, Holenstein 2010).
 - `ensemble` does the same with the walkers of emcee, without a scale to choose.
-- `particle_gibbs` alternates draws of parameters given the path of states, and of the path given the parameters by
-  `conditional_path`: a filter in which one particle follows the present path (conditional SMC). If the transition has
-  a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which the early states
-  hardly change.
+- `particle_gibbs` alternates draws of parameters given the path of states, and of the path given the parameters.
+  `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
+  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which
+  the early states hardly change.
 - `smc_sampler` moves particles from the prior to the posterior of a likelihood that can be computed, by tempering
   (Del Moral, Doucet, Jasra 2006). It estimates the evidence, and finds several modes. ``waste_free=True`` uses all
   states of the moves.
@@ -411,8 +411,8 @@ def smc_sampler(
     steps : int
         Metropolis steps per temperature.
     waste_free : bool
-        Keep all states of the moves (waste-free SMC; Dau and Chopin 2022): n / (`steps` + 1) particles are resampled,
-        and these and their states after each step are the next `n` particles. A temperature takes about `n`
+        Keep all states of the moves (waste-free SMC; Dau and Chopin 2022). Of n particles, n / (`steps` + 1) are
+        resampled; these and their states after each step are the next `n` particles. A temperature takes about `n`
         evaluations of the likelihood instead of `steps` times `n`, so `n` and `steps` can be larger: for example
         n = 5000 and steps = 99. `n` must be a multiple of `steps` + 1.
     temperatures : sequence of float, optional

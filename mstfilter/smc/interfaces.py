@@ -16,7 +16,7 @@ work on whole populations, so a component can share work between particles.
 ...         return Population(population.particles + step, population.log_weights)
 
 A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
-to the log weights (`mstfilter.smc.Dynamics` does so for any model with densities).
+to the log weights. `mstfilter.smc.Dynamics` does so for any model with densities.
 
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`; most have a `Transition` and
 an `Update`. Optional are `Size` (number of particles), `Lookahead` (auxiliary filter), `Rejuvenation`
@@ -257,7 +257,7 @@ class Equivalence(Bounded, ABC):
 class Lookahead(Component):
     """Evaluates the next observation before particles are selected (auxiliary filter).
 
-    The filter selects by log weight + priority and subtracts the priority from the selected log weights, so the
+    The filter selects by log weight + priority and subtracts the priority from the selected log weights. So the
     filter is exact for any priority; a good one is close to log p(y_t | x_{t-1}).
     """
 

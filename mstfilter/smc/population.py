@@ -204,7 +204,7 @@ class Population(Table):
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none; the filter numbers both, an update takes the numbers over. ``"mate"``: the
+        proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. ``"mate"``: the
         second parent of a particle that two previous ones made. A resampler adds ``"ancestor"``, the index before the
         resampling; a population after a step has it if the step resampled after its update.
     notes : mapping

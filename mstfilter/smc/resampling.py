@@ -7,10 +7,15 @@ The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. They differ i
 scheme          N_i                                                variance of N_i
 ==============  =================================================  ====================================
 Multinomial     n independent draws                                n W_i (1 - W_i)
+
 Residual        floor(n W_i), the rest by another scheme           f (1 - f / R), R = sum of all f
+
 Stratified      one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
+
 Systematic      one draw, shifted to each stratum                  f (1 - f)
+
 Ssp             floor or ceil, fractions decided pair by pair      f (1 - f)
+
 Killing         survive with w_i / max w, else multinomial         see `Killing`
 ==============  =================================================  ====================================
 

@@ -69,7 +69,7 @@ def run_many(
         If True, `observations` are sequences of T observations, one for each seed. Components that are called with
         all runs get the observations of a step by row.
     workers : int
-        Number of processes. 1 uses the calling process; more are started by joblib's loky, as new interpreters that
+        Number of processes; 1 uses the calling process. More are started by joblib's loky, as new interpreters that
         get the filters by cloudpickle, and limit the numerical libraries to one thread. InputError if a worker dies,
         with the runs that may have ended it.
     folder : path, optional
@@ -85,8 +85,8 @@ def run_many(
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) of a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). From that step on, its log evidence is -inf and other results are NaN;
-        `History.lost` has the reasons, and `History.single` why the runs of an arm were made one by one.
+        an observation (`LostRunError`). From that step on, its log evidence is -inf and other results are NaN.
+        `History.lost` has the reasons, and `History.single` says why the runs of an arm were made one by one.
 
     Warns
     -----

@@ -8,7 +8,7 @@ Three smoothers of a record return a tuple with one population per time:
 
 - `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record; after many
   resamplings all paths share their beginning.
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001): more distinct
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It has more distinct
   particles, and a bias if the state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
   path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"`` or ``"rejection"``.
@@ -132,14 +132,14 @@ def backward_paths(
 
         "rejection" (Douc, Garivier, Moulines, Olsson 2011) draws particles by weight and accepts them with
         probability f / max f. The law is that of "exact". A path that has accepted none of N particles is drawn as by
-        "exact" (Dau and Chopin 2023), so a step takes at most about 2 n N densities; on average n times the mean of
+        "exact" (Dau and Chopin 2023). So a step takes at most about 2 n N densities, on average n times the mean of
         max f / p(x_{t+1} | y_0 .. y_t).
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
         steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
-        The steps need not converge: a parent has the law of "exact" already, given x_{t+1}, after independent
-        selections of a bootstrap filter, and up to order 1 / N after others, so there is no further bias
-        (Dau and Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
+        The steps need not converge. Given x_{t+1}, a parent has the law of "exact" already after independent
+        selections of a bootstrap filter, and up to order 1 / N after others. So there is no further bias (Dau and
+        Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
     steps : int
         Metropolis steps of "mcmc".
     log_bound : float

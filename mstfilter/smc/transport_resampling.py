@@ -71,9 +71,9 @@ class Sorted(ResamplerWrapper):
         function of the particles that `Systematic` or `Stratified` select differs from the weighted one by at most
         1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of resampling
         methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte Carlo".
-        "mean_partition": particles of at most the mean weight, then the others, each group in its order. `Systematic`
-        then keeps as many of the light particles as on average, rounded up or down. Chopin, Singh, Soto, Vihola
-        (2022), "On resampling schemes for particle filters with weakly informative observations".
+        With "mean_partition", particles of at most the mean weight come first, then the others, each in its order.
+        `Systematic` then keeps as many of the light particles as on average, rounded up or down. Chopin, Singh, Soto,
+        Vihola (2022), "On resampling schemes for particle filters with weakly informative observations".
     """
 
     scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
@@ -176,8 +176,9 @@ class Coalesced(ResamplerWrapper):
 def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Select one particle for each class: the heaviest, with the weight of the class.
 
-    Returns the representatives (k,), ascending, the first if several have equal weights, and their log weights (k,):
-    the log of the summed weights times k / m, which keeps the log mean. Classes of weight zero are left out.
+    Returns the representatives (k,), ascending, the first if several have equal weights, and their log weights (k,).
+    A log weight is the log of the summed weights times k / m, which keeps the log mean. Classes of weight zero are
+    left out.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)

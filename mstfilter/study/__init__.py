@@ -5,8 +5,9 @@
 >>> result = run_study(study, Path("studies/main"), Local(workers=2))
 >>> result.folder.summary().compared()[0].words
 
-`run_study` plans the runs (every arm on every scene with every seed), runs those that are not done yet by an executor
-(`Local` or `Cluster`), and writes the tables of the study folder. Each run is a `mstfilter.runs.RunFolder`.
+`run_study` plans the runs (every arm on every scene with every seed), and an executor (`Local` or `Cluster`) makes
+those that are not done yet. Then `run_study` writes the tables of the study folder. Each run is a
+`mstfilter.runs.RunFolder`.
 """
 
 from mstfilter.lazy import attach

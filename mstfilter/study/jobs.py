@@ -4,7 +4,7 @@
 JobOutcome(status='done')
 
 A job is a mapping of plain values, so that a process on another machine can do it. A run is written under a temporary
-name and renamed when it is complete: two workers with the same run do not disturb each other, and the remains of a
+name and renamed when it is complete. So two workers with the same run do not disturb each other, and the remains of a
 killed worker are never taken for a result.
 """
 

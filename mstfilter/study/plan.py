@@ -3,9 +3,9 @@
 >>> plan = make_plan(load_study("study.toml"))
 >>> [run.name for run in plan.runs]
 
-The identity of a run is a hash of its configuration, its recording (the recipe if it is simulated, otherwise the
-content with the ground truth), its seed, the files of mstfilter and of the user, and the versions of the libraries. A
-run whose identity is unchanged is not repeated. Equal runs of two studies have equal identities.
+The identity of a run is a hash of its configuration, its recording, its seed, the files of mstfilter and of the user,
+and the versions of the libraries. A simulated recording is hashed as its recipe, another as its content with the
+ground truth. A run whose identity is unchanged is not repeated. Equal runs of two studies have equal identities.
 """
 
 from __future__ import annotations

@@ -6,12 +6,16 @@
 Layout::
 
     study.json       description, arms with their configuration, scenes, seeds, the folder of every run
+
     runs/NAME/       one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz: counts of
                      its forecasts
+
     runs.csv         one row per pause and run: metrics first, time and memory last
     summary.csv      one row per family, arm and metric: mean over scenes and its interval
+
     differences.csv  every arm minus the reference: paired differences, intervals, p values, conclusions
     failures.csv     runs that failed, and why
+
     recalibration.json  of each family and arm, fitted to all its scenes; for studies of other scenes
     logs/            output of the workers
 """

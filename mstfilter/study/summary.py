@@ -136,7 +136,7 @@ class Summary:
         return [one for one in self.differences if one.metric == name]
 
     def is_better(self, family: str, arm: str) -> bool:
-        """Whether the reference can be claimed to be better than an arm on a family.
+        """Whether the reference is shown to be better than an arm on a family.
 
         One endpoint is better after adjustment, the intervals of the other exclude that it is worse by 0.005 or more,
         and both have at least 20 scenes.

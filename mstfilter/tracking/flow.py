@@ -215,8 +215,8 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
 def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
     """Positions in the first frame (D, 2) of pixels without valid flow.
 
-    Each takes the position of one of its five nearest valid pixels, by position in space and colour together (12 mm
-    and 20 grey levels have equal weight; without depth 6 pixels): the one closest to the others.
+    Each takes the position of one of its five nearest valid pixels: the one closest to the others. They are nearest
+    in space and colour together (12 mm and 20 grey levels have equal weight; without depth 6 pixels).
     """
     height, width = frame.depth.shape
     if not len(uncertain) or not known.any():

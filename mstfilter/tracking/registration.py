@@ -5,8 +5,8 @@
 >>> result.T, result.overlap, result.iterations                                    # doctest: +SKIP
 
 A `Surface` holds the downsampled cloud with normals, covariances and search tree. It is prepared once and used by all
-registrations of the segment. small_gicp runs on one thread: with several threads the order of a sum changes the last
-digits of the result.
+registrations of the segment. The library small_gicp runs on one thread: with several threads the order of a sum
+changes the last digits of the result.
 """
 
 from __future__ import annotations

@@ -8,9 +8,8 @@ measured depth:
 - outside the image: a larger constant cost;
 - no reading or robot: not counted.
 
-The score S is the mean cost of the counted points, plus a term for the fraction of visible points that land on pixels
-which the flow traces back to another object: depth and colour do not distinguish two objects of equal look. Lower is
-better.
+The score S is the mean cost of the counted points, plus a term for the fraction of visible points on pixels that the
+flow traces back to another object. Depth and colour do not distinguish two objects of equal look. Lower is better.
 
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour. It compares
 every moved point with the measurement at the pixel that it falls on, so errors of the tracked mask have no effect.
@@ -134,7 +133,7 @@ def refine_motion(track: Track, T: np.ndarray) -> np.ndarray:
 def _improvement(track: Track, x: np.ndarray, before_grey: np.ndarray, gate: float) -> np.ndarray | None:
     """The motion (4, 4) of one Gauss-Newton step; None if fewer than 12 points can be compared.
 
-    `x` (N, 3) are the moved points, `before_grey` (N,) their grey values in the first frame, `gate` the largest
+    `x` (N, 3) are the moved points, `before_grey` (N,) their grey values in the first frame. `gate` is the largest
     distance in metres between a point and the measurement at its pixel.
     """
     after = track.clip.after

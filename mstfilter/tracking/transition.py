@@ -37,12 +37,12 @@ class WarpResult:
 
     hypothesis: Hypothesis
     voxels_left: int = 0  #: number of voxels that left the grid
-    contested: int = 0  #: number of voxels that more than one object claimed
+    contested: int = 0  #: number of voxels that more than one object covered
     dropped: tuple[int, ...] = ()  #: ids of objects without voxels
 
 
 class _Claim(NamedTuple):
-    """Voxels that an object claims: flat indices (N,) and their depths inside it (N,)."""
+    """Voxels of an object before they are assigned: flat indices (N,) and their depths inside it (N,)."""
 
     record: ObjectRecord
     voxels: np.ndarray
@@ -58,13 +58,14 @@ class Warp(Bounded):
     method : "smooth" or "splat"
         "smooth": every voxel x takes the value of a smoothed signed distance of the object's source at T^-1 x, and
         the object keeps its number of voxels. The source is the occupancy of the object after its last change other
-        than a motion; T is the product of all motions since then, so the shape does not degrade with the number of
-        motions. On 481 true motions of simulated objects of 50-3000 voxels, the mean Jaccard index with the true
-        voxels is .877. "splat", as in the authors' program: moves voxel centres forward and rounds; loses 3-14 % of
-        the voxels per step.
+        than a motion. Here T is the product of all motions since then, so the shape does not degrade with the number
+        of motions. On 481 true motions of simulated objects of 50-3000 voxels, the mean Jaccard index with the true
+        voxels is .877. The method "splat", as in the authors' program, moves voxel centres forward and rounds; it
+        loses 3-14 % of the voxels per step.
     collisions : "deepest" or "label"
-        Which object gets a voxel that several claim. "deepest": the one in which the voxel is deepest, then the one
-        with the smaller residual. "label": the one with the higher label, as in the authors' program.
+        Which object gets a voxel that several cover. With "deepest", it is the one in which the voxel is deepest,
+        then the one with the smaller residual. With "label", it is the one with the higher label, as in the authors'
+        program.
     """
 
     method: Literal["smooth", "splat"] = "smooth"
@@ -118,7 +119,7 @@ class Warp(Bounded):
     def _moved_voxels(
         self, record: ObjectRecord, hypothesis: Hypothesis, T: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, ObjectRecord]:
-        """Voxels (N, 3) that a moved object claims, their depth inside it (N,) in voxels, and its new record."""
+        """Voxels (N, 3) of a moved object, their depth inside it (N,) in voxels, and its new record."""
         grid = hypothesis.grid
         if self.method == "splat":
             crop = hypothesis.crop(record.label)
@@ -132,7 +133,7 @@ class Warp(Bounded):
         return index, depth, record.moved(RigidTransform.from_matrix(T), crop)
 
     def _assign(self, labels: np.ndarray, claims: list[_Claim], residuals: Mapping[int, float]) -> int:
-        """Assign every claimed voxel to one object; returns the number of contested voxels."""
+        """Assign every voxel of `claims` to one object; returns the number of contested voxels."""
         index = np.concatenate([c.voxels for c in claims])
         if not len(index):
             return 0
@@ -180,7 +181,7 @@ def _moved_occupancy(
 
 
 def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Claim]) -> list[_Claim]:
-    """The claims of resting objects on voxels that moved objects claim."""
+    """The voxels that resting objects share with moved objects."""
     claimed = np.unique(np.concatenate([c.voxels for c in claims]))
     holder = labels.ravel()[claimed]
     resting = []
@@ -285,12 +286,16 @@ class TrackingTransition(Transition):
 
         Notes
         -----
-        `notes` contains ``motions`` (number of objects per kind: static, identity, flow, icp, sift, search,
-        invisible, unsupported, lost), ``segments`` (number of distinct segments), ``registrations`` (of candidates of
-        distinct segments: number, iterations, inliers, not converged), ``voxels_left`` (the grid),
-        ``voxels_contested`` and ``objects_dropped``. *invisible*: hidden in the first frame; *unsupported*: the depth
-        image disagrees with the object; *lost*: not found in the last frame. Objects of these three kinds keep their
-        position.
+        `notes` contains:
+
+        - ``motions``: number of objects per kind (static, identity, flow, icp, sift, search, invisible, unsupported,
+          lost);
+        - ``segments``: number of distinct segments;
+        - ``registrations``: of candidates of distinct segments (number, iterations, inliers, not converged);
+        - ``voxels_left`` (the grid), ``voxels_contested`` and ``objects_dropped``.
+
+        An object is *invisible* if it is hidden in the first frame, *unsupported* if the depth image disagrees with
+        it, *lost* if it is not found in the last frame. Objects of these three kinds keep their position.
         """
         particles: tuple[Hypothesis, ...] = tuple(population.particles)
         if observation is None or len(observation.frames) < 2:

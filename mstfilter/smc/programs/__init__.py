@@ -16,8 +16,8 @@ and adds nothing. A program may also contain:
 - `switch(name, probs, branches, ...)` draws a branch for each particle and runs each branch on its particles;
 - `per_particle` marks a function that runs once for every particle, so that the names may differ between particles.
 
-The methods of `Program` make a bootstrap filter from the function, a guided filter (with a guide program that has the
-same sites), an auxiliary filter (its lookahead uses the mean or mode instead of each draw) and a resample-move filter
-(Metropolis steps on all sites). `sample` and `observe` happen in one pass, so a program is a Transition that weights
-its particles; the filter has no Update.
+The methods of `Program` make a bootstrap, a guided, an auxiliary and a resample-move filter from the function. The
+guided filter needs a guide program that has the same sites. The lookahead of the auxiliary filter uses the mean or
+mode instead of each draw. The resample-move filter makes Metropolis steps on all sites. `sample` and `observe` happen
+in one pass, so a program is a Transition that weights its particles; the filter has no Update.
 """

@@ -8,8 +8,8 @@ fault of every third step):
 1. The first two run again with the same random numbers: all values and log weights must be the same.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-3. Particles of a `per_particle` program run alone, too. In the first two steps, a particle alone sees the lists,
-   dictionaries, sets and arrays in the closure and the global variables of the function as they were before the step.
+3. Particles of a `per_particle` program run alone, too. In the first two steps, each sees the lists, dictionaries,
+   sets and arrays in the closure and the global variables of the function as before the step.
 4. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
    the evidence must agree.
 
@@ -371,8 +371,8 @@ def _first_call_that_differs(one: list[ProgramRun], two: list[ProgramRun]) -> st
 def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
     """Raise if the shape of an event depends on the number of particles.
 
-    A vector with as many entries as there are particles looks like one number for each of them, and an array (n, n)
-    made from (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
+    A vector with as many entries as there are particles looks like one number for each of them. An array (n, n) made
+    from (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
     """
     calls = alone.calls or []
     for k, found in enumerate(whole.calls or ()):

@@ -1,7 +1,7 @@
 """What particles carry after a resampling: test cases, their statistics, likely faults, and generators that count.
 
 A `Case` is a list of weights and a number of particles to select. A `Sample` collects over many calls what each
-particle and each group of particles carries, in units of the total weight; `fault_message` compares its mean with the
+particle and each group of particles carries, in units of the total weight. `fault_message` compares its mean with the
 weights and names the likely fault.
 """
 
@@ -88,10 +88,11 @@ class Sample:
     """What particles and groups of particles of a case carry, over many calls.
 
     The mean of each is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
-    betting"). For calls x_1, x_2, ... in [0, b] with expectation mu, the product of 1 + s (x_k - mu) over the calls
-    has expectation 1 for any stake s from -1 / (b - mu) to 1 / mu. By Ville's inequality its largest value over any
-    number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no variance, so a
-    scheme that gives very many copies in rare calls passes; and calls may be added where the result is not clear.
+    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to
+    1 / mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality its largest value
+    over any number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no
+    variance, so a scheme that gives very many copies in rare calls passes. Calls may be added where the result is not
+    clear.
     """
 
     def __init__(self, case: Case) -> None:
@@ -129,8 +130,8 @@ class Sample:
     def evidence(self, tolerance: float) -> np.ndarray:
         """(m + k,) log evidence against an expectation within `tolerance` of that of each particle and group.
 
-        It exceeds log(2 / p) with probability at most p. 0 where the mean is less than four standard errors away; 16
-        copies in all calls together allow for particles that are hardly ever selected.
+        It exceeds log(2 / p) with probability at most p. The result is 0 where the mean is less than four standard
+        errors away; 16 copies in all calls together allow for particles that are hardly ever selected.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)

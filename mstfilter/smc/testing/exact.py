@@ -52,8 +52,8 @@ class ExactContract(PopulationContract):
     the weights f / q of a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
 
     The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 of them the tests find a
-    standard deviation that is 2 % off, a shift by 3 % of it, a cut of the tails that holds 0.1 % of the probability,
-    and a correlation of 0.02 between particles.
+    standard deviation that is 2 % off, and a shift by 3 % of it. They also find a cut of the tails that holds 0.1 %
+    of the probability and a correlation of 0.02 between particles.
     """
 
     exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None
@@ -126,7 +126,7 @@ class ExactContract(PopulationContract):
     def compare_changed(
         self, found: np.ndarray, change: np.ndarray, log_g: Any, exact: np.ndarray, exact_lw: np.ndarray
     ) -> None:
-        """`compare_weighted` for the log weights ``log_g + change``; says if -`change` would be right."""
+        """`compare_weighted` for the log weights ``log_g + change``; says if -`change` would be correct."""
         try:
             self.compare_weighted(found, log_g + change, exact, exact_lw)
         except (AssertionError, SkipTest) as error:

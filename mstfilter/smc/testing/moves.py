@@ -37,8 +37,8 @@ class TransitionContract(BatchedContract, ExactContract):
     """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
 
     One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
-    them, and the observation; for a guided move also log p(y_t | x_t), a function of x_t. If the transition weights
-    by the observation, the population of x_t has these weights.
+    them, and the observation. For a guided move it also returns log p(y_t | x_t), a function of x_t. If the
+    transition weights by the observation, the population of x_t has these weights.
     """
 
     slot = "transition"
@@ -240,8 +240,8 @@ class DensityTransitionContract(TransitionContract):
 class ProposalContract(BatchedContract, ExactContract):
     """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n exact draws of what the weighted particles of the
-    proposal are distributed as, and the observation: for the initial proposal draws of p(x_0). A third item
+    That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
+    particles, and the observation. For the initial proposal these are draws of p(x_0). A third item
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
     """
 
@@ -402,7 +402,7 @@ class RejuvenationContract(ExactContract):
         return component.move(rng, inputs["population"], inputs["previous"], inputs["observation"])
 
     def test_keeps_number_and_weights(self) -> None:
-        """It returns as many particles, with unchanged log weights, also if the past or the observation is None."""
+        """It returns as many particles, with unchanged log weights, also if `previous` or the observation is None."""
         component = self.make()
         for n in (1, 2, _N):
             inputs = self.inputs(n)
