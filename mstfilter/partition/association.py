@@ -7,21 +7,22 @@
 A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one.
 Conflicts are the edges of the conflict graph (in the paper, section IV-D, edges join objects that share voxels). The
 *main object* of a segment is the one with which it shares most readings. An object that is the main object of no
-segment and has very few readings is in no conflict: these are readings of other objects that lie near it. In each
-connected component, a predicted object is continued by at most one segment:
+segment and has fewer than about 60 readings is in no conflict: these are readings of other objects near it.
 
-- by the segment that has more than 80 % of its readings in segments with this main object; readings at which another
-  object now occludes it do not count;
-- without such a segment, by the one that has more than 80 % of all its readings.
+In each connected component, a predicted object is continued by at most one segment. Two rules are tried in turn:
 
-If a segment and an object are in conflict with each other only, more than 50 % is enough. It follows:
+1. Only the segments count whose main object it is. It is continued by the one that has more than 80 % of the readings
+   that these segments share with it. So readings at which another object now occludes it do not count.
+2. All segments count. It is continued by the one that has more than 80 % of the readings that they share with it.
 
-- An object that is *split* into segments of which none has as much is continued by none of them. Its track ends, and
-  the segments are new objects.
+If the component has one segment and one object, more than 50 % is enough. It follows:
+
+- An object that is *split* into segments of which none has this share is continued by none of them. Its track ends,
+  its views are forgotten, and the segments are new objects.
 - If several objects are *merged* into one segment, the segment continues all of them.
 - A segment that continues no object is a new object.
 
-An object without conflict is *occluded*: practically no reading belongs to it.
+An object without conflict is *occluded*. Readings that belong to no segment do not count anywhere.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class ConflictComponent(NamedTuple):
 class Overlaps:
     """The number of readings that each segment shares with each predicted object."""
 
-    shared: np.ndarray  #: (segments + 1, objects + 1) int; row 0 is no segment, column 0 is no object
-    least: float  #: readings of an object in conflict, at least, if it is the main object of no segment
+    shared: np.ndarray  #: (segments + 1, objects + 1) int; row 0 (no segment) is 0, column 0 is no object
+    least: float  #: an object that is the main object of no segment needs as many readings to be in conflict
 
     @classmethod
     def of(cls, segments: np.ndarray, objects: np.ndarray, least: float) -> Overlaps:

@@ -9,18 +9,20 @@ A sample partitions the readings by its segments, a prediction by the objects th
 set of readings that all these partitions treat alike: the cells are the common refinement of all partitions. Cells
 that some partition joins form a component.
 
-For two cells, the samples of the image and the predictions say in how many of them both belong to one object. If the
-predictions hold, the log odds of "one object" are
+For two cells, the samples of the image and the predictions say in how many of them both belong to one object: the
+shares f_image and f_prediction. The log odds of "one object" are
 
-    l = constant + image logit(f_image) + prediction logit(f_prediction) + prediction_constant,
+    l = (1 - R) (image_only_constant + image_only logit(f_image))
+        + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
 
-with shares f softened by 2 %; the last two terms count by the weight of the predictions that explain both cells. If
-no prediction holds, l = image_only_constant + image_only logit(f_image). The two are mixed by the probability that a
-prediction holds, which is the sum of the weights. `experiments/partition_fit` fits the coefficients.
+where R is the probability that a prediction holds, and W <= R the weight of the predictions that explain both cells.
+The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`; `experiments/partition_fit` fits
+them.
 
-The alternatives of a component are the partitions that the samples and the predictions give it. A cell that a
-prediction does not explain joins a predicted object as each sample has it. The probabilities of the alternatives are
-those whose probabilities of pairs are nearest to the given ones (least cross entropy over the pairs of readings).
+The alternatives of a component are the partitions that the samples and the predictions give it. If a prediction does
+not explain a cell, each sample in turn says which object of the prediction the cell joins. Every mixture of the
+alternatives gives each pair of cells a probability of "one object". The mixture is taken whose probabilities are
+nearest to those of l (least cross entropy over the pairs of readings).
 """
 
 from __future__ import annotations
@@ -156,6 +158,7 @@ class Cells:
     def _partitions_of(self, cells: np.ndarray) -> list[np.ndarray]:
         """Partitions (k,) of some cells (k,) by the samples, and by the predictions, completed by each sample."""
         labels = self.samples[:, cells]
+        # A cell without a segment is a part by itself.
         samples = np.unique(np.where(labels > 0, labels, -1 - np.arange(len(cells))), axis=0)
         rows = [*samples]
         for prediction in np.unique(self.predictions[:, cells], axis=0):
@@ -222,7 +225,7 @@ def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> 
 
 
 def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """A reading (K,) of each cell (m,) that has not joined it from a sliver: its labels are those of the cell."""
+    """A reading (K,) of each cell (m,), with the labels of the cell: not one of a sliver that has joined it."""
     own = np.flatnonzero(cell == exact)
     return own[np.unique(cell[own], return_index=True)[1]]
 

@@ -8,22 +8,23 @@ which are crossed. Here, both are partitions of the depth readings of the last f
 estimated anew from all that was seen of it.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
-   observe as free. Prediction j *holds* with probability Q_j^lambda.
+   observe as free. Q_j^lambda is used as the probability that prediction j *holds*, that is, shows the present scene.
 2. **Partitions.** A sample partitions the readings by its segments, a prediction by the objects that lie at the
-   readings. All of them together say how likely two readings belong to one object. Partitions of the image are drawn
-   by these odds (`mstfilter.partition.cells`), so segments of different samples can occur in one partition. The
-   paper crosses each sample with each prediction.
+   readings. All of them together say how likely two readings belong to one object, and partitions of the image are
+   drawn by these odds (`mstfilter.partition.cells`). In different parts of the image, a drawn partition can follow
+   different samples and predictions. The paper crosses each sample with each prediction.
 3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments
-   and predicted objects form a *conflict graph*. In each of its *components*, segments continue predicted objects
-   (`mstfilter.partition.association`). An object that is split into several segments is continued by the one with
-   more than 80 % of its readings, or by none; the other segments are new objects. The paper draws which conflicts end
-   in a merge; here the partition decides.
-4. **Occluded objects.** A predicted object without conflict, to which practically no reading belongs, stays with
-   probability (Q_j q)^lambda. Here q is the share of its own voxels that the frame does not observe as free. It is
-   completed from its views alone, and removed if the frame refutes all of them.
+   and predicted objects form a *conflict graph*, in whose *components* segments continue predicted objects; the rules
+   are in `mstfilter.partition.association`. Of an object that is split, at most one segment continues it. The other
+   segments are new objects. The paper draws which conflicts end in a merge; here the partition decides.
+4. **Occluded objects.** A predicted object without conflict has no or very few readings. It stays in a candidate with
+   probability (Q_j q)^lambda, where q is the share of its own voxels that the frame does not observe as free. Q_j
+   says whether the prediction can be trusted at all, and q whether this object is still there.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
-   completed from its readings in this frame and from the views of the objects that it continues. Evidence is
-   remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on.
+   completed from its readings in this frame and from the views of the objects that it continues; an occluded object
+   from its views alone. The completer drops views that the frame refutes. An object without any voxel is removed.
+   Evidence is remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on. The exception
+   are occluded objects without views, which a completer without memory makes: they keep what free space leaves.
 
 At the first pause the candidates are the samples: every segment is a new object. An object that no frame has shown is
 in no hypothesis.
@@ -85,7 +86,9 @@ class SceneObject(NamedTuple):
 
     readings: np.ndarray  #: (m,) bool, its readings in the last frame
     tracks: tuple[ObjectRecord, ...] = ()  #: the predicted objects that it continues, that with most readings first
-    occluded: Completion | None = None  #: what is left of the voxels of an occluded object; None for a segment
+    remains: Completion | None = (
+        None  #: of an occluded object, its predicted voxels that are left; None for a segment
+    )
 
 
 @dataclass(frozen=True)
@@ -241,7 +244,7 @@ class PartitionUpdate(Update):
         masks = [readings.mask(objects[k].readings) for k in seen]
         found = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
         completed = {k: one.shifted(self.occupied_log_odds) for k, one in zip(seen, found, strict=True)}
-        completed |= {k: one.occluded for k, one in enumerate(objects) if k not in completed and one.occluded}
+        completed |= {k: one.remains for k, one in enumerate(objects) if k not in completed and one.remains}
         return [completed[k] for k in range(len(objects))]
 
     def _hypothesis(
