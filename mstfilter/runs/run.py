@@ -31,7 +31,7 @@ from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings
 from mstfilter.scoring import ask
-from mstfilter.smc import Observer, ParticleFilter
+from mstfilter.smc import ParticleFilter
 
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp", "torch")
 
@@ -63,7 +63,6 @@ def filter_recording(
     replace: bool = False,
     allow_files: bool = False,
     progress: bool | Callable[[RunProgress], None] = False,
-    observer: Observer | None = None,
 ) -> RunFolder:
     """Filter a recording and return the run folder.
 
@@ -82,8 +81,6 @@ def filter_recording(
         Whether components may come from ``./file.py:Class``.
     progress : bool or callable
         True shows a progress bar; a function is called before the first step and after every step.
-    observer : callable, optional
-        ``observer(slot, begins)``, called when a component of the filter begins and ends its work.
 
     Raises
     ------
@@ -110,7 +107,7 @@ def filter_recording(
                 clips = recording.clips()
                 advance(RunProgress(done, len(clips)))
                 for clip in clips[done:]:
-                    state, info = bound.step(state, clip, observer)
+                    state, info = bound.step(state, clip)
                     truth = recording.truth(clip.index)
                     questions = None if truth is None else ask(recording, clip.index)
                     step = clip, state, info, truth, questions, recording.instance(recording.pauses[clip.index])

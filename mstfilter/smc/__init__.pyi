@@ -90,7 +90,6 @@ from mstfilter.smc.interfaces import (
     Info as Info,
     Infos as Infos,
     Lookahead as Lookahead,
-    Observer as Observer,
     Proposal as Proposal,
     Rejuvenation as Rejuvenation,
     Resampler as Resampler,

@@ -42,7 +42,6 @@ from mstfilter.smc.interfaces import (
     Info,
     Infos,
     Lookahead,
-    Observer,
     Proposal,
     Rejuvenation,
     Resampler,
@@ -143,14 +142,14 @@ class ParticleFilter(AtStep):
         """The state before the first observation."""
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
-    def step(self, state: State, observation: Any, observer: Observer | None = None) -> tuple[State, Info]:
+    def step(self, state: State, observation: Any) -> tuple[State, Info]:
         """Process one observation; None if it is missing: then without proposal and update.
 
         A step with an input takes ``WithInput(observation, u)``.
 
         Raises InputError if a component raises it. The message starts with the step and the slot of the component.
         """
-        step = _Step(self, state, observation, observer)
+        step = _Step(self, state, observation)
         past, resampled_before = step.select_before()
         predicted = step.predict(past)
         proposed = step.propose(predicted)
@@ -167,7 +166,6 @@ class ParticleFilter(AtStep):
         *,
         checkpoint: str | Path | None = None,
         codec: Codec | None = None,
-        observer: Observer | None = None,
     ) -> Iterator[tuple[State, Info]]:
         """Yield the state and the info of every step.
 
@@ -183,10 +181,8 @@ class ParticleFilter(AtStep):
             the file is of another seed, filter or model, or if those observations were others.
         codec : Codec, optional
             Stores particles that are not arrays, mappings of arrays or dataclasses of arrays.
-        observer : callable, optional
-            ``observer(slot, begins)``, called when a component begins and ends its work.
         """
-        yield from self._steps(*self._begin(observations, state, checkpoint, codec), observer)
+        yield from self._steps(*self._begin(observations, state, checkpoint, codec))
 
     def run(
         self,
@@ -195,7 +191,6 @@ class ParticleFilter(AtStep):
         *,
         checkpoint: str | Path | None = None,
         codec: Codec | None = None,
-        observer: Observer | None = None,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
@@ -210,7 +205,7 @@ class ParticleFilter(AtStep):
         infos = Infos()
         with progress_of(progress, "filter") as advance:
             advance(state.t, total)
-            for state, info in self._steps(observations, state, store, observer):  # noqa: B020
+            for state, info in self._steps(observations, state, store):  # noqa: B020
                 infos.append(info)
                 advance(state.t, total)
         return state, infos
@@ -230,11 +225,9 @@ class ParticleFilter(AtStep):
         remaining = iter(observations)
         return remaining, store.resume(remaining), store
 
-    def _steps(
-        self, observations: Iterable[Any], state: State, store: Any, observer: Observer | None
-    ) -> Iterator[tuple[State, Info]]:
+    def _steps(self, observations: Iterable[Any], state: State, store: Any) -> Iterator[tuple[State, Info]]:
         for observation in observations:
-            state, info = self.step(state, observation, observer)
+            state, info = self.step(state, observation)
             if store is not None:
                 store.save(state, observation)
             yield state, info
@@ -243,13 +236,11 @@ class ParticleFilter(AtStep):
 class _Step:
     """The stages of one step. Each component call is wrapped by ``with self.slot(name)``."""
 
-    def __init__(
-        self, filter: ParticleFilter, state: State, observation: Any, observer: Observer | None = None
-    ) -> None:
+    def __init__(self, filter: ParticleFilter, state: State, observation: Any) -> None:
         self.observation, u = split_input(observation)
         self.filter, self.state = filter.at_step(state.t, u), state
         self.given = filter
-        self.slot = _Slot(state.t, observer)
+        self.slot = _Slot(state.t)
 
     def rng(self, slot: str) -> np.random.Generator:
         """The random stream of a component in this step."""
@@ -415,9 +406,8 @@ class _Slot:
     ...     slot.record(moved.notes)
     """
 
-    def __init__(self, t: int, observer: Observer | None) -> None:
-        self.t, self.observer = t, observer
-        self.name, self._began = "", 0.0
+    def __init__(self, t: int) -> None:
+        self.t, self.name, self._began = t, "", 0.0
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Mapping[str, Any]] = {}
 
@@ -426,14 +416,10 @@ class _Slot:
         return self
 
     def __enter__(self) -> None:
-        if self.observer is not None:
-            self.observer(self.name, True)
         self._began = time.perf_counter()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
         self.seconds[self.name] = self.seconds.get(self.name, 0.0) + time.perf_counter() - self._began
-        if self.observer is not None:
-            self.observer(self.name, False)
         if isinstance(error, InputError):
             raise type(error)(f"step {self.t}, {self.name}: {error.message}", *error.hints) from error
         if isinstance(error, Exception):

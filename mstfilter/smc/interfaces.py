@@ -27,7 +27,7 @@ another one: `DensityTransition`, `WeightResampler`. Models and programs are mad
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -40,9 +40,6 @@ from mstfilter.smc.export import Table
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
-
-#: ``observer(slot, begins)`` is called when the component in a slot of a filter begins and ends its work.
-Observer = Callable[[str, bool], None]
 
 
 class Component(AtStep, ABC):
