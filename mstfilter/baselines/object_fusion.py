@@ -81,7 +81,7 @@ class ObjectFusion(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The map after the clip; at the first pause the proposed segmentation."""
+        """The map, updated by the clip. At the first pause it is the proposed segmentation."""
         if predicted is None:
             return union(None, proposed)
         maps, notes = [], []

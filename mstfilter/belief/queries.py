@@ -373,7 +373,7 @@ class Belief:
 
 
 def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:
-    """Raise InputError unless `index` (..., k) holds integers from 0 to below `shape` (k,)."""
+    """Raise InputError unless `index` (..., k) holds integers that are at least 0 and below `shape` (k,)."""
     if index.shape[-1:] != (len(shape),) or not np.issubdtype(index.dtype, np.integer):
         raise InputError(
             f"{name}s have type {index.dtype} and shape {index.shape}, expected integers (..., {len(shape)})", hint

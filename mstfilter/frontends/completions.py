@@ -167,7 +167,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return Completion(offset, p, seen.points, key.hex()[:16])
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
-        """Occupancy (X, Y, Z) float32 of a shape in the grid, placed once."""
+        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once and kept."""
         data = read_bytes(path, "a shape")
         T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
         key = (content_key(path.suffix, data, T), grid.key)

@@ -268,10 +268,10 @@ def time_figure(
     """Quality of all hypotheses, or another measure of the runs, over time, one panel per family.
 
     `values` is family -> arm -> pause -> values: one of each scene and seed, or of each hypothesis. `arms` gives the
-    order of the boxes (see `figure_groups` for many arms); arms without values are left out. An arm has the same
-    colour in all figures with the same `every_arm`, if these are at most twelve. Boxes contain the middle half of the
-    values, the bar is their median, whiskers reach the 5th and 95th percentile; points are values, lines join the
-    means.
+    order of the boxes (see `figure_groups` for many arms); arms without values are left out. An arm of a study has
+    the same colour in all figures with the same `every_arm`, for at most twelve arms. Boxes contain the middle half
+    of the values, the bar is their median, whiskers reach the 5th and 95th percentile; points are values, lines join
+    the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)

@@ -5,9 +5,9 @@
 >>> identities.colours(t, k)                        # {label: (r, g, b)}
 
 Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
-From pause to pause, an object is followed by its stable id through the hypothesis it descends from, otherwise by the
-overlap with the last pause. The ground truth, if there is one, is matched first; its labels persist.
-Identities are used for colours only and change no number.
+From pause to pause, an object is matched by its stable id if its hypothesis has a known parent, else by its overlap
+with the last pause. The ground truth, if there is one, is matched first; its labels persist. Identities are used for
+colours only and change no number.
 """
 
 from __future__ import annotations

@@ -161,9 +161,9 @@ def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | 
     """Simulate the actions of a scene, write the recording and open it.
 
     The scene is at its first pause; a subclass of `SimulatedScene` can change the arrangement and the choice of
-    pushes. The folder `path` must not exist or be empty. Nothing is left behind on failure. `progress` is called
-    after each frame with frames done, frames in all, and a description. Raises InputError if the folder cannot be
-    written, or the objects cannot be arranged or pushed.
+    pushes. `path` is a folder that is empty or does not exist yet. Nothing is left behind on failure. `progress` is
+    called after each frame with frames done, frames in all, and a description. Raises InputError if the folder cannot
+    be written, or the objects cannot be arranged or pushed.
     """
     family, world = scene.family, scene.world
     report = progress or (lambda done, total, description: None)

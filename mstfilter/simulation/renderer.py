@@ -39,8 +39,8 @@ def visible_texel(camera: Camera) -> float:
 class Renderer:
     """Renders the current state of a world.
 
-    There is one skin for each object. `supersample` gives pixels on edges further rays. The rendered poses may differ
-    from the physics by `tolerance` metres; see `Stage`.
+    There is one skin for each object. `supersample` casts additional rays for pixels on edges. The rendered poses may
+    differ from the physics by `tolerance` metres; see `Stage`.
     """
 
     def __init__(

@@ -229,7 +229,7 @@ class PhysicsWorld:
         return float(-contact.dist[objects].min(initial=0.0))
 
     def save(self) -> np.ndarray:
-        """The full state of the integration; `restore` continues from it bit by bit."""
+        """The full state of the simulation. After `restore`, the simulation continues bit for bit the same."""
         kind = self._mj.mjtState.mjSTATE_INTEGRATION
         state = np.empty(self._mj.mj_stateSize(self.model, kind))
         self._mj.mj_getState(self.model, self.data, state, kind)
@@ -243,7 +243,7 @@ class PhysicsWorld:
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2), data: Any = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cast rays (n, 3) of any length from one point (3,), metres.
+        """Cast rays from one point (3,), in metres, along directions (n, 3) of any length.
 
         `groups` are the visible geoms: 0 the room, 1 objects, 2 finger and arm. `data` is another state of the same
         model; by default the state of the world after `forward`. Returns the first geom (n,) int32 that each ray

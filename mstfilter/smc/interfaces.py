@@ -354,7 +354,7 @@ class Codec(ABC):
 
     @abstractmethod
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The particles of `encode`."""
+        """The particles that `encode` has encoded (its inverse)."""
 
 
 @dataclass(frozen=True, eq=False)

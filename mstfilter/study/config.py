@@ -169,7 +169,7 @@ class ArmRequest:
     reported_only: bool  #: reported, but not part of the comparisons
 
     def config(self, allow_files: bool) -> dict[str, Any]:
-        """The configuration of the arm; unknown names of components raise InputError."""
+        """The configuration of this arm of the study. Unknown names of components raise InputError."""
         return load_config(self.preset, self.overrides, allow_files=allow_files)
 
 

@@ -125,7 +125,7 @@ class Summary:
     differences: tuple[Compared, ...]
 
     def metric(self, family: str, arm: str, name: str = "quality") -> ArmMetric | None:
-        """A metric; None if the arm has no value on the family."""
+        """The value of a metric; None if the arm has none for this family of scenes."""
         for one in self.metrics:
             if (one.family, one.arm, one.name) == (family, arm, name):
                 return one

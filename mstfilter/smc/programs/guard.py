@@ -5,7 +5,8 @@ draw from another generator, or keep values between steps. Such a program runs, 
 checks some steps, of each kind the first and the second, then the 9th, 66th, 515th, ... (8^k + k, which also finds a
 fault of every third step):
 
-1. The first two run again with the same random numbers: all values and log weights must be the same.
+1. The first two steps run again with the same random numbers. All values and log weights must equal those of the
+   first run.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
 3. Particles of a `per_particle` program run alone, too. In the first two steps, each sees the lists, dictionaries,

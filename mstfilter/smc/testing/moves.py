@@ -207,8 +207,8 @@ class DensityTransitionContract(TransitionContract):
         """Moves have the distribution of `log_prob`, up to a constant factor of the density.
 
         Of a move from a or b, each as likely, p = f(x' | a) / (f(x' | a) + f(x' | b)) is the probability that it is
-        from a. For the p of the particle that it is from, (1 - p) log(p / (1 - p)) has mean 0. Pairs are particles
-        that are some positions apart in the order of their first coordinate.
+        from a. With p of the particle that the move is from, (1 - p) log(p / (1 - p)) has mean 0.
+        Pairs are particles that are some positions apart in the order of their first coordinate.
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
