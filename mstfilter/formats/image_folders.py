@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -52,7 +51,7 @@ class PairedImages(RecordingFormat):
         example = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
         with reading(path / "info.json", "pairs of images", example):
             info = read_json(path / "info.json", "pairs of images", example)
-            K, scale = _four(np.asarray(info["K"], dtype=float), by_columns=False), float(info["depth_scale_m"])
+            K, scale = _four(info["K"]), float(info["depth_scale_m"])
         names = [p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png")]
         present = sorted(
             names, key=lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]
@@ -98,27 +97,19 @@ class PairedImages(RecordingFormat):
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
-_INTRINSICS = tuple(
-    f"{name}{suffix}"
-    for name in (
-        *("intrinsic", "camera_intrinsic", "intrinsics", "camera_intrinsics", "intrinsic_color", "camera_info"),
-        *("camera", "camera_matrix", "calibration", "calib", "cam_K", "K"),
-    )
-    for suffix in (".json", ".txt", ".yaml", ".yml")
-)
+_INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json", "camera_info.yaml")
 
 
 @dataclass(frozen=True)
 class Redwood(VideoFormat):
     """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics: Redwood, Open3D, many recorders.
 
-    Intrinsics are read from a file beside the folders, such as ``intrinsics.json``, ``camera_info.yaml`` or
-    ``K.txt``, or given as ``K``. JSON holds ``fx``, ``fy``, ``cx`` (``ppx``), ``cy`` (``ppy``), or ``K``,
-    ``camera_matrix`` or ``cam_K`` (4 or 9 numbers row by row, or 3 x 3), or Open3D's ``intrinsic_matrix`` column by
-    column. YAML is that of ROS ``camera_info``. Text holds fx fy cx cy, or a 3 x 3 or 4 x 4 matrix. Images are paired
-    by the first number in their names, or by time if these are time stamps. Depth is PNG or TIFF of 16 bits, or
-    float in metres (.npy, .tif). A trajectory ``.log`` of a moving camera has five lines per frame: three numbers,
-    then a 4 x 4 camera-to-world matrix. Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
+    Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
+    holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
+    Open3D's ``intrinsic_matrix``, column by column. ``camera_info.yaml`` is a message or a calibration file of ROS.
+    Images are paired by the first number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
+    16 bits, or float in metres (.npy, .tif). A trajectory ``.log`` of a moving camera has five lines per frame: three
+    numbers, then a 4 x 4 camera-to-world matrix. Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
@@ -127,7 +118,7 @@ class Redwood(VideoFormat):
     depth_scale : float
         Metres per unit of integer depth. Default: from the file of intrinsics, else 0.001.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3. Default: from YAML or JSON of ROS, else none.
+        OpenCV's k1, k2, p1, p2, k3. Default: from the file of intrinsics, else none.
     fps : float
         Frames per second, if names are no time stamps. Default: from the file of intrinsics, else 30.
     tolerance_s : float
@@ -245,21 +236,16 @@ def _seconds(number: Decimal) -> Decimal | None:
 
 
 def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
-    """The file of intrinsics and its entries; a file of text or YAML has ``K`` (and ``distortion``)."""
+    """The file of intrinsics and its entries."""
     file = next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
     if file is None:
         return None, {}
-    with reading(file, "a file of intrinsics"):
-        if file.suffix == ".json":
-            stored = read_json(file, "a file of intrinsics")
-            if not isinstance(stored, dict):
-                stored = {"K": stored}
-            for name in ("color", "colour", "rgb", "intrinsics"):
-                inner = stored.get(name)
-                stored = {**stored, **inner} if isinstance(inner, dict) else stored
-            return file, stored
-        text = re.sub(r"(#|%).*", "", read_text(file, "a file of intrinsics"))
-        return file, {"K": _numbers(text)} if file.suffix == ".txt" else _camera_info(text)
+    kind = "a file of intrinsics"
+    with reading(file, kind):
+        stored = read_json(file, kind) if file.suffix == ".json" else _camera_info(read_text(file, kind))
+        if not isinstance(stored, dict):
+            raise TypeError(f"it holds a {type(stored).__name__}, expected an object with the entry K")
+    return file, stored
 
 
 def _numbers(text: str) -> list[float]:
@@ -267,10 +253,10 @@ def _numbers(text: str) -> list[float]:
 
 
 def _camera_info(text: str) -> dict[str, Any]:
-    """``K``, size and ``distortion`` of YAML as ROS and OpenCV write it, in ``camera_matrix``, ``K`` or ``k``."""
+    """``K``, size and ``distortion`` of a calibration file of ROS, or of a message of ROS 1 or 2."""
 
     def entry(names: str) -> list[float]:
-        found = re.search(rf"(?ms)^(?:{names})\s*:(.*?)(?=^[A-Za-z_]|\Z)", text)
+        found = re.search(rf"(?ms)^(?:{names})\s*:(.*?)(?=^[A-Za-z_]|\Z)", re.sub("#.*", "", text))
         return _numbers(re.sub(r"(?s).*data\s*:", "", found.group(1))) if found else []
 
     sizes = {name: entry(f"image_{name}|{name}") for name in ("width", "height")}
@@ -289,38 +275,31 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
     """fx, fy, cx, cy of the file of intrinsics."""
     if file is None:
         raise InputError(
-            f"{path}: intrinsics are missing, there is no intrinsics.json, camera_info.yaml or K.txt",
+            f"{path}: intrinsics are missing, there is no {' or '.join(_INTRINSICS)}",
             "give them: -o K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
         )
     hint = "expected fx, fy, cx, cy, or K row by row, or intrinsic_matrix of Open3D column by column; or give K"
     with reading(file, "a file of intrinsics", hint):
-        if "fx" in stored:
-            values: Sequence[float] = [stored[name] for name in ("fx", "fy")]
-            values = [*values, *(stored[a] if a in stored else stored[b] for a, b in (("cx", "ppx"), ("cy", "ppy")))]
+        if "intrinsic_matrix" in stored:
+            K = _four(np.reshape(stored["intrinsic_matrix"], (3, 3)).T)
         else:
-            names = ("intrinsic_matrix", "K", "k", "camera_matrix", "cam_K", "intrinsics")
-            name = next((name for name in names if name in stored), names[0])
-            found = stored[name]["data"] if isinstance(stored[name], dict) else stored[name]
-            values = _four(np.asarray(found, float), name == "intrinsic_matrix")
-        K = tuple(float(value) for value in values)
+            K = _four([stored[name] for name in ("fx", "fy", "cx", "cy")] if "fx" in stored else stored["K"])
     for name, value in zip(("fx", "fy", "cx", "cy"), K, strict=True):
         check_number(f"{file}: {name}", value, hint, above=0)
     return K
 
 
-def _four(K: np.ndarray, by_columns: bool) -> tuple[float, ...]:
-    """fx, fy, cx, cy of 4 numbers, or of a 3 x 3 or 4 x 4 matrix, flat or not; `by_columns`: flat ones by columns."""
-    if K.size == 4:
-        return tuple(float(v) for v in K.ravel())
-    side = {9: 3, 16: 4}.get(K.size)
-    if side is None:
-        raise ValueError(f"the matrix has {K.size} numbers, expected 4, 9 or 16")
-    matrix = K.reshape(side, side)
-    matrix = (matrix.T if by_columns and K.ndim == 1 else matrix)[:3, :3]
+def _four(K: Any) -> tuple[float, ...]:
+    """fx, fy, cx, cy of these four numbers, or of the nine of a 3 x 3 matrix."""
+    values = np.asarray(K, dtype=float)
+    if values.size == 4:
+        return tuple(values.ravel().tolist())
+    if values.size != 9:
+        raise ValueError(f"the matrix has {values.size} numbers, expected 4 or 9")
+    matrix = values.reshape(3, 3)
     if not np.allclose(matrix[2], (0, 0, 1)):
-        order = "column by column" if by_columns else "row by row: fx 0 cx, 0 fy cy, 0 0 1"
-        raise ValueError(f"the matrix is {K.tolist()}, expected {order}")
-    return tuple(float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        raise ValueError(f"the matrix is {matrix.tolist()}, expected the rows fx 0 cx, 0 fy cy, 0 0 1")
+    return tuple(matrix[(0, 1, 0, 1), (0, 1, 2, 2)].tolist())
 
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:

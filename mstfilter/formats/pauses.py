@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, naming
+from mstfilter.errors import InputError, naming
+from mstfilter.fields import NonNegativeFloat, PositiveInt, Share
 from mstfilter.reading import read_text
 from mstfilter.scene import PauseRule, grey_blocks
 
@@ -35,10 +36,7 @@ class Ends(PauseRule):
 class EveryNth(PauseRule):
     """Every n-th frame is a pause: single images of a scene that was changed in between."""
 
-    n: int = 1
-
-    def __post_init__(self) -> None:
-        check_integer("n", self.n)
+    n: PositiveInt = 1
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         return tuple(range(0, len(times), self.n))
@@ -136,9 +134,9 @@ class Still(PauseRule):
         people behind the table.
     """
 
-    hold_s: float = 0.5
-    share: float = 0.001
-    levels: float = 3.0
+    hold_s: NonNegativeFloat = 0.5
+    share: Share = 0.001
+    levels: NonNegativeFloat = 3.0
     region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning, check_integer
+from mstfilter.fields import Bounded
 from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
@@ -36,7 +37,7 @@ from mstfilter.scene.voxels import VoxelGrid, as_labels
 _LONG = 20  # frames; more are probably not one clip
 
 
-class PauseRule(ABC):
+class PauseRule(Bounded, ABC):
     """Finds the pauses of a video; the rules are in `mstfilter.formats`."""
 
     @abstractmethod

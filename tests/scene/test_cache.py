@@ -6,7 +6,7 @@ import io
 import multiprocessing
 import os
 import pickle
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -40,45 +40,39 @@ def fail():
     raise AssertionError("computed again")
 
 
-def test_a_value_is_computed_once_per_key():
+def test_a_value_is_computed_once_per_name_and_key():
     cache, calls = Cache(), []
-    for key in (1, 1, 2, 1):
-        cache.get("x", key, lambda key=key: calls.append(key))
-    assert calls == [1, 2]
+
+    def found(name, key):
+        cache.get(name, key, lambda: calls.append((name, key)))
+        return len(calls)
+
+    assert [found(*entry) for entry in (("x", 1), ("x", 1), ("x", 2), ("x", 1), ("y", 1))] == [1, 1, 2, 2, 3]
     assert cache.hits == {"x": 2}
-    cache.get("y", 1, lambda: calls.append("y"))
-    assert calls[-1] == "y"
     cache.clear()
-    cache.get("x", 1, lambda: calls.append("cleared"))
-    assert calls[-1] == "cleared"
+    assert found("x", 1) == 4
 
 
 def test_memory_is_bounded_and_drops_the_least_recently_used():
     cache, calls = Cache(limit_bytes=10_000), []
-
-    def make(key):
-        return lambda: calls.append(key) or np.zeros(500)
-
-    for key in (1, 2, 1, 3, 1, 2):
-        cache.get("x", key, make(key))
-    assert calls == [1, 2, 3, 2]  # 3 displaced 2, which was used before 1
-    cache.get("x", "huge", lambda: np.zeros(10_000))
-    cache.get("x", 2, make(2))
-    assert calls == [1, 2, 3, 2]
+    for key in (1, 2, 1, 3, 1, 2, "huge", 2):
+        size = 10_000 if key == "huge" else 500
+        cache.get("x", key, lambda key=key, size=size: calls.append(key) or np.zeros(size))
+    # 3 displaced 2, which was used before 1; a value above the limit displaces no other.
+    assert calls == [1, 2, 3, 2, "huge"]
 
 
 def test_content_keys_differ_if_content_differs():
     a = np.arange(6)
     assert content_key(a) == content_key(a.copy())
-    different = {content_key(a), content_key(a.reshape(2, 3)), content_key(a.astype(np.int32)), content_key(a, 1)}
-    different |= {
-        content_key("ab", "c"),
-        content_key("a", "bc"),
-        content_key(b"ab"),
-        content_key(1, 2),
-        content_key(12),
-    }
-    assert len(different) == 9
+    arrays = [(a,), (a.reshape(2, 3),), (a.astype(np.int32),), (a, 1)]
+    different = [*arrays, ("ab", "c"), ("a", "bc"), (b"ab",), (1, 2), (12,)]
+    assert len({content_key(*parts) for parts in different}) == len(different)
+
+
+def leaves(value):
+    parts = value if isinstance(value, tuple) else (value,)
+    return [leaf for part in parts for leaf in ([part] if isinstance(part, np.ndarray) else vars(part).values())]
 
 
 @pytest.mark.parametrize(
@@ -95,16 +89,12 @@ def test_values_on_disk_are_found_bit_for_bit(tmp_path, name, value):
     key = (b"key", 1, 2.5, ("a", None))
     get(tmp_path, name, key, lambda: value)
     found = get(tmp_path, name, key, fail)
-    parts = [(value, found)] if name != "pair" else list(zip(value, found, strict=True))
-    for a, b in parts:
-        for x, y in [(a, b)] if isinstance(a, np.ndarray) else [(a.array, b.array), (a.maybe, b.maybe)]:
-            if x is None:
-                assert y is None
-                continue
-            assert x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
+    for x, y in zip(leaves(value), leaves(found), strict=True):
+        if isinstance(x, np.ndarray):
+            assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes())
             assert not y.flags.writeable
-        if isinstance(a, Thing):
-            assert a.text == b.text
+        else:
+            assert x == y
 
 
 def test_key_version_and_type_separate_entries(tmp_path):
@@ -122,22 +112,25 @@ def test_key_version_and_type_separate_entries(tmp_path):
         get(tmp_path, "something else", (1,), fail)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "other"])
+def packed(**arrays):
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+DAMAGE = {
+    "truncated": lambda data: data[: len(data) // 2],
+    "flipped": lambda data: data[:40_000] + bytes([data[40_000] ^ 1]) + data[40_001:],
+    "empty": lambda data: b"",
+    "other": lambda data: packed(unexpected=np.zeros(1)),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_an_unreadable_entry_counts_as_missing(tmp_path, damage):
     get(tmp_path, "array", 1, lambda: np.arange(10_000.0))
     (path,) = tmp_path.rglob("*.val")
-    data = bytearray(path.read_bytes())
-    if damage == "truncated":
-        data = data[: len(data) // 2]
-    elif damage == "flipped":
-        data[len(data) // 2] ^= 1
-    elif damage == "empty":
-        data = bytearray()
-    else:
-        buffer = io.BytesIO()
-        np.savez(buffer, unexpected=np.zeros(1))
-        data = bytearray(buffer.getvalue())
-    path.write_bytes(data)
+    path.write_bytes(DAMAGE[damage](path.read_bytes()))
     assert get(tmp_path, "array", 1, lambda: np.full(3, 7.0)).tolist() == [7, 7, 7]
     assert get(tmp_path, "array", 1, fail).tolist() == [7, 7, 7]
 
@@ -158,17 +151,12 @@ class Executed:
         return os.mkdir, (str(self.path),)
 
 
-@pytest.mark.parametrize("where", ["entry", "object array"])
-def test_a_pickle_in_the_folder_is_not_executed(tmp_path, where):
+@pytest.mark.parametrize("pack", [lambda found: found, lambda found: packed(value=np.array([found], dtype=object))])
+def test_a_pickle_in_the_folder_is_not_executed(tmp_path, pack):
     folder, mark = tmp_path / "work", tmp_path / "executed"
     key = DiskCache(folder, 10**6, "1")._key("array", 1)
     with diskcache.Cache(str(folder)) as foreign:
-        if where == "entry":
-            foreign.set(key, Executed(mark))  # diskcache pickles it
-        else:
-            buffer = io.BytesIO()
-            np.savez(buffer, value=np.array([Executed(mark)], dtype=object))
-            foreign.set(key, buffer.getvalue())
+        foreign.set(key, pack(Executed(mark)))  # diskcache pickles all but bytes
         assert len(foreign) == 1
     assert get(folder, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
     assert not mark.exists()
@@ -194,10 +182,8 @@ def test_the_folder_is_bounded_and_the_least_recently_used_entry_goes(tmp_path):
 
 def read_and_write(folder, seed):
     """Number of wrong values among the entries of a small folder that other workers use at the same time."""
-    disk, value, rng = DiskCache(folder, 150_000, "1"), np.arange(4000.0), np.random.default_rng(seed)
-    wrong = 0
-    for _ in range(40):
-        k = int(rng.integers(6))
+    disk, value, rng, wrong = DiskCache(folder, 150_000, "1"), np.arange(4000.0), np.random.default_rng(seed), 0
+    for k in rng.integers(6, size=40).tolist():
         found = disk.find("array", k, np.ndarray)
         if found is None:
             disk.store("array", k, value + k)
@@ -207,28 +193,19 @@ def read_and_write(folder, seed):
 
 
 def test_threads_and_processes_use_one_folder(tmp_path):
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
+    with multiprocessing.get_context("spawn").Pool(2) as pool, ThreadPoolExecutor(4) as threads:
         wrong = pool.starmap_async(read_and_write, [(tmp_path, 10), (tmp_path, 11)])
-        found = []
-        threads = [threading.Thread(target=lambda s=s: found.append(read_and_write(tmp_path, s))) for s in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert wrong.get() + found == [0] * 6
-    disk = DiskCache(tmp_path, 150_000, "1")
-    disk.store("array", "last", np.zeros(4000))
-    assert disk.find("array", "last", np.ndarray) is not None
+        assert [*threads.map(lambda seed: read_and_write(tmp_path, seed), range(4)), *wrong.get()] == [0] * 6
+    assert get(tmp_path, "array", "last", lambda: np.zeros(4000), 150_000).sum() == 0
+    get(tmp_path, "array", "last", fail, 150_000)
 
 
 def test_a_folder_that_cannot_be_written_and_a_full_disk_store_nothing(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    folder = tmp_path / "file" / "below"
-    assert get(folder, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
-
     def full(*args, **options):
         raise OSError(28, "No space left on device")
 
+    (tmp_path / "file").write_text("")
+    assert get(tmp_path / "file" / "below", "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
     with monkeypatch.context() as patch:
         patch.setattr(diskcache.Cache, "set", full)
         assert get(tmp_path, "array", 1, lambda: np.ones(2)).tolist() == [1, 1]
