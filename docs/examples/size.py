@@ -24,7 +24,7 @@ class MySize(Size):
     factor : float
         Number of particles per unit of the perplexity, the exponential of the entropy of the weights.
     n_min, n_max : int
-        Bounds of the answer. The filter stops if the answer is larger than `n_max`.
+        Bounds of the answer.
     """
 
     factor: float = 2.0
