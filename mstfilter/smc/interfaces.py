@@ -132,11 +132,6 @@ class Resampler(Component):
         """Whether the result always has `n` particles. Schemes without duplicates may return fewer."""
         return True
 
-    @property
-    def tolerance(self) -> float:
-        """Largest bias abs(E[N_i] / n - W_i) of a scheme that is exact in a limit only. Default: 0."""
-        return 0.0
-
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`.

@@ -56,10 +56,6 @@ class ResamplerWrapper(Resampler):
     def exact_size(self) -> bool:
         return self.scheme.exact_size
 
-    @property
-    def tolerance(self) -> float:
-        return self.scheme.tolerance
-
 
 @dataclass(frozen=True)
 class Sorted(ResamplerWrapper):
