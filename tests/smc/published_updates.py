@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.fields import PositiveFloat
 from mstfilter.smc import Population, Update, union
 
 
@@ -20,9 +19,7 @@ from mstfilter.smc import Population, Update, union
 class ProjectOnto(Update):
     """Moves every particle onto the set of states that the observation allows, then weights it.
 
-    If that set has no volume (a contact), no draw of the dynamics lies in it and every weight would be zero.
-    ``project(particles, y)`` moves row by row; ``log_likelihood(particles, y)`` (n,) of the projected particles is
-    the information that the projection does not use.
+    ``project(particles, y)`` moves row by row; ``log_likelihood(particles, y)`` (n,) is of the projected particles.
     """
 
     project: Callable[[Any, Any], Any]
@@ -45,24 +42,13 @@ class ProjectOnto(Update):
 
 @dataclass(frozen=True)
 class CrossVectors(Update):
-    """Adds children of pairs of vectors to the particles, and weights all by the likelihood.
+    """Adds a child for every second predicted particle, and weights all by the likelihood.
 
     A child takes each entry from one of two parents: a predicted particle, drawn by weight, and a proposed one (or,
-    with `among`, a second predicted one). Its weight is the mean of the parents' weights. Without proposed particles
-    and without `among` there are no children, and this is `Reweight`, bit for bit.
-
-    Parameters
-    ----------
-    log_likelihood : callable
-        ``(particles, y) -> (n,)``.
-    share : float
-        Children per predicted particle.
-    among : bool
-        Cross predicted particles with each other (Kwok et al.); ``parents["mate"]`` is the second parent.
+    with `among`, a second predicted one, ``parents["mate"]``). Its weight is the mean of the parents' weights.
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
-    share: PositiveFloat = 0.5
     among: bool = False
 
     #: The density of children is not known.
@@ -80,7 +66,7 @@ class CrossVectors(Update):
 
     def _children(self, rng: np.random.Generator, predicted: Population, mates: Population) -> Population:
         a, b = predicted.particles, mates.particles
-        n = max(1, round(self.share * len(predicted)))
+        n = len(predicted) // 2
         i = rng.choice(len(predicted), n, p=predicted.weights)
         j = rng.choice(len(mates), n, p=mates.weights)
         children = np.where(rng.random((n, a.shape[1])) < 0.5, a[i], b[j])
