@@ -311,9 +311,9 @@ class Void(Completer):
         pass
 
 @dataclass(frozen=True)
-class Grows(Size):
+class Empty(Size):
     def choose(self, population):
-        return 1001
+        return 0
 """
 
 
@@ -331,7 +331,7 @@ def test_an_error_in_a_file_of_the_user_is_located(recording, tmp_path, monkeypa
             "returns None, expected an array of shape",
         ),
         "proposal.completer=./mine.py:Void": ("step 0, proposal: Void.fill (mine.py, line", "returns None"),
-        "size=./mine.py:Grows": ("step 0, resampler: Grows chose 1001 particles from 1, more than 1000", "n_max"),
+        "size=./mine.py:Empty": ("step 0, resampler: number of particles that Empty chose is 0", "at least 1"),
         "proposal.boundary=./mine.py:Fails": ("Fails of ./mine.py is no boundary", "import BoundaryModel"),
         "transition=./mine.py:Needs": ("transition: Needs needs scale, without a default", "transition.scale=VALUE"),
         "proposal.boundary=./mine.py:Flot": ("has no class 'Flot'", "it has: Fails, Wrong"),

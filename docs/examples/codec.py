@@ -17,10 +17,7 @@ from mstfilter.smc import Codec, Population
 
 @dataclass(frozen=True)
 class Shelf:
-    """A particle: boxes on a shelf, in order.
-
-    A dataclass of arrays, numbers and strings needs no codec. This one holds a tuple of variable length.
-    """
+    """A particle: boxes on a shelf, in order. Particles that are no arrays need a codec."""
 
     boxes: tuple[str, ...]
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fields import PositiveFloat, PositiveInt
 from mstfilter.smc import Population, Size, bootstrap, linear_gaussian
 
 
@@ -24,16 +25,16 @@ class MySize(Size):
     factor : float
         Number of particles per unit of the perplexity, the exponential of the entropy of the weights.
     n_min, n_max : int
-        Bounds of the answer. The filter stops if the answer is larger than `n_max`.
+        Bounds of the answer.
     """
 
-    factor: float = 2.0
-    n_min: int = 10
+    factor: PositiveFloat = 2.0
+    n_min: PositiveInt = 10
     n_max: int = 1000
 
     def __post_init__(self) -> None:
-        if not (self.factor > 0 and 1 <= self.n_min <= self.n_max):
-            raise InputError(f"factor is {self.factor}, n_min {self.n_min} and n_max {self.n_max}")
+        if self.n_max < self.n_min:
+            raise InputError(f"n_max is {self.n_max}, less than n_min, {self.n_min}")
 
     def choose(self, population: Population) -> int:
         """An integer of at least 1, from the weighted particles before the resampling."""

@@ -264,8 +264,6 @@ def updates() -> Iterator[tuple[str, Any, Any, Any]]:
         yield f"likelihood {name}, exact weights", component, numbers, exact_weights(g)
         yield f"likelihood {name}, exact draws", component, numbers, resampled_posterior(g)
     yield "user: posterior", other_faults.Posterior(), numbers, other_faults.exact_evidence
-    yield "cross vectors", smc.CrossVectors(lambda x, y: -(x**2).sum(axis=1)), vectors, None
-    yield "project", smc.ProjectOnto(lambda x, y: x / np.linalg.norm(x, axis=1, keepdims=True)), vectors, None
 
 
 def rejuvenations() -> Iterator[tuple[str, Any, Any, Any]]:
@@ -290,7 +288,6 @@ def values() -> Iterator[tuple[str, Any, Any, Any]]:
             yield f"{trigger!r} of {example.__name__}", trigger, example, None
         yield f"equal {example.__name__}", smc.ExactEquality(), example, None
         yield f"KLD of equal {example.__name__}", smc.Kld(smc.ExactEquality()), example, None
-        yield f"fixed size of {example.__name__}", smc.Fixed(7), example, None
     for example in ARRAYS:
         yield f"ArrayCodec of {example.__name__}", smc.ArrayCodec(), example, None
         for width in (0.1, 1.0, 10.0):

@@ -12,7 +12,7 @@
 
 Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
 observation, hardly any prediction lies in it, so every particle is projected into it. This is the manifold filter of
-Koval, Pollard and Srinivasa (2015; for vectors `mstfilter.smc.ProjectOnto`).
+Koval, Pollard and Srinivasa (2015).
 
 One crossover (figure 5):
 

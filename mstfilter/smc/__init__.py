@@ -72,7 +72,7 @@ __components__ = {
         "keep_weights": "KeepWeights",
     },
     "trigger": {"always": "Always", "ess": "EssBelow", "every": "EveryKth", "never": "Never"},
-    "size": {"fixed": "Fixed", "kld": "Kld"},
+    "size": {"kld": "Kld"},
     "similarity": {"gaussian": "Gaussian"},
     "equivalence": {"bins": "Bins", "exact": "ExactEquality"},
 }

@@ -7,16 +7,14 @@ renamed, so that a process that is killed leaves the state of a complete step. A
 step only, so a continued run equals an uninterrupted one. A run with another seed, filter, model or observation is
 refused; so is one with another version of Python if the filter contains functions.
 
-`ArrayCodec` stores particles that are arrays, mappings of arrays, and sequences of dataclasses or traces whose fields
-are arrays, numbers, strings or None. A dataclass is found by its name among the loaded modules; stored data never
-import code. Particles of another kind need your own `Codec`.
+`ArrayCodec` stores particles that are arrays, mappings of arrays, or traces of arrays, numbers, strings and None.
+Particles of another kind need a `Codec`; stored data never import code.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -256,13 +254,7 @@ _FORM = "form"
 
 @dataclasses.dataclass(frozen=True)
 class ArrayCodec(Codec):
-    """Arrays, mappings of arrays, and sequences of dataclasses or traces of arrays.
-
-    `particle` is the dataclass of the particles, if it cannot be found by name because it is defined inside a
-    function.
-    """
-
-    particle: type | None = None
+    """Arrays, mappings of arrays, and traces of programs of single particles."""
 
     def encode(self, particles: Any) -> dict[str, np.ndarray]:
         """Named arrays; ``form`` describes the particles in JSON."""
@@ -271,43 +263,25 @@ class ArrayCodec(Codec):
         if isinstance(particles, Mapping):
             arrays = {f"x/{name}": _storable(np.asarray(a), f"{name!r}") for name, a in particles.items()}
             return {_FORM: _json({"kind": "mapping", "names": list(particles)}), **arrays}
-        return self._encode_objects(particles)
+        return self._encode_traces(particles)
 
-    def _encode_objects(self, particles: Sequence[Any]) -> dict[str, np.ndarray]:
-        kind = type(particles[0])
-        if any(type(p) is not kind for p in particles):
-            names = sorted({type(p).__qualname__ for p in particles})
-            raise InputError(f"particles of several types cannot be stored: {', '.join(names)}", _HINT)
-        if dataclasses.is_dataclass(kind):
-            rows = [{f.name: getattr(p, f.name) for f in dataclasses.fields(kind)} for p in particles]
-            form = {"kind": "dataclass", "type": f"{kind.__module__}:{kind.__qualname__}"}
-            if self.particle is not kind:
-                _find(form["type"], kind)
-        else:
-            from mstfilter.smc.programs.sites import Trace  # the language of programs is imported for programs only
+    def _encode_traces(self, particles: Sequence[Any]) -> dict[str, np.ndarray]:
+        from mstfilter.smc.programs.sites import Trace  # the language of programs is imported for programs only
 
-            if kind is not Trace:
-                raise InputError(f"particles of type {kind.__qualname__} cannot be stored", _HINT)
-            rows, form = [dict(p) for p in particles], {"kind": "traces"}
+        others = sorted({type(p).__qualname__ for p in particles if type(p) is not Trace})
+        if others:
+            raise InputError(f"particles of type {', '.join(others)} cannot be stored", _HINT)
         # Resampled particles are references: each object is stored once.
-        first: dict[int, int] = {}
-        index: list[int] = []
-        described: list[dict[str, Any]] = []
-        arrays: dict[str, np.ndarray] = {}
-        for particle, row in zip(particles, rows, strict=True):
-            k = first.setdefault(id(particle), len(first))
-            index.append(k)
-            if k < len(described):
-                continue
-            fields = {}
-            for name, value in row.items():
-                what = f"field {name!r} of {kind.__qualname__}"
-                fields[name] = _describe(value, what)
+        distinct = {id(p): p for p in particles}
+        numbers = {key: k for k, key in enumerate(distinct)}
+        arrays = {"index": np.array([numbers[id(p)] for p in particles], np.int64)}
+        rows = []
+        for k, trace in enumerate(distinct.values()):
+            rows.append({name: _describe(value, f"{name!r}") for name, value in trace.items()})
+            for name, value in trace.items():
                 if isinstance(value, (np.ndarray, np.generic)):
-                    arrays[f"x/{k}/{name}"] = _storable(np.asarray(value), what)
-            described.append(fields)
-        arrays["index"] = np.array(index, np.int64)
-        return {_FORM: _json({**form, "rows": described}), **arrays}
+                    arrays[f"x/{k}/{name}"] = _storable(np.asarray(value), f"{name!r}")
+        return {_FORM: _json({"kind": "traces", "rows": rows}), **arrays}
 
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
         form = json.loads(str(arrays[_FORM]))
@@ -315,20 +289,12 @@ class ArrayCodec(Codec):
             return arrays["x"]
         if form["kind"] == "mapping":
             return {name: arrays[f"x/{name}"] for name in form["names"]}
-        make: Any
-        if form["kind"] == "dataclass":
-            cls = self.particle or _find(form["type"])
+        from mstfilter.smc.programs.sites import Trace
 
-            def make(row: dict[str, Any]) -> Any:
-                return cls(**row)
-
-        else:
-            from mstfilter.smc.programs.sites import Trace as make
-
-        made = []
-        for k, fields in enumerate(form["rows"]):
-            row = {name: _restore(how, arrays.get(f"x/{k}/{name}")) for name, how in fields.items()}
-            made.append(make(row))
+        made = [
+            Trace({name: _restore(how, arrays.get(f"x/{k}/{name}")) for name, how in row.items()})
+            for k, row in enumerate(form["rows"])
+        ]
         return tuple(made[k] for k in arrays["index"].tolist())
 
 
@@ -368,18 +334,3 @@ def _storable(array: np.ndarray, what: str) -> np.ndarray:
 
 def _json(value: Any) -> np.ndarray:
     return np.array(json.dumps(value))
-
-
-def _find(location: str, expected: type | None = None) -> type:
-    """A dataclass by its name, among the loaded modules."""
-    module, _, path = location.partition(":")
-    found: Any = sys.modules.get(module)
-    for part in path.split("."):
-        found = getattr(found, part, None)
-    usable = isinstance(found, type) and dataclasses.is_dataclass(found)
-    if not usable or (expected is not None and found is not expected):
-        raise InputError(
-            f"dataclass {location} cannot be found by its name",
-            "define it at the top level of a module that is imported first, or pass codec=ArrayCodec(TheClass)",
-        )
-    return found

@@ -1,13 +1,7 @@
 """Components that need no model: updates, branching, triggers, sizes, and equality of particles.
 
 >>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
->>> update = ProjectOnto(lambda particles, y: particles / np.linalg.norm(particles, axis=1, keepdims=True))
->>> update = CrossVectors(log_likelihood)
 >>> transition = Branching(Dynamics(model), branches=4)
-
-`ProjectOnto` and `CrossVectors` make published filters from `ParticleFilter`. The manifold filter (Koval, Pollard,
-Srinivasa 2015, 2017) projects particles onto the states that a contact allows. The evolutionary filter (Kwok, Fang,
-Zhou 2005) crosses vectors. Neither is properly weighted, so no evidence is reported.
 
 A trigger decides when to resample, a size to how many particles:
 
@@ -34,7 +28,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer
-from mstfilter.fields import Bounds, PositiveFloat, PositiveInt
+from mstfilter.fields import Bounds, PositiveInt
 from mstfilter.smc.interfaces import Equivalence, Size, Transition, Trigger, Update
 from mstfilter.smc.population import Population, as_matrix, union
 
@@ -64,84 +58,6 @@ class Reweight(Update):
                 "particle"
             )
         return population.reweighted(found)
-
-
-@dataclass(frozen=True)
-class ProjectOnto(Update):
-    """Moves every particle onto the set of states that the observation allows, then weights it.
-
-    If that set has no volume (a contact), no draw of the dynamics lies in it and every weight would be zero.
-    ``project(particles, y)`` moves row by row; ``log_likelihood(particles, y)`` (n,) of the projected particles is
-    the information that the projection does not use.
-    """
-
-    project: Callable[[Any, Any], Any]
-    log_likelihood: Callable[[Any, Any], np.ndarray] | None = None
-
-    properly_weighted: ClassVar[bool] = False
-    draws: ClassVar[bool] = False
-    step_functions: ClassVar = {"project": 2, "log_likelihood": 2}
-
-    def update(
-        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
-    ) -> Population:
-        population = union(predicted, proposed)
-        projected = self.project(population.particles, observation)
-        population = Population(projected, population.log_weights, population.parents)
-        if self.log_likelihood is None:
-            return population
-        return population.reweighted(np.asarray(self.log_likelihood(population.particles, observation)))
-
-
-@dataclass(frozen=True)
-class CrossVectors(Update):
-    """Adds children of pairs of vectors to the particles, and weights all by the likelihood.
-
-    A child takes each entry from one of two parents: a predicted particle, drawn by weight, and a proposed one (or,
-    with `among`, a second predicted one). Its weight is the mean of the parents' weights. Without proposed particles
-    and without `among` there are no children, and this is `Reweight`, bit for bit.
-
-    Parameters
-    ----------
-    log_likelihood : callable
-        ``(particles, y) -> (n,)``.
-    share : float
-        Children per predicted particle.
-    among : bool
-        Cross predicted particles with each other (Kwok et al.); ``parents["mate"]`` is the second parent.
-    """
-
-    log_likelihood: Callable[[Any, Any], np.ndarray]
-    share: PositiveFloat = 0.5
-    among: bool = False
-
-    #: The density of children is not known.
-    properly_weighted: ClassVar[bool] = False
-    step_functions: ClassVar = {"log_likelihood": 2}
-
-    def update(
-        self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
-    ) -> Population:
-        population = union(predicted, proposed)
-        mates = predicted if self.among else proposed
-        if predicted is not None and mates is not None:
-            population = union(population, self._children(rng, predicted, mates))
-        return population.reweighted(np.asarray(self.log_likelihood(population.particles, observation)))
-
-    def _children(self, rng: np.random.Generator, predicted: Population, mates: Population) -> Population:
-        a, b = predicted.particles, mates.particles
-        vectors = isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and a.ndim == 2
-        if not vectors or a.shape[1:] != b.shape[1:]:
-            raise InputError("crossover of vectors needs particles (n, d) of one dimension")
-        n = max(1, round(self.share * len(predicted)))
-        i = rng.choice(len(predicted), n, p=predicted.weights)
-        j = rng.choice(len(mates), n, p=mates.weights)
-        children = np.where(rng.random((n, a.shape[1])) < 0.5, a[i], b[j])
-        log_weights = np.logaddexp(predicted.log_weights[i], mates.log_weights[j]) - np.log(2)
-        parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[i]}
-        name, source = ("mate", "previous") if mates is predicted else ("proposed", "proposed")
-        parents[name] = mates.parents.get(source, np.full(len(mates), -1))[j]
-        return Population(children, log_weights, parents)
 
 
 @dataclass(frozen=True)
@@ -231,16 +147,6 @@ class EveryKth(Trigger):
 
     def wants(self, population: Population, t: int) -> bool:
         return t % self.k == 0
-
-
-@dataclass(frozen=True)
-class Fixed(Size):
-    """A fixed number of particles `n`."""
-
-    n: PositiveInt = 100
-
-    def choose(self, population: Population) -> int:
-        return self.n
 
 
 def first_seen(keys: Iterable[Hashable]) -> np.ndarray:

@@ -20,11 +20,12 @@ weight-based schemes lose it most of the time. Exact in expectation.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import Bounds
 from mstfilter.smc.interfaces import Resampler, Similarity, WeightResampler
 from mstfilter.smc.population import Population, as_matrix, log_mean_exp
 from mstfilter.smc.resampling import Systematic, check_scheme, checked_weights, inverse_cdf, systematic_copies
@@ -111,10 +112,7 @@ class Chopthin(WeightResampler):
     64.
     """
 
-    ratio: float = 3 + 8**0.5
-
-    def __post_init__(self) -> None:
-        check_number("ratio", self.ratio, at_least=4)
+    ratio: Annotated[float, Bounds(at_least=4)] = 3 + 8**0.5
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         weights = checked_weights(log_weights, n)
@@ -153,10 +151,7 @@ def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
 class Gaussian(Similarity):
     """exp(-d^2 / (2 scale^2)), d the Euclidean distance of array particles in their units; positive semidefinite."""
 
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("scale", self.scale, above=0, unit="distance")
+    scale: Annotated[float, Bounds(above=0, unit="distance")] = 1.0
 
     def matrix(self, particles: Any) -> np.ndarray:
         from scipy.spatial.distance import cdist
@@ -206,17 +201,14 @@ class ClusterStratified(Resampler):
     """
 
     similarity: Similarity = Gaussian()
-    at_least: float = 0.5
+    at_least: Annotated[float, Bounds(above=0, at_most=1, unit="similarity")] = 0.5
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
-    least_mass: float = 0.0
+    least_mass: Annotated[float, Bounds(at_least=0, below=1, unit="share of the weight")] = 0.0
 
     exact_size: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check_component("similarity", self.similarity, Similarity)
         check_scheme(self.scheme)
-        check_number("at_least", self.at_least, above=0, at_most=1, unit="similarity")
-        check_number("least_mass", self.least_mass, at_least=0, below=1, unit="share of the weight")
 
     @property
     def properly_weighted(self) -> bool:

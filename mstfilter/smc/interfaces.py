@@ -132,16 +132,11 @@ class Resampler(Component):
         """Whether the result always has `n` particles. Schemes without duplicates may return fewer."""
         return True
 
-    @property
-    def tolerance(self) -> float:
-        """Largest bias abs(E[N_i] / n - W_i) of a scheme that is exact in a limit only. Default: 0."""
-        return 0.0
-
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`.
 
-        A scheme that makes new particles instead sets no ``parents["ancestor"]``.
+        A scheme that makes new particles inherits `TransformResampler`.
         """
 
 
@@ -206,32 +201,17 @@ class Trigger(Bounded, ABC):
         """True to resample at step `t`."""
 
 
-#: Largest numbers of particles that a `Size` may choose by default: of objects, of rows of arrays.
-_MOST_OBJECTS, _MOST_ROWS = 1_000, 100_000_000
-
-
 class Size(Bounded, ABC):
     """Chooses the number of particles of a resampling. The filter then only starts with `n` particles."""
-
-    #: Largest number that a filter accepts; a subclass may declare a field of this name. None: 1,000 if the particles
-    #: are objects, 100 million if they are arrays.
-    n_max: int | None = None
 
     @abstractmethod
     def choose(self, population: Population) -> int:
         """Number of particles (at least 1), from the weighted particles that are about to be resampled."""
 
     def checked(self, population: Population) -> int:
-        """The number that `choose` returns; InputError if it is no integer from 1 to the largest accepted one."""
-        n, name = self.choose(population), type(self).__name__
-        check_integer(f"number of particles that {name} chose", n)
-        objects = not isinstance(population.particles, np.ndarray | Mapping)
-        bound = self.n_max or (_MOST_OBJECTS if objects else _MOST_ROWS)
-        if n > bound:
-            raise InputError(
-                f"{name} chose {n} particles from {len(population)}, more than {bound}",
-                f"bound the result of choose, or raise the largest number that is accepted: {name}.n_max",
-            )
+        """The number that `choose` returns; InputError if it is no integer of at least 1."""
+        n = self.choose(population)
+        check_integer(f"number of particles that {type(self).__name__} chose", n)
         return int(n)
 
 

@@ -49,7 +49,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice, check_component
+from mstfilter.errors import InputError
 from mstfilter.smc.interfaces import Resampler, TransformResampler, WeightResampler
 
 
@@ -112,9 +112,6 @@ class Residual(WeightResampler):
     """
 
     remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
-
-    def __post_init__(self) -> None:
-        check_choice("remainder", self.remainder, ("multinomial", "stratified", "systematic"))
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)
@@ -226,8 +223,7 @@ class LargestWeights(WeightResampler):
 
 
 def check_scheme(scheme: Resampler) -> None:
-    """Raise InputError unless the scheme is a resampler that selects particles."""
-    check_component("scheme", scheme, Resampler)
+    """Raise InputError if the scheme makes new particles."""
     if isinstance(scheme, TransformResampler):
         raise InputError(
             f"{type(scheme).__name__} makes new particles without ancestors",

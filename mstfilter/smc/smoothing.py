@@ -24,11 +24,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice, check_component, check_integer, check_number
+from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.fields import Bounded, PositiveInt
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
@@ -228,18 +229,15 @@ class _Move:
 
 
 @dataclass(frozen=True)
-class _Backward:
+class _Backward(Bounded):
     """Draws predecessors of later particles; the fields are arguments of `backward_paths`."""
 
     transition: DensityTransition
     method: BackwardMethod
-    steps: int
+    steps: PositiveInt
     log_bound: float | None
 
     def __post_init__(self) -> None:
-        check_component("transition", self.transition, DensityTransition)
-        check_choice("method", self.method, get_args(BackwardMethod))
-        check_integer("steps", self.steps)
         if self.method == "rejection":
             check_number("log_bound", self.log_bound)
 

@@ -25,7 +25,8 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.errors import InputError
+from mstfilter.fields import PositiveInt
 from mstfilter.smc.components import EssBelow, Reweight
 from mstfilter.smc.distributions import as_distribution, hypothetical
 from mstfilter.smc.filter import ParticleFilter
@@ -256,12 +257,10 @@ class RandomWalkMove(Rejuvenation):
 
     model: StateSpaceModel
     scale: Any = 1.0
-    steps: int = 1
+    steps: PositiveInt = 1
     step_functions: ClassVar = {"model": None}
 
     def __post_init__(self) -> None:
-        check_component("model", self.model, StateSpaceModel)
-        check_integer("steps", self.steps)
         scale = np.asarray(self.scale, dtype=np.float64)
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")

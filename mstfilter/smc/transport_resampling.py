@@ -24,7 +24,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice, check_component, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import Share
 from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
 from mstfilter.smc.interfaces import Equivalence, Resampler, TransformResampler
@@ -55,10 +56,6 @@ class ResamplerWrapper(Resampler):
     def exact_size(self) -> bool:
         return self.scheme.exact_size
 
-    @property
-    def tolerance(self) -> float:
-        return self.scheme.tolerance
-
 
 @dataclass(frozen=True)
 class Sorted(ResamplerWrapper):
@@ -78,10 +75,6 @@ class Sorted(ResamplerWrapper):
 
     scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
     order: Literal["position", "mean_partition"] = "position"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("order", self.order, ("position", "mean_partition"))
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         if self.order == "mean_partition":
@@ -160,10 +153,6 @@ class Coalesced(ResamplerWrapper):
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
     equivalence: Equivalence = ExactEquality()  # noqa: RUF009 (frozen)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_component("equivalence", self.equivalence, Equivalence)
-
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         population = population.realised()
         classes = self.equivalence.classes(population.particles)
@@ -199,11 +188,7 @@ class Tempered(ResamplerWrapper):
     likely.
     """
 
-    power: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_number("power", self.power, at_least=0, at_most=1)
+    power: Share = 0.5
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         lw = population.log_weights

@@ -15,8 +15,9 @@ from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Clip, Crop, Frame, FreeSpace, Hypothesis, NoFreeSpace, Occupancy, Projection, VoxelGrid
 from mstfilter.scoring import weighted_coverage
-from mstfilter.smc import Population, ProjectOnto
+from mstfilter.smc import Population
 from tests.scene.scenes import CAMERA, GRID, table_scene
+from tests.smc.published_updates import ProjectOnto
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (5, 4, 3))
 labels = hnp.arrays(np.uint16, SMALL.shape, elements=st.sampled_from([0, 0, 1, 2, 3, 65535]))

@@ -17,7 +17,6 @@ from mstfilter.errors import InputError
 from mstfilter.smc import (
     Branching,
     Categorical,
-    CrossVectors,
     Dynamics,
     LargestWeights,
     MultivariateNormal,
@@ -57,6 +56,7 @@ from tests.smc.models import (
     predictive,
     states_of,
 )
+from tests.smc.published_updates import CrossVectors
 
 # --- conditional SMC: sweeps from an exact path give an exact path -------------------------------------------------
 

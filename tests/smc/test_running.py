@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +21,6 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.files import folder_name
 from mstfilter.smc import (
-    ArrayCodec,
     Codec,
     EssBelow,
     Key,
@@ -281,19 +280,20 @@ def test_workers_need_a_script_that_is_not_imported(tmp_path):
 
 
 # --- codecs -------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class Thing:
-    grid: np.ndarray
-    name: str
-    size: float
-    where: tuple
-    count: np.int32
-    parent: int | None = None
-
-
-THINGS = tuple(
-    Thing(np.arange(k + 1, dtype=np.uint16), f"t{k}", 0.1 * k, (k, (1.5, "a")), np.int32(k)) for k in range(3)
+TRACES = tuple(
+    Trace(
+        {"grid": np.arange(k + 1, dtype=np.uint16), "name": f"t{k}", "where": (k, (1.5, "a")), "x": np.float32(0.1)}
+    )
+    for k in range(3)
 )
+
+
+class Boxes(Codec):
+    def encode(self, particles):
+        return {"grids": np.array([box.grid for box in particles])}
+
+    def decode(self, arrays):
+        return tuple(Box(tuple(grid)) for grid in arrays["grids"].tolist())
 
 
 @pytest.mark.parametrize(
@@ -301,11 +301,9 @@ THINGS = tuple(
     [
         np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32),
         {"x": np.arange(3.0), "k": np.array([True, False, True])},
-        (THINGS[1], THINGS[0], THINGS[1], THINGS[2]),
-        (Trace({"n": 2, "x": np.float64(0.1)}), Trace({"n": 0})),
-        (Box((1, 1)), Box((2, 2))),
+        (TRACES[1], TRACES[0], TRACES[1], Trace({"n": 0, "x": 0.1, "none": None})),
     ],
-    ids=["array", "mapping", "dataclasses", "traces", "boxes"],
+    ids=["array", "mapping", "traces"],
 )
 def test_states_come_back_bit_for_bit(particles, tmp_path):
     n = len(next(iter(particles.values()))) if isinstance(particles, dict) else len(particles)
@@ -322,52 +320,31 @@ def test_states_come_back_bit_for_bit(particles, tmp_path):
     elif isinstance(particles, dict):
         assert {k: a.dtype for k, a in found.items()} == {k: a.dtype for k, a in particles.items()}
         np.testing.assert_array_equal(found["x"], particles["x"])
-    elif isinstance(particles[0], Thing):
-        for a, b in zip(found, particles, strict=True):
-            np.testing.assert_array_equal(a.grid, b.grid)
-            assert (a.grid.dtype, a.name, a.size, a.where, a.count, a.parent) == (
-                np.uint16, b.name, b.size, b.where, b.count, b.parent,
-            )  # fmt: skip
-            assert type(a.count) is np.int32
-        assert found[0] is found[2], "shared particles are shared again"
-    elif isinstance(particles[0], Trace):
-        assert [dict(a) for a in found] == [dict(b) for b in particles]
     else:
-        assert found == particles
+        for a, b in zip(found, particles, strict=True):
+            assert {name: type(v) for name, v in a.items()} == {name: type(v) for name, v in b.items()}
+            np.testing.assert_equal(dict(a), dict(b))
+        assert found[0]["grid"].dtype == np.uint16
+        assert found[0] is found[2], "shared particles are shared again"
 
 
 def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
-    @dataclass(frozen=True)
-    class Local:
-        x: int
-
     def save(particles, codec=None):
         save_state(tmp_path / "s.npz", State(1, Population(particles), Key(0)), codec)
 
     with pytest.raises(InputError, match="particles of type complex cannot be stored"):
         save((1j, 2j))
-    with pytest.raises(InputError, match="cannot be found by its name"):
-        save((Local(1),))
     with pytest.raises(InputError, match="array of Python objects"):
         save(np.array([object()]))
-    with pytest.raises(InputError, match="several types"):
-        save((Box((1,)), THINGS[0]))
-    with pytest.raises(InputError, match="field 'name' of Thing is of type dict"):
-        save((Thing(np.zeros(1), {}, 1.0, (), np.int32(0)),))
+    with pytest.raises(InputError, match="particles of type Box cannot be stored"):
+        save((TRACES[0], Box((1,))))
+    with pytest.raises(InputError, match="'name' is of type complex"):
+        save((Trace({"name": 1j}),))
+    with pytest.raises(InputError, match="'where' is a tuple that holds arrays"):
+        save((Trace({"where": (np.zeros(1),)}),))
     assert not list(tmp_path.iterdir()), "nothing is left behind"
-    save((Local(1), Local(2)), ArrayCodec(Local))
-    state, _ = load_state(tmp_path / "s.npz", ArrayCodec(Local))
-    assert state.population.particles == (Local(1), Local(2))
-
-    class Halves(Codec):
-        def encode(self, particles):
-            return {"halves": np.array([p.imag for p in particles])}
-
-        def decode(self, arrays):
-            return tuple(1j * v for v in arrays["halves"])
-
-    save((1j, 2j), Halves())
-    assert load_state(tmp_path / "s.npz", Halves())[0].population.particles == (1j, 2j)
+    save((Box((1,)), Box((2,))), Boxes())
+    assert load_state(tmp_path / "s.npz", Boxes())[0].population.particles == (Box((1,)), Box((2,)))
     whole = (tmp_path / "s.npz").read_bytes()
     other, single = io.BytesIO(), io.BytesIO()
     np.savez(other, x=np.zeros(3))
@@ -375,12 +352,12 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
     for content in (b"", b"no zip", b"PK nonsense", whole[: len(whole) // 2], single.getvalue(), other.getvalue()):
         (tmp_path / "s.npz").write_bytes(content)
         with pytest.raises(InputError, match="s.npz") as found:
-            load_state(tmp_path / "s.npz", Halves())
+            load_state(tmp_path / "s.npz", Boxes())
         assert found.value.hints
     for head in ('"text"', "3", "{}", '{"format": 1}', '{"format": 1, "seed": 0, "path": [], "t": 1}', "not json"):
         np.savez(tmp_path / "s.npz", head=np.array(head), log_weights=np.zeros(2))
         with pytest.raises(InputError, match="s.npz"):
-            load_state(tmp_path / "s.npz", Halves())
+            load_state(tmp_path / "s.npz", Boxes())
     with pytest.raises(InputError, match="checkpoint is missing"):
         load_state(tmp_path / "t.npz")
 
@@ -395,26 +372,30 @@ def walk(previous, y):
 
 
 @pytest.mark.parametrize(
-    ("filter", "ys"),
-    [(bootstrap(AR1, 30), YS), (bootstrap(hmm("objects"), 30), SYMBOLS), (Program(walk).bootstrap(8), YS)],
+    ("filter", "ys", "codec"),
+    [
+        (bootstrap(AR1, 30), YS, None),
+        (bootstrap(hmm("objects"), 30), SYMBOLS, Boxes()),
+        (Program(walk).bootstrap(8), YS, None),
+    ],
     ids=["arrays", "objects", "traces"],
 )
-def test_a_run_goes_on_from_its_checkpoint(filter, ys, tmp_path):
+def test_a_run_goes_on_from_its_checkpoint(filter, ys, codec, tmp_path):
     whole, _ = filter.run(ys, 5)
     path = tmp_path / "run.npz"
-    _, first = filter.run(ys[:4], 5, checkpoint=path)
-    state, rest = filter.run(ys, 5, checkpoint=path)
+    _, first = filter.run(ys[:4], 5, checkpoint=path, codec=codec)
+    state, rest = filter.run(ys, 5, checkpoint=path, codec=codec)
     assert [i.t for i in (*first, *rest)] == list(range(len(ys)))
-    again, none = filter.run(ys, 5, checkpoint=path)
+    again, none = filter.run(ys, 5, checkpoint=path, codec=codec)
     assert none == []
     for other in (state, again):
         assert other.log_evidence == whole.log_evidence and other.t == len(ys)
         for a, b in zip(other.population.particles, whole.population.particles, strict=True):
             assert a == b
     with pytest.raises(InputError, match="its seed is"):
-        filter.run(ys, 6, checkpoint=path)
+        filter.run(ys, 6, checkpoint=path, codec=codec)
     with pytest.raises(InputError, match="is of another run: its filter"):
-        bootstrap(AR1, 31).run(YS, 5, checkpoint=path)
+        bootstrap(AR1, 31).run(YS, 5, checkpoint=path, codec=codec)
     with pytest.raises(InputError, match="folder of the checkpoint"):
         filter.run(ys, 5, checkpoint=tmp_path / "no" / "run.npz")
     # A field of a component that changed would give neither run.
@@ -427,15 +408,15 @@ def test_a_run_goes_on_from_its_checkpoint(filter, ys, tmp_path):
         (replace(filter, n=31), "its filter.n is 30|its filter.n is 8"),
     ):
         with pytest.raises(InputError, match=message):
-            other.run(ys, 5, checkpoint=path)
+            other.run(ys, 5, checkpoint=path, codec=codec)
     same = replace(filter, n=np.int64(filter.n))
-    assert same.run(ys, 5, checkpoint=path)[1] == []
+    assert same.run(ys, 5, checkpoint=path, codec=codec)[1] == []
     with pytest.raises(InputError, match=f"its first {len(ys)} observations differ"):
-        filter.run([*ys[:2], None, *ys[3:]], 5, checkpoint=path)
+        filter.run([*ys[:2], None, *ys[3:]], 5, checkpoint=path, codec=codec)
     with pytest.raises(InputError, match="there are only 3 observations"):
-        filter.run(ys[:3], 5, checkpoint=path)
+        filter.run(ys[:3], 5, checkpoint=path, codec=codec)
     with pytest.raises(InputError, match="its first step is 0, expected 2"):
-        filter.run(ys[2:], filter.run(ys[:2], 5)[0], checkpoint=path)
+        filter.run(ys[2:], filter.run(ys[:2], 5)[0], checkpoint=path, codec=codec)
 
 
 def with_noise(sd):

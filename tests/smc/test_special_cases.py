@@ -9,20 +9,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError
 from mstfilter.smc import (
     Always,
     ConditionallyLinear,
-    CrossVectors,
     EssBelow,
     Linear,
     Population,
-    ProjectOnto,
     Proposal,
     bootstrap,
     linear_gaussian,
     rao_blackwellised,
 )
+from tests.smc.published_updates import CrossVectors, ProjectOnto
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, kalman, observations
 
 YS = observations(6)
@@ -135,8 +133,6 @@ def test_children_take_each_entry_from_a_parent():
     )
     state, infos = filter.run(YS, 0)
     assert len(state.population) == 40 and infos[0].n_candidates == 40 + 40 + 20
-    with pytest.raises(InputError, match="crossover of vectors needs"):
-        CrossVectors(model.log_likelihood, among=True).update(rng, Population(np.zeros(3)), None, YS[0])
 
 
 def test_crossing_previous_particles_records_both_parents():

@@ -91,23 +91,6 @@ def Rejection(rng, lw, n):
 
 
 @dataclass(frozen=True)
-class Metropolis(WeightResampler):
-    """Chains of so many steps that their total variation distance from the weights is at most `tolerance`."""
-
-    tolerance: float = 0.05
-
-    def select(self, rng, log_weights, n):
-        weights = np.exp(log_weights - log_weights.max())
-        chains = np.resize(np.flatnonzero(weights), n)
-        # Tierney (1994): each step keeps at most 1 - mean w / max w of the distance.
-        steps = int(np.ceil(np.log(self.tolerance) / np.log1p(-min(weights.mean(), 1 - 1e-9))))
-        for _ in range(steps):
-            proposed = rng.integers(len(weights), size=n)
-            chains = np.where(rng.random(n) * weights[chains] < weights[proposed], proposed, chains)
-        return chains, None
-
-
-@dataclass(frozen=True)
 class MeansByOrder(TransformResampler):
     """New particles are means of the old ones by optimal transport, in one dimension: by order (Reich 2013)."""
 
@@ -164,7 +147,7 @@ def SizeChanging(rng, lw, n):
     return ancestors, lw[ancestors] + np.log((lw > -np.inf).mean())
 
 
-CORRECT = (Metropolis(), MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
+CORRECT = (MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
 
 # --- wrong numbers of copies --------------------------------------------------------------------------------------
 
@@ -585,11 +568,6 @@ def weights_of_neighbours(rng, lw, n):
 @faulty("gives_n_particles", "float64, expected integers")
 def as_floats(rng, lw, n):
     return systematic(rng, normalise(lw), n).astype(float)
-
-
-@faulty("states_a_small_tolerance", "tolerance is 0.9")
-class StatesALargeBias(GreedyCalledProper):
-    tolerance: ClassVar[float] = 0.9
 
 
 @faulty("gives_n_particles", "asked to make")

@@ -25,7 +25,7 @@ from mstfilter.smc import (
 )
 from mstfilter.smc.testing import CodecContract, LookaheadContract, RejuvenationContract
 from mstfilter.testing import run_contract, scene_example
-from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, Box, predictive
+from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, predictive
 from tests.testing import run_property
 from tests.testing.other_faults import CORRECT, CORRECT_RANDOM, FAULTS, NOT_FOUND, exact_ar1
 
@@ -38,10 +38,6 @@ def vectors(rng, n):
 
 def traces(rng, n):
     return Population({"x": rng.standard_normal(n)}, rng.standard_normal(n)), 0.4
-
-
-def boxes(rng, n):
-    return Population(tuple(Box((int(k),) * 4) for k in rng.integers(3, size=n))), None
 
 
 def exact_traces(rng, n):
@@ -82,7 +78,6 @@ OURS = {
     "lookahead of a program": (ProgramLookahead(ar1, 0.5), traces, None),
     "random walk": (RandomWalkMove(AR1, 0.7), None, exact_ar1),
     "codec of mappings": (ArrayCodec(), traces, None),
-    "codec of objects": (ArrayCodec(), boxes, None),
     "codec of hypotheses": (HypothesisCodec(), scene_example, None),
 }
 

@@ -72,7 +72,7 @@ def test_planted_faults_are_reported(fault):
 
 
 def test_no_planted_fault_is_lost():
-    assert len(FAULTS) == 70
+    assert len(FAULTS) == 69
 
 
 def test_the_global_generators_are_restored():

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.errors import InputError
+from mstfilter.fields import NonNegativeFloat, PositiveFloat, PositiveInt
 from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import AtStep
@@ -168,10 +169,7 @@ class ProgramLookahead(_OfProgram, Lookahead):
     """
 
     model: Model
-    power: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_number("power", self.power, at_least=0)
+    power: NonNegativeFloat = 1.0
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         """(n,) log probability of the observation, bounded from below."""
@@ -201,12 +199,8 @@ class ProgramMove(_OfProgram, Rejuvenation):
     """
 
     model: Model
-    scale: float = 0.5
-    steps: int = 1
-
-    def __post_init__(self) -> None:
-        check_number("scale", self.scale, above=0)
-        check_integer("steps", self.steps)
+    scale: PositiveFloat = 0.5
+    steps: PositiveInt = 1
 
     def move(
         self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any

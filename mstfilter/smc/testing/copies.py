@@ -127,21 +127,21 @@ class Sample:
         """Largest weight that a call can carry: 1, or four times the largest observed if the total is not kept."""
         return 1.0 if self._most <= 1 + 1e-9 else 4 * self._most
 
-    def evidence(self, tolerance: float) -> np.ndarray:
-        """(m + k,) log evidence against an expectation within `tolerance` of that of each particle and group.
+    def evidence(self) -> np.ndarray:
+        """(m + k,) log evidence against the expectation of each particle and group.
 
         It exceeds log(2 / p) with probability at most p. The result is 0 where the mean is less than four standard
         errors away; 16 copies in all calls together allow for particles that are hardly ever selected.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
-        beyond = np.abs(found - self.expected) - tolerance
+        beyond = np.abs(found - self.expected)
         clear = _SUSPICIOUS * sd / np.sqrt(len(x)) + _SUSPICIOUS**2 / (self.case.n * len(x))
         columns = np.flatnonzero(beyond > clear)
         result = np.zeros(x.shape[1])
         for j in columns.tolist():
             sign = np.sign(found[j] - self.expected[j])
-            mean = self.expected[j] + sign * tolerance
+            mean = self.expected[j]
             gains = sign * (x[:, j] - mean) / max(mean if sign > 0 else self.largest - mean, 1e-12)
             bets = np.log1p(_STAKES[:, None] * gains).sum(axis=1)
             result[j] = bets.max() + np.log(np.exp(bets - bets.max()).mean())

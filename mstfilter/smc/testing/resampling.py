@@ -54,9 +54,8 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 class ResamplerContract(Contract):
     """The contract of every `Resampler`. Its statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    The particles of the example differ. The tests allow the bias `tolerance` that a component states. They find a
-    deviation of a mean that is about six standard errors in the calls of a `Case`, and at least 0.3 % of the
-    particle's weight.
+    The particles of the example differ. The tests find a deviation of a mean that is about six standard errors in the
+    calls of a `Case`, and at least 0.3 % of the particle's weight.
     """
 
     #: Fewer calls: schemes that compare particles are slower.
@@ -106,14 +105,6 @@ class ResamplerContract(Contract):
                     found = len(self.resample(component, self.population(np.linspace(1, 3, m)), n, seeded(seed)))
                     enough = found == n if component.exact_size else 1 <= found <= n
                     assert enough, f"asked to make {n} particles of {m} it returns {found}"
-
-    def test_states_a_small_tolerance(self) -> None:
-        """Its `tolerance` is a bias of less than 0.1 of the weight."""
-        found = self.make().tolerance
-        assert 0 <= found < 0.1, (
-            f"tolerance is {found!r}, expected a number from 0 to 0.1: for a larger bias declare "
-            "properly_weighted = False"
-        )
 
     def test_zero_weights_are_never_chosen(self) -> None:
         """A particle of weight zero is never selected, also by the uniform numbers 0 and 1 - 2^-53."""
@@ -207,8 +198,8 @@ class ResamplerContract(Contract):
                 f"{len(W)} particles to {case.n}: the mean weight after selection is {sample.total:.4g} of the one "
                 f"before, expected the same{evidence_hint(sample.total, W)}"
             )
-            evidence = sample.evidence(component.tolerance)
-            assert _excess(sample, component, len(cases)) <= 0, fault_message(sample, int(np.argmax(evidence)))
+            evidence = sample.evidence()
+            assert _excess(sample, len(cases)) <= 0, fault_message(sample, int(np.argmax(evidence)))
         if slow:
             raise SkipTest(
                 slow[0] if len(cases) == 1 else f"{slow[0]} ({len(slow)} of {len(cases)} cases, others hold)"
@@ -232,7 +223,7 @@ class ResamplerContract(Contract):
                 if sample.calls == 0 and rng.drawn * calls > BUDGET:
                     raise SkipTest(f"{slow}: a call draws {rng.drawn:.3g} random numbers")
                 sample.add(chosen.parents["ancestor"], np.exp(chosen.log_weights - population.log_mean_weight))
-            clear = sample.evidence(component.tolerance).max() == 0 or _excess(sample, component, n_cases) > 0
+            clear = sample.evidence().max() == 0 or _excess(sample, n_cases) > 0
             if clear or calls >= MOST_CALLS * case.calls:
                 return sample
             calls *= 2
@@ -247,9 +238,9 @@ def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
             yield f"rng.random() gives {value:.17g}", ConstantGenerator(value, 200_000), n
 
 
-def _excess(sample: Sample, component: Resampler, n_cases: int) -> float:
+def _excess(sample: Sample, n_cases: int) -> float:
     """Largest log evidence against a mean, minus its bound for one of `n_cases` cases at level `FALSE_ALARM`."""
-    evidence = sample.evidence(component.tolerance)
+    evidence = sample.evidence()
     return float(evidence.max() - np.log(2 * len(evidence) * n_cases / FALSE_ALARM))
 
 
@@ -270,9 +261,8 @@ class WeightResamplerContract(BatchedContract, ResamplerContract):
         except AssertionError as error:
             raise AssertionError(f"single precision, or too few bits for the indices? {error}") from error
         # If all are draws of one law, the five are above, or below, all sixty with probability 1 / C(65, 5) = 1.2e-7.
-        margin = 80 + 100_000 * component.tolerance
-        wrong = component.properly_weighted and (many.max() < few.min() - margin or many.min() > few.max() + margin)
-        rounded = abs(few.mean() - 100) < margin  # else it is another fault
+        wrong = component.properly_weighted and (many.max() < few.min() - 80 or many.min() > few.max() + 80)
+        rounded = abs(few.mean() - 100) < 80  # else it is another fault
         hint = ": cumulated in single precision?" if rounded else ""
         assert not wrong, (
             f"100 000 particles that share a thousandth of the weight get {many.mean():.0f} copies in total, and 100 "

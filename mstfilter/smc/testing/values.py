@@ -89,13 +89,6 @@ class SizeContract(DecisionContract):
         valid = isinstance(result, (int, np.integer)) and not isinstance(result, bool) and result >= 1
         assert valid, f"its answer is {result!r}, expected an int of at least 1"
 
-    def test_keeps_its_largest_number(self) -> None:
-        """A filter accepts its answer: it is at most `n_max`, or the largest number for such particles."""
-        component = self.make()
-        for population in self.populations():
-            with reports_errors("the size is checked by the filter"):
-                component.checked(population)
-
 
 class ScoreContract(Contract):
     """Properties of components that give one number per particle."""
