@@ -147,7 +147,6 @@ def report(
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
     export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
     mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply, obj or glb.")] = "ply",
-    mesh_style: Annotated[str, typer.Option(help="Style of exported meshes: blocky or smooth.")] = "blocky",
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
@@ -165,7 +164,7 @@ def report(
 
     print(f"report      {write_report(run, out)}")
     if export is not None:
-        export_run(run, export, mesh_format, mesh_style)
+        export_run(run, export, mesh_format)
         print(f"hypotheses  {export}")
 
 

@@ -1,8 +1,8 @@
 """Export of hypotheses for other programs: meshes, label images and a table of objects. open3d writes the meshes.
 
->>> export_run("runs/demo", "out")                                        # blocky PLY meshes
->>> export_run("runs/demo", "out", mesh_format="glb", mesh_style="smooth")
->>> export_mesh(hypothesis, "scene.obj")                                  # one hypothesis
+>>> export_run("runs/demo", "out")                         # PLY meshes
+>>> export_run("runs/demo", "out", mesh_format="glb")
+>>> export_mesh(hypothesis, "scene.obj")                   # one hypothesis
 
 Layout of an exported run::
 
@@ -33,7 +33,6 @@ from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
 
 MESH_FORMATS = ("ply", "obj", "glb")
-MESH_STYLES = ("blocky", "smooth")
 
 # Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
 _CORNERS = {
@@ -41,7 +40,6 @@ _CORNERS = {
     1: np.array([[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 1, 0]]),
     2: np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]),
 }
-_TAUBIN_ITERATIONS = 10
 
 
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,54 +62,37 @@ def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, index.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def hypothesis_mesh(
-    hypothesis: Hypothesis, colours: Mapping[int, Colour] | None = None, style: str = "blocky"
-) -> Any:
+def hypothesis_mesh(hypothesis: Hypothesis, colours: Mapping[int, Colour] | None = None) -> Any:
     """Meshes of all objects of a hypothesis as one ``open3d.geometry.TriangleMesh``, in world metres.
 
-    `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. The style "blocky" has the faces
-    of the voxels, which enclose exactly the volume of the voxels. The style "smooth" is the isosurface of the
-    occupancy at 0.5 (open3d's dual contouring), smoothed by Taubin's filter, which shrinks it little (G. Taubin,
-    "Curve and surface smoothing without shrinkage", ICCV 1995). Raises MissingLibraryError if open3d cannot be
-    imported.
+    The triangles are the faces of the voxels; the mesh of an object encloses exactly the volume of its voxels.
+    `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. Raises MissingLibraryError if
+    open3d cannot be imported.
     """
     o3d = import_open3d()
     if colours is None:
         colours = {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
-    build = _smooth_mesh if style == "smooth" else _blocky_mesh
     mesh = o3d.geometry.TriangleMesh()
     for record in hypothesis.objects:
-        part = build(o3d, hypothesis.labels == record.label, hypothesis.grid)
+        part = _voxel_mesh(o3d, hypothesis.labels == record.label, hypothesis.grid)
         part.paint_uniform_color(np.array(colours.get(record.label, UNASSIGNED_COLOUR)) / 255)
         mesh += part
     return mesh
 
 
-def _blocky_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
+def _voxel_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
     corners, triangles = voxel_faces(mask)
     vertices = o3d.utility.Vector3dVector(grid.origin + corners * grid.voxel_size)
     return o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
 
 
-def _smooth_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
-    # open3d's axes are (z, y, x); vertex 0 is the centre of the first voxel, which is one voxel of padding here.
-    occupancy = np.ascontiguousarray(np.pad(mask, 1).T, np.float32)
-    mesh = o3d.t.geometry.TriangleMesh.create_isosurfaces(occupancy, [0.5]).to_legacy()
-    mesh.vertex_normals = o3d.utility.Vector3dVector()
-    mesh.scale(grid.voxel_size, np.zeros(3))
-    mesh.translate(grid.origin - 0.5 * grid.voxel_size)
-    return mesh.filter_smooth_taubin(_TAUBIN_ITERATIONS)
-
-
-def export_mesh(
-    hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None, style: str = "blocky"
-) -> Path:
+def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
     """Write the mesh of a hypothesis that has objects; the ending of `path` (ply, obj, glb) chooses the format.
 
-    `colours` and `style` are those of `hypothesis_mesh`.
+    `colours` are those of `hypothesis_mesh`.
     """
     path, o3d = Path(path), import_open3d()
-    mesh = hypothesis_mesh(hypothesis, colours, style)
+    mesh = hypothesis_mesh(hypothesis, colours)
     with atomic_path(path) as partial, TemporaryDirectory(dir=partial.parent) as folder:
         work = str(Path(folder) / path.name)  # open3d writes the name into OBJ files
         if path.suffix == ".glb":
@@ -126,16 +107,13 @@ def export_mesh(
     return path
 
 
-def export_run(
-    run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply", mesh_style: str = "blocky"
-) -> list[Path]:
+def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply") -> list[Path]:
     """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, as laid out above.
 
     Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
-    imported. `mesh_format` is "ply", "obj" or "glb"; `mesh_style` as for `hypothesis_mesh`.
+    imported. `mesh_format` is "ply", "obj" or "glb".
     """
     check_choice("mesh_format", mesh_format, MESH_FORMATS)
-    check_choice("mesh_style", mesh_style, MESH_STYLES)
     import_open3d()  # a missing library is reported before anything is written
     run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     identities = assign_identities(run)
@@ -151,7 +129,7 @@ def export_run(
             write_image(image, project(hypothesis, camera))
             paths.append(image)
             if hypothesis.objects:
-                paths.append(export_mesh(hypothesis, image.with_suffix(f".{mesh_format}"), colours, mesh_style))
+                paths.append(export_mesh(hypothesis, image.with_suffix(f".{mesh_format}"), colours))
             for record in hypothesis.objects:
                 rows.append(
                     {

@@ -10,8 +10,8 @@ The first six colours of the palette were chosen by hand. Each further one is th
 earlier ones. The distance is the smallest Oklab distance in three views: normal vision, protanopia and deuteranopia
 (Machado, Oliveira, Fernandes 2009, severity 1).
 
-Voxels are rendered by ray casting. The first face that a ray meets gives the normal. Blurred occupancy gives soft
-shadows in corners and on the table. Lines are drawn where objects or faces meet.
+Voxels are rendered by ray casting. The brightness of a face depends on its normal. Lines are drawn where objects or
+faces meet.
 """
 
 from __future__ import annotations
@@ -193,27 +193,21 @@ def voxel_picture(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Ma
     rays = camera.rays() @ camera.pose.rotation.as_matrix().T
     depth = np.where(hit, seen.depth, 0.0)
     points = camera.position + rays * depth[..., None]
-    shade = _Shade(labels, grid)
     colour = np.zeros((*hit.shape, 3))
     alpha = np.zeros(hit.shape)
 
     if hit.any():
         p, r = points[hit], rays[hit]
         normal = _normals(p, r, grid)
-        n = np.zeros_like(p)
-        n[np.arange(len(p)), np.abs(normal) - 1] = np.sign(normal)
-        diffuse = 0.5 + 0.5 * (n @ light)
-        open_sky = 1.0 - 0.62 * shade.at(p + n * 1.6 * grid.voxel_size)
-        value = (0.50 + 0.58 * diffuse) * open_sky
-        base = _label_colours(seen.labels[hit], colours)
-        bright = np.clip(value, 0, 1.12)[:, None]
-        colour[hit] = np.where(bright <= 1, base * bright, base + (255 - base) * (bright - 1))
+        axis = np.abs(normal) - 1
+        diffuse = 0.5 + 0.5 * np.sign(normal) * light[axis]
+        colour[hit] = _label_colours(seen.labels[hit], colours) * (0.43 + 0.57 * diffuse)[:, None]
         alpha[hit] = 1.0
         side = np.zeros(hit.shape, np.int64)
-        side[hit] = normal + 8 * np.floor(np.abs(p[np.arange(len(p)), np.abs(normal) - 1]) / grid.voxel_size + 0.5)
+        side[hit] = normal + 8 * np.floor(np.abs(p[np.arange(len(p)), axis]) / grid.voxel_size + 0.5)
         crease, border = _lines(seen.labels, side, hit)
         colour *= np.where(border, 0.42, np.where(crease, 0.86, 1.0))[..., None]
-    return _over(_reduced(colour, alpha, _RAYS), _table(view, grid, shade))
+    return _over(_reduced(colour, alpha, _RAYS), memo("report_table", (view.key,), lambda: _table(view)))
 
 
 def _view_axes(camera: Camera) -> np.ndarray:
@@ -232,37 +226,6 @@ def _normals(points: np.ndarray, rays: np.ndarray, grid: VoxelGrid) -> np.ndarra
     return np.where(rays[np.arange(len(rays)), axis] > 0, -1, 1) * (axis + 1)
 
 
-class _Shade:
-    """Blurred occupancy, for shadows."""
-
-    def __init__(self, labels: np.ndarray, grid: VoxelGrid) -> None:
-        from scipy.ndimage import gaussian_filter
-
-        self._pad = 12
-        self._grid = grid
-        solid = np.pad((labels > 0).astype(np.float32), self._pad)
-        self._near = gaussian_filter(solid, 1.8, truncate=3)
-        # Shadows on the table come from the first layers above it.
-        floor = self._pad + int(np.clip(round(-grid.origin[2] / grid.voxel_size), 0, labels.shape[2] - 1))
-        far = gaussian_filter(solid[:, :, floor : floor + 8].max(axis=2), 4.0, truncate=3)
-        self._ground = 0.35 * far + 0.65 * self._near[:, :, floor]
-
-    def at(self, points: np.ndarray) -> np.ndarray:
-        """Occupancy (n,) in [0, 1] around points (n, 3) in metres."""
-        from scipy.ndimage import map_coordinates
-
-        u = (points - self._grid.origin) / self._grid.voxel_size - 0.5 + self._pad
-        return map_coordinates(self._near, u.T, order=1, mode="nearest")
-
-    def on_table(self, points: np.ndarray) -> np.ndarray:
-        """Shadow (H, W) in [0, 1] at points (H, W, 2) of the table in metres."""
-        import cv2
-
-        u = ((points - self._grid.origin[:2]) / self._grid.voxel_size - 0.5 + self._pad).astype(np.float32)
-        ground = np.ascontiguousarray(self._ground, np.float32)
-        return cv2.remap(ground, u[..., 1], u[..., 0], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-
-
 def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels where the face changes within an object, and pixels where the object changes."""
     crease, border = np.zeros(hit.shape, bool), np.zeros(hit.shape, bool)
@@ -278,29 +241,21 @@ def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.nd
     return crease & ~border, border
 
 
-def _table(view: Camera, grid: VoxelGrid, shade: _Shade) -> np.ndarray:
-    """The plane z = 0 as (H, W, 4) float: soft shadows, a line every 10 cm, transparent at the border."""
-
-    def bare() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rays = view.rays() @ view.pose.rotation.as_matrix().T
-        below = rays[..., 2] < -1e-6
-        along = np.where(below, -view.position[2] / np.where(below, rays[..., 2], -1), 0)
-        xy = (view.position + rays * along[..., None])[..., :2]
-        # Lines are a pixel wide, with soft borders of half a pixel.
-        pixel = along / view.K[0, 0]
-        to_line = np.abs(xy / 0.1 - np.rint(xy / 0.1)).min(axis=-1) * 0.1
-        line = np.clip(1.2 - to_line / np.maximum(pixel, 1e-9), 0, 1)
-        y, x = np.mgrid[-1 : 1 : view.height * 1j, -1 : 1 : view.width * 1j]
-        fade = np.clip((1.0 - np.hypot(x, y)) / 0.25, 0, 1)
-        return xy, line, np.where(below, fade * fade * (3 - 2 * fade), 0)
-
-    xy, line, fade = memo("report_table", (view.key,), bare)
-    shadow = 0.85 * np.clip(shade.on_table(xy) * 1.35, 0, 1)
-    wash = 0.13 + 0.16 * line
-    # A black shadow over a grey wash, both translucent: for light and dark pages.
-    alpha = shadow + wash * (1 - shadow)
-    grey = _TABLE_GREY * (wash * (1 - shadow) / alpha)
-    return np.concatenate([np.repeat(grey[..., None], 3, axis=-1), 255 * (alpha * fade)[..., None]], axis=-1)
+def _table(view: Camera) -> np.ndarray:
+    """The plane z = 0 as (H, W, 4) float: translucent grey, a line every 10 cm, transparent at the border."""
+    rays = view.rays() @ view.pose.rotation.as_matrix().T
+    below = rays[..., 2] < -1e-6
+    along = np.where(below, -view.position[2] / np.where(below, rays[..., 2], -1), 0)
+    xy = (view.position + rays * along[..., None])[..., :2]
+    # Lines are a pixel wide, with soft borders of half a pixel.
+    pixel = along / view.K[0, 0]
+    to_line = np.abs(xy / 0.1 - np.rint(xy / 0.1)).min(axis=-1) * 0.1
+    line = np.clip(1.2 - to_line / np.maximum(pixel, 1e-9), 0, 1)
+    y, x = np.mgrid[-1 : 1 : view.height * 1j, -1 : 1 : view.width * 1j]
+    fade = np.clip((1.0 - np.hypot(x, y)) / 0.25, 0, 1)
+    table = np.full((*fade.shape, 4), _TABLE_GREY)
+    table[..., 3] = 255 * (0.13 + 0.16 * line) * np.where(below, fade * fade * (3 - 2 * fade), 0)
+    return table
 
 
 def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from typing import Any
 
 
 @contextlib.contextmanager
-def _bars(description: str, remaining: bool = False) -> Iterator[Any]:
-    """Bars with a description and the elapsed time, and the remaining time if asked for."""
+def _bars() -> Iterator[Any]:
+    """Bars with a description, the counts, and the elapsed and remaining time."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -26,8 +26,8 @@ def _bars(description: str, remaining: bool = False) -> Iterator[Any]:
         TimeRemainingColumn,
     )
 
-    columns = [TextColumn(description), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-    bars = Progress(*columns, *([TimeRemainingColumn()] if remaining else []), console=Console(stderr=True))
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    bars = Progress(TextColumn("{task.description:<12}"), *columns, console=Console(stderr=True))
     try:
         yield bars
     finally:
@@ -37,7 +37,7 @@ def _bars(description: str, remaining: bool = False) -> Iterator[Any]:
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
     """A progress bar; yields ``advance(done, total)``, where `total` is None if it is not known."""
-    with _bars("{task.description:<12}") as bars:
+    with _bars() as bars:
         task = bars.add_task(what, total=None)
 
         def advance(done: int, total: int | None) -> None:
@@ -49,27 +49,20 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Bars of a study: one for all jobs and one for every running job; yields the function for its events."""
-    overall: dict[str, Any] = {}
-    running: dict[str, Any] = {}
-    with _bars("{task.description}", remaining=True) as bars:
+    """Bars of the parts of a study; yields the function for its events. Failures are printed above the bars."""
+    tasks: dict[str, Any] = {}
+    with _bars() as bars:
 
         def update(p: Any) -> None:
             bars.start()
-            if p.what not in overall:
-                overall[p.what] = bars.add_task(p.what, total=p.total)
+            if p.what not in tasks:
+                tasks[p.what] = bars.add_task(p.what, total=p.total)
             failed = f", {p.failed} failed" if p.failed else ""
-            bars.update(overall[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
+            bars.update(tasks[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
             if p.event is None:
                 return
-            if p.event.kind == "started":
-                running[p.name] = bars.add_task(f"  {p.name}", total=None)
-            elif p.event.kind == "step" and p.name in running:
-                bars.update(running[p.name], completed=p.event.done, total=p.event.total)
-            elif p.event.kind in ("ended", "lost") and p.name in running:
-                bars.remove_task(running.pop(p.name))
             if p.event.kind == "lost":
-                bars.console.print(f"a worker died in {p.name}")
+                bars.console.print(f"a worker died in {p.name}", markup=False)
             elif p.event.outcome is not None and p.event.outcome.status != "done":
                 bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
 

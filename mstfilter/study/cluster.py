@@ -136,13 +136,11 @@ class _ClusterRun:
         elif "outcome" in message:
             outcome = message["outcome"]
             self._end(k, JobOutcome(**{**outcome, "hints": tuple(outcome["hints"])}))
-        elif "started" in message:
+        else:
             if k not in self._tries:
                 self._tell(Event("started", k))
             self._tries[k] = self._tries.get(k, 0) + 1
             self._running[k] = (message["started"], time.monotonic())
-        else:
-            self._tell(Event("step", k, message["done"], message["total"]))
 
     def _end_without_outcome(self, k: int, future: Any) -> None:
         """End or repeat a job whose task is done and which has sent no outcome."""
@@ -235,7 +233,7 @@ def _worker_version() -> str:
 
 
 def _perform(job: Job, k: int, topic: str) -> None:
-    """In a worker: do a job and log its steps and its outcome as events of the scheduler."""
+    """In a worker: do a job and log its start and its outcome as events of the scheduler."""
     import cv2
     from distributed import get_worker
 
@@ -246,5 +244,4 @@ def _perform(job: Job, k: int, topic: str) -> None:
 
     cv2.setNumThreads(1)
     send(started=worker.contact_address)
-    outcome = perform(job, lambda done, total: send(done=done, total=total))
-    send(outcome=asdict(outcome))
+    send(outcome=asdict(perform(job)))

@@ -15,18 +15,18 @@ import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from mstfilter.errors import check_integer
+from mstfilter.fields import Bounded, NonNegativeInt
 from mstfilter.processes import available_cores, environment
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
-_POLL_S = 0.01
+_POLL_S = 0.1  # of a worker's order to stop
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
     "1",
@@ -37,19 +37,17 @@ _ONE_THREAD = dict.fromkeys(
 class Event:
     """Something that happened to a job."""
 
-    #: {"started", "step", "lost", "ended"}: "lost": its worker died or the time limit was exceeded; it is started
+    #: {"started", "lost", "ended"}: "lost": its worker died or the time limit was exceeded; it is started
     #: again if tries are left.
     kind: str
     job: int  #: its index in the list of jobs
-    done: int = 0  #: steps of the job, if known
-    total: int = 0
     outcome: JobOutcome | None = None  #: of a job that has ended
 
 
 Tell = Callable[[Event], None]
 
 
-class Executor(ABC):
+class Executor(Bounded, ABC):
     """Runs jobs."""
 
     @abstractmethod
@@ -77,11 +75,8 @@ class Local(Executor):
         Folder for the output of the workers. Default: their output is discarded.
     """
 
-    workers: int = 0
+    workers: NonNegativeInt = 0
     logs: Path | None = None
-
-    def __post_init__(self) -> None:
-        check_integer("workers", self.workers, at_least=0)
 
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         if not jobs:
@@ -151,7 +146,6 @@ class _Worker(threading.Thread):
         self._number, self._queue, self._events = number, jobs_left, events
         self._log = None if logs is None else logs / f"worker-{number}.log"
         self._pool: Any = None
-        self._steps: Connection | None = None
 
     def run(self) -> None:
         try:
@@ -177,7 +171,7 @@ class _Worker(threading.Thread):
         for attempt in range(1, tries + 1):
             self._events.put(Event("started", k))
             try:
-                outcome = self._try(k, job)
+                outcome = self._try(job)
             except TimeoutError:
                 reason = f", the last time because it took longer than {job['timeout_s']:g} s"
             except ProcessExpired as error:
@@ -193,21 +187,16 @@ class _Worker(threading.Thread):
         hints = ("if memory ran out: use fewer workers or a smaller scene", *log_hint)
         return JobOutcome("failed", f"its worker died {times(tries)}{reason}", hints, tries=tries)
 
-    def _try(self, k: int, job: Job) -> JobOutcome | None:
+    def _try(self, job: Job) -> JobOutcome | None:
         """Run a job once; None if the worker is stopped.
 
         Raises TimeoutError, ProcessExpired or BrokenProcessPool if the process took too long or died.
         """
         if self._pool is None:
             self._open_pool()
-        assert self._steps is not None
-        future = self._pool.schedule(_perform, args=(dict(job),), timeout=job.get("timeout_s") or None)
+        future = self._pool.schedule(perform, args=(dict(job),), timeout=job.get("timeout_s") or None)
         while not self.stopped.is_set():
-            ended = future.done()
-            while self._steps.poll(0 if ended else _POLL_S):
-                done, total = self._steps.recv()
-                self._events.put(Event("step", k, done, total))
-            if ended:
+            if wait([future], _POLL_S).done:
                 outcome: JobOutcome = future.result()
                 return outcome
         return None
@@ -216,17 +205,14 @@ class _Worker(threading.Thread):
         from pebble import ProcessPool
 
         context = multiprocessing.get_context("spawn")
-        self._steps, worker_end = context.Pipe(duplex=False)
-        arguments = (worker_end, None if self._log is None else str(self._log))
-        self._pool = ProcessPool(1, initializer=_initialise, initargs=arguments, context=context)
+        log = os.devnull if self._log is None else str(self._log)
+        self._pool = ProcessPool(1, initializer=_initialise, initargs=(log,), context=context)
 
     def _close_pool(self) -> None:
         if self._pool is not None:
             self._pool.stop()
             self._pool.join()
-        if self._steps is not None:
-            self._steps.close()
-        self._pool = self._steps = None
+        self._pool = None
 
 
 def times(n: int) -> str:
@@ -236,16 +222,12 @@ def times(n: int) -> str:
 
 # In the worker process:
 
-_step_pipe: Connection | None = None
 
-
-def _initialise(steps: Connection, log: str | None) -> None:
+def _initialise(log: str) -> None:
     """Prepare a worker process: output goes to the log, one thread, exit when the study ends."""
-    global _step_pipe
     import cv2
 
-    _step_pipe = steps
-    target = os.open(log or os.devnull, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    target = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     sys.stdout.flush()
     os.dup2(target, 1)
     os.dup2(target, 2)
@@ -260,9 +242,3 @@ def _exit_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _perform(job: Job) -> JobOutcome:
-    assert _step_pipe is not None
-    send = _step_pipe.send
-    return perform(job, lambda done, total: send((done, total)))

@@ -1,6 +1,6 @@
 """The jobs of a study: simulate a recording, or run a filter on one.
 
->>> perform({"kind": "run", "name": "mst on demo-0", ...}, step=lambda done, total: None)
+>>> perform({"kind": "run", "name": "mst on demo-0", ...})
 JobOutcome(status='done')
 
 A job is a mapping of plain values, so that a process on another machine can do it. A run is written under a temporary
@@ -16,7 +16,7 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,20 +31,17 @@ from mstfilter.scene import Recording, scene_cache
 from mstfilter.scoring import measure_pause
 from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
-_StepCallback = Callable[[int, int], None]
 
-
-def perform(job: Job, step: _StepCallback = lambda done, total: None) -> JobOutcome:
+def perform(job: Job) -> JobOutcome:
     """Do a job; an error in it becomes its outcome.
 
-    ``job["kind"]`` is "record" or "run"; the other keys are those that `mstfilter.study.study` makes. `step` is
-    called with the number of steps done and of all steps.
+    ``job["kind"]`` is "record" or "run"; the other keys are those that `mstfilter.study.study` makes.
     """
     try:
         if job["kind"] == "record":
             open_scene(job["source"], job["recordings"])
         else:
-            _run(job, step)
+            _run(job)
     except (Exception, SystemExit) as error:
         return _failure(error)
     return JobOutcome("done")
@@ -84,7 +81,7 @@ def _check_code(expected: str) -> None:
             getattr(package, name)
 
 
-def _run(job: Job, step: _StepCallback) -> None:
+def _run(job: Job) -> None:
     _check_code(job["code"])
     folder = Path(job["folder"])
     costs: list[dict[str, float]] = []
@@ -97,7 +94,6 @@ def _run(job: Job, step: _StepCallback) -> None:
             costs.append({"seconds": p.seconds, "core_seconds": spent, "peak_mb": peak_megabytes()})
         reset_peak()
         began = time.process_time()
-        step(p.done, p.total)
 
     recording = open_scene(job["source"], job["recordings"])
     with atomic_folder(folder, "replace") as work:

@@ -93,7 +93,7 @@ def run_study(
     recalibration = _read_recalibration(plan)
     cache = (cache or cache_folder()).absolute()
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
-        _prepare(plan, folder, cache, {**_description(plan), "recalibration": recalibration})
+        _prepare(folder, cache, {**_description(plan), "recalibration": recalibration})
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
         call = _Call(plan, folder, cache, executor, report, allow_files)
         failed = call.record_scenes(waiting)
@@ -105,8 +105,8 @@ def run_study(
     return StudyResult(folder, n - len(failed), n - len(waiting), tuple(failed.items()))
 
 
-def _prepare(plan: Plan, folder: StudyFolder, cache: Path, description: dict[str, Any]) -> None:
-    """Check the folders and write study.json; done runs are renamed to their present names."""
+def _prepare(folder: StudyFolder, cache: Path, description: dict[str, Any]) -> None:
+    """Check the folders and write study.json."""
     for target in (folder.path, cache):
         _check_free_space(target)
     for part in ("recordings", "work"):
@@ -115,7 +115,6 @@ def _prepare(plan: Plan, folder: StudyFolder, cache: Path, description: dict[str
         write_json(folder.path / "study.json", description)
         for part in ("runs", "logs"):
             (folder.path / part).mkdir(exist_ok=True)
-    _rename_done_runs(plan, folder)
 
 
 @dataclass(frozen=True)
@@ -284,16 +283,6 @@ def _description(plan: Plan) -> dict[str, Any]:
             for run in plan.runs
         ],
     }
-
-
-def _rename_done_runs(plan: Plan, folder: StudyFolder) -> None:
-    """Rename the folders of runs that are done and whose arm or scene has a new name."""
-    named = {run.identity: folder.run(run.folder) for run in plan.runs}
-    for path in (folder.path / "runs").glob("*"):
-        result = read_result(path)
-        target = named.get(result.get("identity", ""))
-        if target is not None and target != path and result.get("status") == "done" and not target.exists():
-            path.rename(target)
 
 
 def _is_done(run: StudyRun, folder: StudyFolder) -> bool:

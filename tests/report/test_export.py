@@ -35,12 +35,6 @@ def two_boxes():
     return Hypothesis.from_labels(labels, VoxelGrid((0, 0, 0), 0.01, labels.shape))
 
 
-def ball(radius=6):
-    index = np.indices((16, 16, 16)) - 7.5
-    labels = ((index**2).sum(axis=0) <= radius**2).astype(np.uint16)
-    return Hypothesis.from_labels(labels, VoxelGrid((-0.1, 0.2, 0.0), 0.01, labels.shape))
-
-
 def signed_volume(vertices, triangles):
     """Volume inside a closed mesh, positive if its triangles are counter-clockwise seen from outside."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
@@ -76,7 +70,7 @@ def test_voxel_faces_are_closed_turned_outwards_and_hold_the_volume(seed, size):
 
 
 @pytest.mark.parametrize("ending", MESH_FORMATS)
-def test_blocky_meshes_read_back_are_watertight_and_hold_the_volume_of_the_voxels(o3d, tmp_path, ending):
+def test_meshes_read_back_are_watertight_and_hold_the_volume_of_the_voxels(o3d, tmp_path, ending):
     path = export_mesh(two_boxes(), tmp_path / f"a.{ending}")
     assert list(tmp_path.iterdir()) == [path]
     objects = objects_of(o3d, path)
@@ -96,21 +90,6 @@ def test_blocky_meshes_read_back_are_watertight_and_hold_the_volume_of_the_voxel
 def test_the_same_hypothesis_gives_the_same_file(o3d, tmp_path, ending):
     first = export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes()
     assert export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes() == first
-
-
-def test_a_smooth_ball_is_rounder_than_a_blocky_one(o3d, tmp_path):
-    deviation = {}
-    for style in ("blocky", "smooth"):
-        path = export_mesh(ball(), tmp_path / f"{style}.ply", style=style)
-        (mesh,) = objects_of(o3d, path).values()
-        assert mesh.is_watertight()
-        centre = np.array([-0.1, 0.2, 0.0]) + 8 * 0.01
-        radius = np.linalg.norm(np.asarray(mesh.vertices) - centre, axis=1)
-        assert radius.mean() == pytest.approx(0.06, rel=0.06)
-        assert mesh.get_volume() == pytest.approx((ball().labels > 0).sum() * 0.01**3, rel=0.1)
-        assert signed_volume(np.asarray(mesh.vertices), np.asarray(mesh.triangles)) > 0
-        deviation[style] = radius.std()
-    assert deviation["smooth"] < 0.6 * deviation["blocky"]
 
 
 def test_export_of_a_run(o3d, tmp_path):
@@ -144,15 +123,12 @@ def test_errors(o3d, tmp_path):
         export_run(tmp_path / "run", tmp_path / "file")
     with pytest.raises(InputError, match="mesh_format is 'stl'"):
         export_run(tmp_path / "run", tmp_path / "out", mesh_format="stl")
-    with pytest.raises(InputError, match="mesh_style is 'round'"):
-        export_run(tmp_path / "run", tmp_path / "out", mesh_style="round")
     assert not (tmp_path / "out").exists()
 
 
 def test_command(o3d, tmp_path, capsys):
     run = make_run(tmp_path / "run", pauses=1)
-    options = ("--export", tmp_path / "out", "--mesh-format", "glb", "--mesh-style", "smooth")
-    code, out, _ = call("report", run.path, *options, capsys=capsys)
+    code, out, _ = call("report", run.path, "--export", tmp_path / "out", "--mesh-format", "glb", capsys=capsys)
     assert code == 0 and str(tmp_path / "out") in out
     assert len(list((tmp_path / "out").rglob("*.glb"))) == 3
 

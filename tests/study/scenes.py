@@ -36,6 +36,6 @@ class InProcess(Executor):
         outcomes = []
         for k, job in enumerate(jobs):
             tell(Event("started", k))
-            outcomes.append(perform(job, lambda done, total, k=k: tell(Event("step", k, done, total))))
+            outcomes.append(perform(job))
             tell(Event("ended", k, outcome=outcomes[-1]))
         return outcomes

@@ -124,9 +124,10 @@ def test_recordings_of_one_name_in_two_groups(tmp_path):
 def test_a_larger_study_runs_new_runs_only(folder, tmp_path):
     study = load_study(folder / "base.toml", smoke=True)
     assert run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache").done == 4
-    more = run_study(study, tmp_path / "out", InProcess(), ["n=5,4"], cache=tmp_path / "cache")
-    assert (more.done, more.repeated) == (8, 4)  # n = 5 is the default, so these runs are done already
-    assert len({r["arm"] for r in table(tmp_path / "out" / "runs.csv")}) == 4
+    larger = study.model_copy(update={"seeds": (*study.seeds, 7)})
+    more = run_study(larger, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
+    assert (more.done, more.repeated) == (8, 4)
+    assert {r["seed"] for r in table(tmp_path / "out" / "runs.csv")} == {str(seed) for seed in larger.seeds}
 
 
 def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
