@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mstfilter.tracking import rigid
+from mstfilter.tracking import rigid, rules
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rules import IDENTITY, AuthorsRule, Candidate, MstRule, PaperRule
 from mstfilter.tracking.segments import Track, segments_of
@@ -104,12 +104,15 @@ def test_sampling_follows_the_scores():
     assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
 
 
-def test_candidates_with_large_shift_or_rotation_are_rejected(printed_box):
+def test_candidates_with_large_shift_or_rotation_are_rejected(printed_box, monkeypatch):
     scene, clip = printed_box
     rng = np.random.default_rng(0)
     centre = track_of(scene, clip).points.mean(axis=0)
-    assert len(MstRule(max_shift=0.005).candidates(rng, track_of(scene, clip))) < 3
-    for c in MstRule(max_shift=0.02, max_angle=0.05).candidates(rng, track_of(scene, clip)):
+    monkeypatch.setattr(rules, "_MAX_SHIFT", 0.005)
+    assert len(MstRule().candidates(rng, track_of(scene, clip))) < 3
+    monkeypatch.setattr(rules, "_MAX_SHIFT", 0.02)
+    monkeypatch.setattr(rules, "_MAX_ANGLE", 0.05)
+    for c in MstRule().candidates(rng, track_of(scene, clip)):
         assert rigid.displacement(c.T.as_matrix(), centre) <= 0.02 and rigid.angle(c.T.as_matrix()) <= 0.05
 
 
