@@ -182,6 +182,10 @@ class PaperRule(MotionRule):
         return candidates[0]
 
 
+# `AuthorsRule` uses a drawn cluster of n matches with probability clip(slope n + offset, lowest, highest).
+_SLOPE, _OFFSET, _LOWEST, _HIGHEST = 0.1, -0.25, 0.1, 0.9
+_MAX_MEAN_SQUARE = 0.002  # square metres, of an accepted ICP: 4.5 cm rms
+
 #: All pairs within the radii of the authors' program: descriptor distance 200, 1000 pixels, 1 m.
 _ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0)
 
@@ -190,21 +194,15 @@ _ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10
 class AuthorsRule(MotionRule):
     """The rule of the authors' program: a random choice of SIFT and ICP.
 
+    A drawn cluster of n matches is used with probability clip(0.1 n - 0.25, 0.1, 0.9). ICP is accepted up to a mean
+    squared distance of 0.002 m^2 (4.5 cm rms).
+
     Parameters
     ----------
-    slope, offset, lowest, highest : float
-        A drawn cluster of n matches is used with probability clip(slope n + offset, lowest, highest).
-    max_mean_square : float
-        Square metres; ICP is accepted up to this mean squared distance (0.002 is 4.5 cm rms).
     registration : Registration
         Performs the ICP, from the identity.
     """
 
-    slope: float = 0.1
-    offset: float = -0.25
-    lowest: float = 0.1
-    highest: float = 0.9
-    max_mean_square: float = 0.002
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 20))
     sift: SiftMatching = _ALL_PAIRS
 
@@ -212,7 +210,7 @@ class AuthorsRule(MotionRule):
         clusters = _sift_motions(rng, track, self.sift, True, 3, 1000)
         candidates = [Candidate("sift", rigid_transform(m.T), len(m.inliers)) for m in clusters]
         fit = _registered(track, False, 10.0, self.registration)  # the authors' program has no limit of distance
-        if fit is not None and fit.score**2 <= self.max_mean_square:
+        if fit is not None and fit.score**2 <= _MAX_MEAN_SQUARE:
             candidates.append(fit)
         return (*candidates, IDENTITY)
 
@@ -221,7 +219,7 @@ class AuthorsRule(MotionRule):
         if sift:
             sizes = np.array([c.support for c in sift], dtype=np.float64)
             drawn = sift[rng.choice(len(sift), p=sizes / sizes.sum())]
-            use = np.clip(self.slope * drawn.support + self.offset, self.lowest, self.highest)
+            use = np.clip(_SLOPE * drawn.support + _OFFSET, _LOWEST, _HIGHEST)
             if rng.random() < use:
                 return drawn
         return next(c for c in candidates if c.kind != "sift")

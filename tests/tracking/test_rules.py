@@ -54,10 +54,11 @@ def test_authors_rule_uses_clusters_with_the_stated_probability():
 
 
 def test_authors_rule_draws_clusters_by_size():
-    a, b = Candidate("sift", IDENTITY.T, 30), Candidate("sift", IDENTITY.T, 10)
-    rng = np.random.default_rng(1)
-    drawn = [AuthorsRule(lowest=1.0, highest=1.0).choose(rng, (a, b, IDENTITY)) for _ in range(4000)]
-    assert abs(sum(c is a for c in drawn) - 3000) < 4.4 * np.sqrt(4000 * 0.75 * 0.25)
+    """A cluster of 36 among 48 is drawn with probability .75 and used with .9. False alarm below 1.1e-5."""
+    a, b = Candidate("sift", IDENTITY.T, 36), Candidate("sift", IDENTITY.T, 12)
+    rng, n, p = np.random.default_rng(1), 4000, 0.75 * 0.9
+    drawn = sum(AuthorsRule().choose(rng, (a, b, IDENTITY)) is a for _ in range(n))
+    assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
 
 
 def test_authors_rule_falls_back_to_icp_then_identity():
