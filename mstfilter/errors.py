@@ -116,8 +116,8 @@ def check_integer(name: str, value: Any, *hints: str, at_least: int = 1, at_most
     """Raise InputError unless `value` is an integer with ``at_least <= value <= at_most``."""
     if isinstance(value, Integral) and not isinstance(value, bool) and at_least <= int(value) <= at_most:
         return
-    above = f" and at most {at_most}" if at_most < math.inf else ""
-    raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}{above}", *hints)
+    limit = f" and of at most {at_most}" if at_most < math.inf else ""
+    raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}{limit}", *hints)
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
