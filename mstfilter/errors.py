@@ -112,11 +112,12 @@ def check_number(
     raise InputError(f"{name} is {value!r}, expected a finite {unit} {expected}".rstrip(), *hints)
 
 
-def check_integer(name: str, value: Any, *hints: str, at_least: int = 1) -> None:
-    """Raise InputError unless `value` is an integer of at least `at_least`."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
+def check_integer(name: str, value: Any, *hints: str, at_least: int = 1, at_most: float = math.inf) -> None:
+    """Raise InputError unless `value` is an integer with ``at_least <= value <= at_most``."""
+    if isinstance(value, Integral) and not isinstance(value, bool) and at_least <= int(value) <= at_most:
         return
-    raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}", *hints)
+    limit = f" and of at most {at_most}" if at_most < math.inf else ""
+    raise InputError(f"{name} is {value!r}, expected an integer of at least {at_least}{limit}", *hints)
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:

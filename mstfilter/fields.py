@@ -33,7 +33,7 @@ from mstfilter.errors import check_choice, check_component, check_integer, check
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a number, for ``Annotated[float, Bounds(...)]``, or ``Annotated[int, Bounds(at_least=...)]``."""
+    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. An int has `at_least` and `at_most` only."""
 
     above: float = -math.inf
     at_least: float = -math.inf
@@ -106,6 +106,7 @@ def _check_of(annotation: Any) -> _Check | None:
 def _check_of_number(kind: type, bounds: Bounds) -> _Check:
     hints = [bounds.hint] if bounds.hint else []
     if kind is int:
-        return lambda name, value: check_integer(name, value, *hints, at_least=int(bounds.at_least))
+        least, most = int(bounds.at_least), bounds.at_most
+        return lambda name, value: check_integer(name, value, *hints, at_least=least, at_most=most)
     limits = {name: getattr(bounds, name) for name in ("above", "at_least", "at_most", "below", "unit")}
     return lambda name, value: check_number(name, value, *hints, **limits)

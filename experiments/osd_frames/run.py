@@ -46,6 +46,7 @@ from mstfilter.segmentation import (
     UcmTree,
     optimal_cut,
 )
+from mstfilter.segmentation.tree import merge_tree, prune
 from mstfilter.statistics import compare
 
 HERE = Path(__file__).resolve().parent
@@ -165,7 +166,7 @@ def load(number: int, border: str) -> Case:
     learned, seen = dict(trees), dict(trees)
     for weight in COLOUR_WEIGHTS:
         boundary = ColourDepthBoundary(colour_weight=weight).boundary(frame)
-        tree = UcmTree(calibrate=False).build(boundary)
+        tree = tree_of_heights(boundary)
         trees[weight] = (tree, RULE.segments(tree, frame))
         leaves = _Given(tree)
         tree = LearnedTree(leaves).build(boundary, frame)
@@ -174,6 +175,12 @@ def load(number: int, border: str) -> Case:
         seen[weight] = (tree, RULE.segments(tree, frame))
     truth = np.where(label >= 2, label - 1, 0)
     return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees, learned, seen)
+
+
+def tree_of_heights(boundary: np.ndarray) -> Tree:
+    """The tree of `UcmTree` whose `start` is the merge height, for `calibrated`."""
+    parent, height, leaves = prune(*merge_tree(boundary), UcmTree().max_leaves)
+    return Tree(parent, leaves, height)  # the height of leaves is 0
 
 
 def calibrated(tree: Tree, centre: float, slope: float) -> Tree:

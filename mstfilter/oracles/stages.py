@@ -40,7 +40,7 @@ class TrueMotions(UsesTruth, Transition):
     true objects moves as the one that it shares more voxels with.
     """
 
-    warp: Warp = field(default_factory=lambda: Warp("smooth"))
+    warp: Warp = field(default_factory=Warp)
 
     properly_weighted: ClassVar[bool] = False
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "poses")
@@ -79,21 +79,17 @@ class TrueMotions(UsesTruth, Transition):
 
 @dataclass(frozen=True)
 class TrueFreeSpace(UsesTruth, Projection):
-    """Clears voxels that are truly free; with `hidden`, also those that the camera does not see."""
-
-    hidden: bool = False
+    """Clears voxels that are truly free and that the camera sees."""
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> tuple[Hypothesis, float]:
         """The hypothesis without these voxels, and the fraction of occupied voxels that it keeps."""
         labels = self.truth.labels(self.truth.pause_of(frame))
         free = labels == 0
-        if not self.hidden:
-            geometry = frame_geometry(frame, hypothesis.grid)
-            depth = render(labels, hypothesis.grid, frame.camera).depth
-            surface = np.where(np.isnan(depth), np.inf, depth).ravel()[np.maximum(geometry.pixel, 0)]
-            free = free & (geometry.pixel >= 0) & (geometry.z < surface)
+        geometry = frame_geometry(frame, hypothesis.grid)
+        depth = render(labels, hypothesis.grid, frame.camera).depth
+        surface = np.where(np.isnan(depth), np.inf, depth).ravel()[np.maximum(geometry.pixel, 0)]
         occupied = hypothesis.labels != 0
-        hit = occupied & free
+        hit = occupied & free & (geometry.pixel >= 0) & (geometry.z < surface)
         if not hit.any():
             return hypothesis, 1.0
         kept = hypothesis.with_labels(np.where(hit, 0, hypothesis.labels).astype(np.uint16))

@@ -209,14 +209,11 @@ class UcmTree(TreeBuilder):
         Merge height (mean boundary strength 0 .. 1) at which P(boundary) = 0.5.
     slope : float
         Slope of the log odds, per unit of height.
-    calibrate : bool
-        If False, `start` is the merge height.
     """
 
     max_leaves: PositiveInt = 501
     centre: float = 0.55
     slope: float = 12.0
-    calibrate: bool = True
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
         boundary = np.asarray(boundary)
@@ -228,8 +225,7 @@ class UcmTree(TreeBuilder):
         parent, altitude, leaves = prune(parent, altitude, leaves, self.max_leaves)
         n_leaves = int(leaves.max()) + 1
         start = np.zeros(len(parent))
-        heights = altitude[n_leaves:]
-        start[n_leaves:] = self.probability(heights) if self.calibrate else heights
+        start[n_leaves:] = self.probability(altitude[n_leaves:])
         return Tree(parent, leaves, start)
 
     def probability(self, height: np.ndarray) -> np.ndarray:

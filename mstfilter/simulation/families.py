@@ -13,10 +13,12 @@ contacts. `catalogue` separates scenes for tuning from scenes for reporting; in 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice, suggestion
+from mstfilter.errors import InputError, check_integer, suggestion
+from mstfilter.fields import Bounded, Bounds, NonNegativeInt, PositiveInt, Share
 from mstfilter.scene import Camera, VoxelGrid, look_at
 from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, Pool
 
@@ -29,32 +31,16 @@ FIRST_REPORTED_SEED = 1000  #: With the catalogue "by seed", seeds from this one
 
 _POOLS = {"tuning": TUNING, "reported": REPORTED, "any": ANY}
 
-_LIMITS: dict[str, tuple[float, float]] = {
-    "n_objects_min": (1, np.inf),
-    "contact": (0.0, 1.0),
-    "n_actions": (0, np.inf),
-    "frames_per_clip": (2, np.inf),
-    "fps": (0.5, 60.0),
-    "push_speed": (0.01, 0.5),
-    "min_moved": (1, np.inf),
-    "move_threshold": (0.0001, 0.5),
-    "n_candidates": (1, np.inf),
-    "width": (16, 4096),
-    "height": (16, 4096),
-    "camera_distance": (0.5, 2.0),
-    "workspace_x": (0.1, 2.0),
-    "workspace_y": (0.1, 2.0),
-    "workspace_z": (0.1, 2.0),
-    "voxel_size": (0.001, 0.1),
-}
+_ImageSize = Annotated[int, Bounds(at_least=16, at_most=4096)]
+_Edge = Annotated[float, Bounds(at_least=0.1, at_most=2.0)]
 
 
 @dataclass(frozen=True)
-class SceneFamily:
+class SceneFamily(Bounded):
     """How scenes are drawn, moved and imaged."""
 
     name: str = "table"  #: name of the family
-    n_objects_min: int = 5  #: range of the number of objects on the table, twins included; uniform
+    n_objects_min: PositiveInt = 5  #: range of the number of objects on the table, twins included; uniform
     n_objects_max: int = 6  #: see `n_objects_min`
     n_twins: int = 1  #: objects that repeat the shape and texture of another object and touch it
     n_stacked: int = 0  #: objects that are put on top of another object, if there is room
@@ -62,39 +48,35 @@ class SceneFamily:
     #: objects is hidden at the first pause.
     n_hidden: int = 0
     #: Probability that an object without a twin touches another one; otherwise the gap is 1 - 4 cm.
-    contact: float = 0.6
+    contact: Share = 0.6
     shapes: str = "all"  #: families of objects, separated by commas; "all" for every family
-    #: {"tuning", "reported", "any", "by seed"}: pool of sizes and textures: one of two disjoint pools, or all. "by
-    #: seed": the tuning pool for seeds below 1000, the reported pool from 1000 on.
-    catalogue: str = "any"
-    n_actions: int = 3  #: number of pushes
-    frames_per_clip: int = 15  #: frames from one pause to the next, both included
-    fps: float = 5.0  #: frames per second
-    push_speed: float = 0.10  #: speed of the finger, m/s
-    min_moved: int = 2  #: objects that an action should move; fewer if no candidate push moves as many
-    move_threshold: float = 0.02  #: displacement from which an object counts as moved, metres
-    n_candidates: int = 24  #: a push is chosen from at most 4 `n_candidates` simulated ones
+    #: Pool of sizes and textures: one of two disjoint pools, or all. "by seed": the tuning pool for seeds below 1000,
+    #: the reported pool from 1000 on.
+    catalogue: Literal["tuning", "reported", "any", "by seed"] = "any"
+    n_actions: NonNegativeInt = 3  #: number of pushes
+    frames_per_clip: Annotated[int, Bounds(at_least=2)] = 15  #: frames from one pause to the next, both included
+    fps: Annotated[float, Bounds(at_least=0.5, at_most=60.0)] = 5.0  #: frames per second
+    push_speed: Annotated[float, Bounds(at_least=0.01, at_most=0.5)] = 0.10  #: speed of the finger, m/s
+    min_moved: PositiveInt = 2  #: objects that an action should move; fewer if no candidate push moves as many
+    #: Displacement from which an object counts as moved, metres.
+    move_threshold: Annotated[float, Bounds(at_least=0.0001, at_most=0.5)] = 0.02
+    n_candidates: PositiveInt = 24  #: a push is chosen from at most 4 `n_candidates` simulated ones
     arm: bool = True  #: whether the finger has a visible arm
     #: Size of the images, pixels. The camera is a Kinect's (focal length 525 pixels at 640 x 480), scaled.
-    width: int = 640
-    height: int = 480
+    width: _ImageSize = 640
+    height: _ImageSize = 480
     supersample: bool = True  #: smooth the edges of objects with three rays per pixel
-    camera_distance: float = 0.8  #: from the camera to the middle of the table, metres
-    workspace_x: float = 1.0  #: edges of the voxel grid, metres, which is centred on the table and stands on it
-    workspace_y: float = 1.0
-    workspace_z: float = 0.5
-    voxel_size: float = 0.01  #: edge of a voxel, metres
+    #: From the camera to the middle of the table, metres.
+    camera_distance: Annotated[float, Bounds(at_least=0.5, at_most=2.0)] = 0.8
+    workspace_x: _Edge = 1.0  #: edges of the voxel grid, metres, which is centred on the table and stands on it
+    workspace_y: _Edge = 1.0
+    workspace_z: _Edge = 0.5
+    voxel_size: Annotated[float, Bounds(at_least=0.001, at_most=0.1)] = 0.01  #: edge of a voxel, metres
 
     def __post_init__(self) -> None:
-        limits = dict(_LIMITS)
-        limits["n_objects_max"] = (self.n_objects_min, 40)
-        limits |= dict.fromkeys(("n_twins", "n_stacked", "n_hidden"), (0, self.n_objects_min - 1))
-        for field, (low, high) in limits.items():
-            value = getattr(self, field)
-            if not low <= value <= high:
-                expected = f"at least {low}" if high == np.inf else f"{low} .. {high}"
-                raise InputError(f"scene family {self.name!r}: {field} is {value!r}, expected {expected}")
-        check_choice(f"scene family {self.name!r}: catalogue", self.catalogue, (*_POOLS, "by seed"))
+        check_integer("n_objects_max", self.n_objects_max, at_least=self.n_objects_min, at_most=40)
+        for field in ("n_twins", "n_stacked", "n_hidden"):
+            check_integer(field, getattr(self, field), at_least=0, at_most=self.n_objects_min - 1)
         self.shape_families()
         if self.n_actions and self.action_seconds < 1.0:
             raise InputError(

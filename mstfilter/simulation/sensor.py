@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.errors import check_number
+from mstfilter.fields import Bounded, NonNegativeFloat, Share
 
 _FOCAL, _BASELINE = 525.0, 0.075  # pixels of the sensor's raster of 640 pixels per row, metres
 _EIGHTHS = 8.0 * _FOCAL * _BASELINE  # disparity at one metre, eighths of a pixel
@@ -40,7 +40,7 @@ NEIGHBOURS = ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1]))
 
 
 @dataclass(frozen=True)
-class DepthSensor:
+class DepthSensor(Bounded):
     """Depth noise of a Kinect v1 or Xtion.
 
     Parameters
@@ -54,12 +54,9 @@ class DepthSensor:
         Shadows of the projector up to this width are filled by the sensor, pixels of its raster.
     """
 
-    lateral: float = 0.5
-    edge_dropout: float = 0.12
-    fill: float = 2.5
-
-    def __post_init__(self) -> None:
-        check_number("edge_dropout", self.edge_dropout, at_least=0, at_most=1, unit="probability")
+    lateral: NonNegativeFloat = 0.5
+    edge_dropout: Share = 0.12
+    fill: NonNegativeFloat = 2.5
 
     @property
     def axial_sigma(self) -> float:

@@ -20,14 +20,15 @@ import numpy as np
 from mstfilter.fields import Bounded, PositiveFloat
 from mstfilter.scene import Frame, depth_sigma, memo
 
+_DEPTH_SIGMAS = 4.0  # limit of the difference of two readings, in its standard deviations
 _N_EXPOSURE_PIXELS = 20000
 _MAX_PAIRS = 20000  # matches with the smallest descriptor distances are kept
 _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the gain stays near 1
 
 
-def same_depth(first: Frame, other: Frame, sigmas: float = 4.0) -> np.ndarray:
+def same_depth(first: Frame, other: Frame) -> np.ndarray:
     """Pixels (H, W) where both frames have a reading off the robot that agrees up to the sensor noise."""
-    limit = sigmas * np.sqrt(2.0) * depth_sigma(first.depth)
+    limit = _DEPTH_SIGMAS * np.sqrt(2.0) * depth_sigma(first.depth)
     with np.errstate(invalid="ignore"):
         return (np.abs(other.depth - first.depth) <= limit) & first.valid & other.valid
 

@@ -30,7 +30,7 @@ from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_rigid, check_type, describe_value, returns, warn_once
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
-from mstfilter.tracking.registration import Registration, RegistrationResult, SmallGicp, centroid_shift
+from mstfilter.tracking.registration import Registration, SmallGicp, centroid_shift
 from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, refine_motion
 from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
@@ -40,6 +40,7 @@ _MIN_OVERLAP = 0.3  # fraction of the moved surface that has a correspondence af
 _MIN_PAIRS = 6  # flow tracks or SIFT matches of a motion
 _MAX_SIFT = 3  # SIFT motions of a segment
 _REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
+_MAX_SHIFT, _MAX_ANGLE = 0.6, 2.6  # metres at the segment's centre, radians
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 
 
@@ -52,11 +53,10 @@ class Candidate:
     support: int = 0  #: number of matches or points that determine it
     #: Criterion of the rule, lower is better: S of `MotionResidual`, or a root mean square residual in metres.
     score: float = 0.0
-    registration: RegistrationResult | None = None  #: result of the registration that computed it, if any
 
 
-#: Kind, motion (4, 4), support and registration of a motion that is not scored yet.
-_Estimate = tuple[str, np.ndarray, int, RegistrationResult | None]
+#: Kind, motion (4, 4) and support of a motion that is not scored yet.
+_Estimate = tuple[str, np.ndarray, int]
 
 #: Rest, the motion of objects that are not tracked.
 IDENTITY = Candidate("identity", RigidTransform.identity())
@@ -147,7 +147,7 @@ def _registered(track: Track, from_centroid: bool, reach: float, registration: R
     fit = registration.register(source, target, init, reach)
     if fit is None:
         return None
-    return Candidate("icp", rigid_transform(fit.T), len(track.points), fit.rms, fit)
+    return Candidate("icp", rigid_transform(fit.T), len(track.points), fit.rms)
 
 
 @dataclass(frozen=True)
@@ -182,6 +182,10 @@ class PaperRule(MotionRule):
         return candidates[0]
 
 
+# `AuthorsRule` uses a drawn cluster of n matches with probability clip(slope n + offset, lowest, highest).
+_SLOPE, _OFFSET, _LOWEST, _HIGHEST = 0.1, -0.25, 0.1, 0.9
+_MAX_MEAN_SQUARE = 0.002  # square metres, of an accepted ICP: 4.5 cm rms
+
 #: All pairs within the radii of the authors' program: descriptor distance 200, 1000 pixels, 1 m.
 _ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10.0, search_distance=1.0)
 
@@ -190,21 +194,15 @@ _ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10
 class AuthorsRule(MotionRule):
     """The rule of the authors' program: a random choice of SIFT and ICP.
 
+    A drawn cluster of n matches is used with probability clip(0.1 n - 0.25, 0.1, 0.9). ICP is accepted up to a mean
+    squared distance of 0.002 m^2 (4.5 cm rms).
+
     Parameters
     ----------
-    slope, offset, lowest, highest : float
-        A drawn cluster of n matches is used with probability clip(slope n + offset, lowest, highest).
-    max_mean_square : float
-        Square metres; ICP is accepted up to this mean squared distance (0.002 is 4.5 cm rms).
     registration : Registration
         Performs the ICP, from the identity.
     """
 
-    slope: float = 0.1
-    offset: float = -0.25
-    lowest: float = 0.1
-    highest: float = 0.9
-    max_mean_square: float = 0.002
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 20))
     sift: SiftMatching = _ALL_PAIRS
 
@@ -212,7 +210,7 @@ class AuthorsRule(MotionRule):
         clusters = _sift_motions(rng, track, self.sift, True, 3, 1000)
         candidates = [Candidate("sift", rigid_transform(m.T), len(m.inliers)) for m in clusters]
         fit = _registered(track, False, 10.0, self.registration)  # the authors' program has no limit of distance
-        if fit is not None and fit.score**2 <= self.max_mean_square:
+        if fit is not None and fit.score**2 <= _MAX_MEAN_SQUARE:
             candidates.append(fit)
         return (*candidates, IDENTITY)
 
@@ -221,7 +219,7 @@ class AuthorsRule(MotionRule):
         if sift:
             sizes = np.array([c.support for c in sift], dtype=np.float64)
             drawn = sift[rng.choice(len(sift), p=sizes / sizes.sum())]
-            use = np.clip(self.slope * drawn.support + self.offset, self.lowest, self.highest)
+            use = np.clip(_SLOPE * drawn.support + _OFFSET, _LOWEST, _HIGHEST)
             if rng.random() < use:
                 return drawn
         return next(c for c in candidates if c.kind != "sift")
@@ -240,10 +238,6 @@ class MstRule(MotionRule):
         pixels are correlated, so it is much smaller than the number of pixels.
     use_flow, use_icp, use_sift : bool
         Estimators that are used.
-    max_shift : float
-        Largest displacement of the segment's centre, metres.
-    max_angle : float
-        Largest rotation angle, radians.
     n_refine : int
         Number of best candidates that are refined against the whole last frame and added as further candidates.
     search_above : float
@@ -259,8 +253,6 @@ class MstRule(MotionRule):
     use_flow: bool = True
     use_icp: bool = True
     use_sift: bool = True
-    max_shift: float = 0.6
-    max_angle: float = 2.6
     n_refine: int = 3
     search_above: float = 4.0
     max_score: float = OUTSIDE_COST
@@ -276,13 +268,13 @@ class MstRule(MotionRule):
         centre = track.points.mean(axis=0)
         distinct: list[np.ndarray] = []
         moving: list[Candidate] = []
-        for kind, T, support, registration in self._estimates(rng, track):
-            if self._admissible(T, centre) and not any(_nearly_equal(T, other, centre) for other in distinct):
+        for kind, T, support in self._estimates(rng, track):
+            if _admissible(T, centre) and not any(_nearly_equal(T, other, centre) for other in distinct):
                 distinct.append(T)
-                moving.append(self._scored(track, kind, T, support, registration))
+                moving.append(self._scored(track, kind, T, support))
         for best in sorted(moving, key=lambda c: c.score)[: self.n_refine]:
             T = refine_motion(track, best.T.as_matrix())
-            if self._admissible(T, centre):
+            if _admissible(T, centre):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
             moving.extend(self._search(track, centre))
@@ -305,11 +297,11 @@ class MstRule(MotionRule):
             fit = rigid.ransac(rng, p, q, 0.008) if len(p) >= _MIN_PAIRS else None
             if fit is not None and len(fit.inliers) >= _MIN_PAIRS:
                 T = rigid.refine_robust(fit.T, p, q, 0.004)
-                yield "flow", T, len(fit.inliers), None
+                yield "flow", T, len(fit.inliers)
                 starts.append(("icp", T, len(fit.inliers), 0.020))
         if self.use_sift:
             for m in _sift_motions(rng, track, self.sift, False, _MIN_PAIRS, 500)[:_MAX_SIFT]:
-                yield "sift", m.T, len(m.inliers), None
+                yield "sift", m.T, len(m.inliers)
                 starts.append(("sift", m.T, len(m.inliers), 0.015))
         source, target = track.surface, track.target_surface
         if self.use_icp and source is not None and target is not None:
@@ -318,7 +310,7 @@ class MstRule(MotionRule):
             for kind, init, support, reach in starts:
                 result = self.registration.register(source, target, init, reach)
                 if result is not None and result.overlap >= _MIN_OVERLAP:
-                    yield kind, result.T, support, result
+                    yield kind, result.T, support
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
         """Search a grid of shifts on the table and three rotations; refine the two best shifts of each rotation."""
@@ -335,20 +327,19 @@ class MstRule(MotionRule):
             scores = self.residual.scores(track, motions, 150)
             for k in np.argsort(scores, kind="stable")[:2]:
                 T = refine_motion(track, motions[k])
-                if np.isfinite(scores[k]) and self._admissible(T, centre):
+                if np.isfinite(scores[k]) and _admissible(T, centre):
                     candidates.append(self._scored(track, "search", T))
         return candidates
 
-    def _scored(
-        self, track: Track, kind: str, T: np.ndarray, support: int = 0, result: RegistrationResult | None = None
-    ) -> Candidate:
-        return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T), result)
+    def _scored(self, track: Track, kind: str, T: np.ndarray, support: int = 0) -> Candidate:
+        return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T))
 
-    def _admissible(self, T: np.ndarray, centre: np.ndarray) -> bool:
-        """Whether a motion is finite and within the limits of displacement and angle."""
-        if not np.isfinite(T).all():
-            return False
-        return bool(rigid.displacement(T, centre) <= self.max_shift and rigid.angle(T) <= self.max_angle)
+
+def _admissible(T: np.ndarray, centre: np.ndarray) -> bool:
+    """Whether a motion is finite and within the limits of displacement and angle."""
+    if not np.isfinite(T).all():
+        return False
+    return bool(rigid.displacement(T, centre) <= _MAX_SHIFT and rigid.angle(T) <= _MAX_ANGLE)
 
 
 def _nearly_equal(a: np.ndarray, b: np.ndarray, centre: np.ndarray) -> bool:

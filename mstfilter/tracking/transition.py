@@ -291,7 +291,6 @@ class TrackingTransition(Transition):
         - ``motions``: number of objects per kind (static, identity, flow, icp, sift, search, invisible, unsupported,
           lost);
         - ``segments``: number of distinct segments;
-        - ``registrations``: of candidates of distinct segments (number, iterations, inliers, not converged);
         - ``voxels_left`` (the grid), ``voxels_contested`` and ``objects_dropped``.
 
         An object is *invisible* if it is hidden in the first frame, *unsupported* if the depth image disagrees with
@@ -319,7 +318,6 @@ class TrackingTransition(Transition):
         notes = {
             "motions": dict(sorted(counts.items())),
             "segments": len(cache),
-            "registrations": _registration_notes([c for _, found in cache.values() for c in found]),
             "voxels_left": sum(m.voxels_left for m in moved),
             "voxels_contested": sum(m.contested for m in moved),
             "objects_dropped": sum(len(m.dropped) for m in moved),
@@ -374,14 +372,3 @@ def _number(key: bytes) -> int:
 
 def _successor(population: Population, particles: tuple[Hypothesis, ...], notes: dict) -> Population:
     return Population(particles, population.log_weights, {"previous": np.arange(len(particles))}, notes)
-
-
-def _registration_notes(candidates: list[Candidate]) -> dict[str, int]:
-    """Statistics of the registrations of candidates."""
-    results = [c.registration for c in candidates if c.registration is not None]
-    return {
-        "number": len(results),
-        "iterations": sum(r.iterations or 0 for r in results),
-        "inliers": sum(r.inliers for r in results),
-        "not_converged": sum(r.converged is False for r in results),
-    }

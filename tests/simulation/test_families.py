@@ -41,13 +41,21 @@ def test_studied_families_differ_only_in_their_objects():
         ("width", 0),
         ("voxel_size", -0.01),
         ("workspace_z", 9.0),
-        ("shapes", "can, teapot"),
+        ("width", 4097),
         ("n_candidates", 0),
-        ("fps", 30.0),
     ],
 )
-def test_bad_fields(field, value):
-    with pytest.raises(InputError):
+def test_fields_out_of_bounds(field, value):
+    with pytest.raises(InputError, match=f"{field} is {value!r}, expected"):
+        replace(SceneFamily(), **{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [("shapes", "can, teapot", "unknown family of shapes 'teapot'"), ("fps", 30.0, "too short to push anything")],
+)
+def test_unknown_shapes_and_short_actions(field, value, message):
+    with pytest.raises(InputError, match=message):
         replace(SceneFamily(), **{field: value})
 
 

@@ -213,7 +213,7 @@ def test_depth_is_lost_at_edges_at_grazing_angles_and_out_of_range():
     lost = np.isnan(reading)
     assert lost[:10].all() and lost[90:].all() and lost[20:80, 49:51].all()
     assert not lost[20:80, :48].any() and not lost[20:80, 52:].any()
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="edge_dropout is 1.5"):
         DepthSensor(edge_dropout=1.5)
 
 

@@ -1,12 +1,8 @@
 """Registration of clouds that move by a known motion."""
 
-import json
-
 import numpy as np
 import pytest
 
-from mstfilter import preset
-from mstfilter.smc import Population
 from mstfilter.tracking.registration import SmallGicp, centroid_shift, prepare
 from mstfilter.tracking.rigid import move_points
 from tests.tracking.scenes import at, errors
@@ -27,19 +23,11 @@ def test_a_small_motion_is_found(method):
     result = SmallGicp(method).register(source, target, np.eye(4), 0.03)
     mm, deg = errors(result.T, T, np.full(3, 0.03))
     assert mm < 0.8 and deg < 0.8
-    assert result.overlap > 0.95 and result.inliers > 0.9 * len(source.points)
-    assert result.converged and 0 <= result.iterations < 30
+    assert result.overlap > 0.95 and result.rms < 0.004
+    first = SmallGicp(method, iterations=1).register(source, target, np.eye(4), 0.03)
+    assert first.rms > result.rms, "one iteration is not enough"
     again = SmallGicp(method).register(source, target, np.eye(4), 0.03)
     np.testing.assert_array_equal(result.T, again.T)
-
-
-def test_the_notes_of_a_step_count_the_registrations(textured):
-    scene, clip = textured
-    component = preset("mst", "transition.rule.registration.method=PLANE_ICP").transition
-    moved = component.predict(np.random.default_rng(0), Population((scene.hypothesis(),), np.zeros(1)), clip)
-    notes = moved.notes["registrations"]
-    assert notes["iterations"] > notes["number"] > notes["not_converged"]
-    assert json.loads(json.dumps(notes)) == notes
 
 
 def test_registration_from_the_centroid_reaches_far_motions():

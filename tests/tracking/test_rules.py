@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mstfilter.tracking import rigid
+from mstfilter.tracking import rigid, rules
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rules import IDENTITY, AuthorsRule, Candidate, MstRule, PaperRule
 from mstfilter.tracking.segments import Track, segments_of
@@ -54,10 +54,11 @@ def test_authors_rule_uses_clusters_with_the_stated_probability():
 
 
 def test_authors_rule_draws_clusters_by_size():
-    a, b = Candidate("sift", IDENTITY.T, 30), Candidate("sift", IDENTITY.T, 10)
-    rng = np.random.default_rng(1)
-    drawn = [AuthorsRule(lowest=1.0, highest=1.0).choose(rng, (a, b, IDENTITY)) for _ in range(4000)]
-    assert abs(sum(c is a for c in drawn) - 3000) < 4.4 * np.sqrt(4000 * 0.75 * 0.25)
+    """A cluster of 36 among 48 is drawn with probability .75 and used with .9. False alarm below 1.1e-5."""
+    a, b = Candidate("sift", IDENTITY.T, 36), Candidate("sift", IDENTITY.T, 12)
+    rng, n, p = np.random.default_rng(1), 4000, 0.75 * 0.9
+    drawn = sum(AuthorsRule().choose(rng, (a, b, IDENTITY)) is a for _ in range(n))
+    assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
 
 
 def test_authors_rule_falls_back_to_icp_then_identity():
@@ -104,12 +105,15 @@ def test_sampling_follows_the_scores():
     assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
 
 
-def test_candidates_with_large_shift_or_rotation_are_rejected(printed_box):
+def test_candidates_with_large_shift_or_rotation_are_rejected(printed_box, monkeypatch):
     scene, clip = printed_box
     rng = np.random.default_rng(0)
     centre = track_of(scene, clip).points.mean(axis=0)
-    assert len(MstRule(max_shift=0.005).candidates(rng, track_of(scene, clip))) < 3
-    for c in MstRule(max_shift=0.02, max_angle=0.05).candidates(rng, track_of(scene, clip)):
+    monkeypatch.setattr(rules, "_MAX_SHIFT", 0.005)
+    assert len(MstRule().candidates(rng, track_of(scene, clip))) < 3
+    monkeypatch.setattr(rules, "_MAX_SHIFT", 0.02)
+    monkeypatch.setattr(rules, "_MAX_ANGLE", 0.05)
+    for c in MstRule().candidates(rng, track_of(scene, clip)):
         assert rigid.displacement(c.T.as_matrix(), centre) <= 0.02 and rigid.angle(c.T.as_matrix()) <= 0.05
 
 
