@@ -59,6 +59,12 @@ def of(interface, method):
     return make
 
 
+def add_methods(interface, method, **faults):
+    """Add components whose method is a function: ``name=(broken property, words, function)``."""
+    for name, (broken, words, function) in faults.items():
+        add_faults(broken, words, None, of(interface, method), **{name: function})
+
+
 def move(function):
     """A transition that replaces the particles by ``function(rng, x, y)``."""
 
@@ -702,73 +708,45 @@ def GlobalRejuvenation(rng, population, previous, observation):
 
 
 # --- triggers and sizes -------------------------------------------------------------------------------------------
-
-
-@faulty("ignores_scale_and_order", "adding", None, of(Trigger, "wants"))
-def AbsoluteWeight(population, t):
-    return population.log_weights.max() < 0
-
-
-@faulty("answers", "True or False", None, of(Trigger, "wants"))
-def MaybeTrigger(population, t):
-    return population.ess
-
-
-@faulty("answers", "at least 1", None, of(Size, "choose"))
-def HalfSize(population):
-    return len(population) // 2
+add_methods(
+    Trigger,
+    "wants",
+    AbsoluteWeight=("ignores_scale_and_order", "adding", lambda population, t: population.log_weights.max() < 0),
+    MaybeTrigger=("answers", "True or False", lambda population, t: population.ess),
+)
+add_methods(Size, "choose", HalfSize=("answers", "at least 1", lambda population: len(population) // 2))
 
 
 # --- similarities and equivalences --------------------------------------------------------------------------------
-
-
-@faulty("similarities_are_shares", "to itself", None, of(Similarity, "matrix"))
-def Distance(particles):
+def distances(particles):
     return np.abs(particles[:, None] - particles[None, :])
 
 
-@faulty("pairs_do_not_depend_on_others", "if only these are given", None, of(Similarity, "matrix"))
-def RelativeSimilarity(particles):
-    d = np.abs(particles[:, None] - particles[None, :])
-    return 1 - d / max(d.max(), 1e-12)
-
-
-@faulty("similarities_are_shares", "similarity of particles", None, of(Similarity, "matrix"))
-def OneSided(particles):
-    return np.tril(np.ones((len(particles), len(particles))))
-
-
-@faulty("classes_are_numbered", "classes are", None, of(Equivalence, "classes"))
-def CountsFromOne(particles):
-    return np.arange(1, len(particles) + 1)
-
-
-@faulty("pairs_do_not_depend_on_others", "if there are copies", None, of(Equivalence, "classes"))
-def AllDifferent(particles):
-    return np.arange(len(particles))
+_PAIRS = "pairs_do_not_depend_on_others"
+add_methods(
+    Similarity,
+    "matrix",
+    Distance=("similarities_are_shares", "to itself", distances),
+    RelativeSimilarity=(_PAIRS, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
+    OneSided=("similarities_are_shares", "similarity of particles", lambda x: np.tril(np.ones((len(x), len(x))))),
+)
+add_methods(
+    Equivalence,
+    "classes",
+    CountsFromOne=("classes_are_numbered", "classes are", lambda particles: np.arange(1, len(particles) + 1)),
+    AllDifferent=(_PAIRS, "if there are copies", lambda particles: np.arange(len(particles))),
+)
 
 
 # --- lookaheads ---------------------------------------------------------------------------------------------------
-
-
-@faulty("ignores_weights", "changes the priorities", None, of(Lookahead, "log_priority"))
-def LooksAtWeights(population, observation):
-    return population.log_weights + population.particles
-
-
-@faulty("scores_are_finite", "-inf", None, of(Lookahead, "log_priority"))
-def RulesOut(population, observation):
-    return np.where(population.particles > 1, -np.inf, 0.0)
-
-
-@faulty("scores_are_finite", "shape (1,)", None, of(Lookahead, "log_priority"))
-def OneForAll(population, observation):
-    return np.zeros(1)
-
-
-@faulty(_ORDER, "in another order", None, of(Lookahead, "log_priority"))
-def ByPlace(population, observation):
-    return 0.1 * np.arange(len(population))
+add_methods(
+    Lookahead,
+    "log_priority",
+    LooksAtWeights=("ignores_weights", "changes the priorities", lambda p, y: p.log_weights + p.particles),
+    RulesOut=("scores_are_finite", "-inf", lambda p, y: np.where(p.particles > 1, -np.inf, 0.0)),
+    OneForAll=("scores_are_finite", "shape (1,)", lambda p, y: np.zeros(1)),
+    ByPlace=(_ORDER, "in another order", lambda p, y: 0.1 * np.arange(len(p))),
+)
 
 
 @faulty("keeps_no_state", "keeps state")
@@ -841,26 +819,14 @@ class Keeps(Codec):
 
 # --- evidence -----------------------------------------------------------------------------------------------------
 _COPIES = "copies_score_the_same"
-
-
-@faulty("scores_are_finite", "-inf", None, of(Evidence, "log_score"))
-def RulesOutOdd(hypotheses, clip):
-    return np.where(np.arange(len(hypotheses)) % 2, -np.inf, 0.0)
-
-
-@faulty(_ORDER, "another order", None, of(Evidence, "log_score"))
-def FirstIsBest(hypotheses, clip):
-    return -np.arange(float(len(hypotheses)))
-
-
-@faulty("scores_are_finite", "shape (1,)", None, of(Evidence, "log_score"))
-def OneScore(hypotheses, clip):
-    return np.zeros(1)
-
-
-@faulty(_COPIES, "other numbers", None, of(Evidence, "log_score"))
-def HighNamesWin(hypotheses, clip):
-    return np.array([float(h.labels.max()) for h in hypotheses])
+add_methods(
+    Evidence,
+    "log_score",
+    RulesOutOdd=("scores_are_finite", "-inf", lambda h, clip: np.where(np.arange(len(h)) % 2, -np.inf, 0.0)),
+    FirstIsBest=(_ORDER, "another order", lambda h, clip: -np.arange(float(len(h)))),
+    OneScore=("scores_are_finite", "shape (1,)", lambda h, clip: np.zeros(1)),
+    HighNamesWin=(_COPIES, "other numbers", lambda h, clip: np.array([float(one.labels.max()) for one in h])),
+)
 
 
 @faulty(_COPIES, "its copy", None, of(Evidence, "log_score"))
