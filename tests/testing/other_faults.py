@@ -24,6 +24,7 @@ from mstfilter.smc import (
     Transition,
     Trigger,
     Update,
+    log_mean_exp,
     union,
 )
 from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
@@ -308,21 +309,20 @@ def shared_by_blocks(rng, x, y):
     return walk(x, np.repeat(rng.standard_normal(-(-len(x) // 8)), 8)[: len(x)])
 
 
-@faulty(_ORDER, "alone (n = 1)", None, move)
-def still_alone(rng, x, y):
-    return walk(x, rng.standard_normal(len(x)) if len(x) > 1 else 0.0)
+def step(rng, x, size=1.0):
+    """Moves by independent noise of a size."""
+    return walk(x, size * rng.standard_normal(len(x)))
 
 
-@faulty(_ORDER, "observation=None", None, move)
-def still_without_observation(rng, x, y):
-    return x if y is None else walk(x, rng.standard_normal(len(x)))
-
-
-@faulty(_MOVES, "and sd", exact_walk, move)
-def wide_step(rng, x, y):
-    return walk(x, 1.05 * rng.standard_normal(len(x)))
-
-
+add_faults(_ORDER, "alone (n = 1)", None, move, still_alone=lambda rng, x, y: step(rng, x, float(len(x) > 1)))
+add_faults(
+    _ORDER,
+    "observation=None",
+    None,
+    move,
+    still_without_observation=lambda rng, x, y: x if y is None else step(rng, x),
+)
+add_faults(_MOVES, "and sd", exact_walk, move, wide_step=lambda rng, x, y: step(rng, x, 1.05))
 add_faults(
     _MOVES,
     "is below",
@@ -330,22 +330,8 @@ add_faults(
     move,
     uniform_noise=lambda rng, x, y: walk(x, rng.uniform(-np.sqrt(3), np.sqrt(3), len(x))),
     cut_noise=lambda rng, x, y: walk(x, np.clip(rng.standard_normal(len(x)), -2.8, 2.8)),
-    small_drift=lambda rng, x, y: walk(x, rng.standard_normal(len(x))) + 0.02,
+    small_drift=lambda rng, x, y: step(rng, x) + 0.02,
 )
-
-
-@faulty(_ORDER, "moves differently", None, move)
-def last_is_still(rng, x, y):
-    noise = rng.standard_normal(len(x))
-    noise[-1] = 0.0 if len(x) > 1 else noise[-1]
-    return walk(x, noise)
-
-
-@faulty(_ORDER, "do not move independently", None, move)
-def depends_on_first(rng, x, y):
-    """The noise of the first particle is added to all."""
-    noise = rng.standard_normal(len(x))
-    return walk(x, np.where(np.arange(len(x)) > 0, np.sqrt(0.5) * (noise + noise[0]), noise))
 
 
 @faulty(_MOVES, "is below", exact_walk, move)
@@ -436,6 +422,8 @@ add_faults(
     flat_tails=lambda x, y: np.maximum(Normal(x, TAU).log_prob(y), -3.0),
     tempered=lambda x, y: 0.95 * Normal(x, TAU).log_prob(y),
     shifted=lambda x, y: Normal(x + 0.02, TAU).log_prob(y),
+    # Bounded at 3 nats below the best particle.
+    bounded_relative=lambda x, y: np.maximum(Normal(x, TAU).log_prob(y), Normal(x, TAU).log_prob(y).max() - 3),
     cauchy=lambda x, y: -np.log1p(((x - y) / TAU) ** 2) - np.log(np.pi * TAU),
 )
 
@@ -457,28 +445,19 @@ def without_constant(x, y):
     return -0.5 * ((x - y) / TAU) ** 2
 
 
-@faulty(_OTHERS, "not normalised or ranked", None, likelihood)
-def divided_by_mean(x, y):
-    log_g = Normal(x, TAU).log_prob(y)
-    return log_g - np.log(np.mean(np.exp(log_g)))
+def log_g(x, y):
+    return Normal(x, TAU).log_prob(y)
 
 
-@faulty(_OTHERS, "not normalised or ranked", None, likelihood)
-def divided_by_largest(x, y):
-    log_g = Normal(x, TAU).log_prob(y)
-    return log_g - log_g.max()
-
-
-@faulty(_OTHERS, "not normalised or ranked", None, likelihood)
-def ranks(x, y):
-    return np.log1p(np.argsort(np.argsort(Normal(x, TAU).log_prob(y))))
-
-
-@faulty(_POSTERIOR, "is below", exact_posterior, likelihood)
-def bounded_relative(x, y):
-    """Bounded at 3 nats below the best particle."""
-    log_g = Normal(x, TAU).log_prob(y)
-    return np.maximum(log_g, log_g.max() - 3)
+add_faults(
+    _OTHERS,
+    "not normalised or ranked",
+    None,
+    likelihood,
+    divided_by_mean=lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y)),
+    divided_by_largest=lambda x, y: log_g(x, y) - log_g(x, y).max(),
+    ranks=lambda x, y: np.log1p(np.argsort(np.argsort(log_g(x, y)))),
+)
 
 
 def changed(function):
@@ -667,18 +646,6 @@ add_faults(
 def pairs_of_steps(rng, x, previous, y):
     step = np.repeat(rng.standard_normal(-(-len(x) // 2)), 2)[: len(x)]
     return np.asarray(optimal(previous, y).mean) + float(np.asarray(optimal(0.0, y).sd)) * step
-
-
-@faulty(_KEPT, "no longer exact", None, kernel)
-def greedy(rng, x, previous, y):
-    new = x + 0.2 * rng.standard_normal(len(x))
-    return np.where(np.abs(new - y) < np.abs(x - y), new, x)
-
-
-@faulty(_KEPT, "exact draws are no longer exact", None, kernel)
-def MovesAll(rng, x, previous, y):
-    """Accepts every step."""
-    return x + 0.5 * rng.standard_normal(len(x))
 
 
 @faulty(_KEPT, "x_t - x_{t-1}", None, kernel)
