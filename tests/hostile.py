@@ -25,6 +25,23 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.completion import NetworkCompleter
+from mstfilter.errors import InputError
+from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.frontends import read_masks, write_masks
+from mstfilter.frontends.completions import place_shape, read_shapes
+from mstfilter.presets import build_filter, load_config
+from mstfilter.reading import read_bytes
+from mstfilter.report import run_page, write_report, write_study_report
+from mstfilter.runs import RunFolder
+from mstfilter.scene import DiskCache, write_image
+from mstfilter.scoring import NO_COUNTS, read_truth
+from mstfilter.smc import Key, Population, State, load_state, save_state
+from mstfilter.study import StudyFolder, check_arm_names, load_study
+from mstfilter.trained import open_model, write_model
+from tests.formats import bags, layouts
+from tests.report.runs import make_run
+from tests.report.test_study_report import make_study
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
@@ -37,8 +54,6 @@ class Kind:
 
 
 def _write_recording(path: Path) -> None:
-    from mstfilter.formats import RecordingWriter
-
     rng = np.random.default_rng(0)
     with RecordingWriter(path, CAMERA, GRID, name="boxes") as writer:
         for index, shift in enumerate((0, 1, 2)):
@@ -51,8 +66,6 @@ def _write_recording(path: Path) -> None:
 
 def _reader(name: str, *options: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
-        from mstfilter.formats import open_recording
-
         recording = open_recording(path, name, options)
         recording.check()
         _ = recording.truth_key
@@ -61,14 +74,10 @@ def _reader(name: str, *options: str) -> Callable[[Path], None]:
 
 
 def _layout(name: str) -> Callable[[Path], Any]:
-    from tests.formats import layouts
-
     return partial(getattr(layouts, f"write_{name}"), shifts=(0, 0, 3, 3))
 
 
 def _bag(kind: str) -> Callable[[Path], Any]:
-    from tests.formats import bags
-
     return lambda path: bags.write(path / "it", kind, bags.scene_messages(kind == "bag", shifts=(0, 0, 3, 3)))
 
 
@@ -78,8 +87,6 @@ def _read_bag(path: Path) -> None:
 
 
 def _write_pairs(path: Path) -> None:
-    from mstfilter.scene import write_image
-
     path.mkdir()
     (path / "info.json").write_text(json.dumps({"K": CAMERA.K.tolist(), "depth_scale_m": 0.001}), encoding="utf-8")
     for name, shift in (("a1", 0), ("a2", 2)):
@@ -90,20 +97,14 @@ def _write_pairs(path: Path) -> None:
 
 
 def _write_run(path: Path) -> None:
-    from tests.report.runs import make_run
-
     make_run(path, 2)
 
 
 def _read_run(path: Path) -> None:
-    from mstfilter.runs import RunFolder
-
     RunFolder.open(path).estimates()
 
 
 def _draw_run(path: Path) -> None:
-    from mstfilter.report import run_page, write_report
-
     write_report(path, path.parent / "report.html")
     run_page(path).save(path.parent / "page.html")
 
@@ -115,8 +116,6 @@ def _write_preset(path: Path) -> None:
 
 
 def _read_preset(path: Path) -> None:
-    from mstfilter.presets import build_filter, load_config
-
     build_filter(load_config(str(path / "mine.toml"), allow_files=False))
 
 
@@ -127,75 +126,38 @@ def _write_study(path: Path) -> None:
 
 
 def _read_study(path: Path) -> None:
-    from mstfilter.study import check_arm_names, load_study
-
     check_arm_names(load_study(path / "mine.toml"), allow_files=False)
 
 
 def _write_study_folder(path: Path) -> None:
-    from mstfilter.scoring import NO_COUNTS
-    from mstfilter.study.results import STUDY_FORMAT
-
-    arms = [{"name": name, "reported_only": False, "uses_truth": [], "config": {}} for name in ("a", "b")]
-    scenes = [{"name": f"s{k}", "group": "s", "source": {"family": "s", "seed": k, "set": {}}} for k in range(2)]
-    runs = [
-        {"name": f"{arm} {scene}", "folder": f"{arm}-{scene}", "identity": "x", "arm": arm, "scene": scene}
-        | {"group": "s", "seed": 0}
-        for arm in "ab"
-        for scene in ("s0", "s1")
-    ]
-    study = {"format": STUDY_FORMAT, "name": "mine", "description": "", "reference": "a", "arms": arms}
-    study |= {"scenes": scenes, "seeds": [0], "runs": runs, "recalibration": None}
-    path.mkdir()
-    (path / "study.json").write_text(json.dumps(study), encoding="utf-8")
-    for k, run in enumerate(runs):
-        folder = path / "runs" / str(run["folder"])
-        folder.mkdir(parents=True)
-        rows = [{"pause": t, "quality": 0.5 + 0.1 * k, "qualities": [0.5]} for t in range(3)]
-        result = {
-            "identity": "x",
-            "status": "done",
-            "rows": rows,
-            "costs": [{"seconds": 1.0, "core_seconds": 1.0, "peak_mb": 9.0}] * 3,
-        }
-        (folder / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    make_study(path, n_scenes=2, arms=("a", "b"), groups=("s",), fail=False)
+    for folder in (path / "runs").iterdir():
         np.savez_compressed(folder / "forecasts.npz", counts=np.zeros((3, 1, *NO_COUNTS.shape), np.int64))
 
 
 def _read_study_folder(path: Path) -> None:
-    from mstfilter.report import write_study_report
-    from mstfilter.study import StudyFolder
-
     StudyFolder.open(path).summary()
     write_study_report(path, path.parent / "study.html")
 
 
 @cache
 def _tensors() -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    from mstfilter.trained import open_model
-
     model = open_model("completion")
     return dict(model.description), dict(model.tensors)
 
 
 def _write_weights(path: Path) -> None:
-    from mstfilter.trained import write_model
-
     write_model(path, *_tensors())
 
 
 def _read_weights(path: Path) -> None:
-    from mstfilter.completion import NetworkCompleter
-    from mstfilter.completion.unet import load_network
+    from mstfilter.completion.unet import load_network  # imports torch
 
     load_network.cache_clear()
     _ = NetworkCompleter(weights=str(path)).network
 
 
 def _write_masks(path: Path) -> None:
-    from mstfilter.frontends import write_masks
-    from mstfilter.scene import write_image
-
     labels = np.zeros((60, 80), np.uint8)
     labels[10:20, 10:20], labels[30:40, 30:50] = 1, 2
     write_masks(path, 0, [labels, (labels > 0).astype(np.uint8)], weights=[0.7, 0.3])
@@ -206,9 +168,6 @@ def _write_masks(path: Path) -> None:
 
 
 def _read_masks(path: Path) -> None:
-    from mstfilter.errors import InputError
-    from mstfilter.frontends import read_masks
-
     errors = []
     for pause in range(3):
         try:
@@ -220,8 +179,6 @@ def _read_masks(path: Path) -> None:
 
 
 def _write_shapes(path: Path) -> None:
-    from mstfilter.scene import write_image
-
     folder = path / "000000" / "a"
     folder.mkdir(parents=True)
     write_image(folder / "mask.png", np.full((60, 80), 255, np.uint8))
@@ -231,9 +188,6 @@ def _write_shapes(path: Path) -> None:
 
 
 def _read_shapes(path: Path) -> None:
-    from mstfilter.frontends.completions import place_shape, read_shapes
-    from mstfilter.reading import read_bytes
-
     for shapes in read_shapes(path, 0, (60, 80)):
         for file in shapes.files:
             place_shape(file, read_bytes(file, "a shape"), np.eye(4), GRID)
@@ -248,27 +202,19 @@ def _write_volumes(path: Path) -> None:
 
 
 def _read_volumes(path: Path) -> None:
-    from mstfilter.scoring import read_truth
-
     read_truth(path / "voxels.npz")
 
 
 def _write_checkpoint(path: Path) -> None:
-    from mstfilter.smc import Key, Population, State, save_state
-
     path.mkdir()
     save_state(path / "state.npz", State(1, Population({"x": np.zeros((4, 2))}, np.zeros(4), {}), Key(0), True))
 
 
 def _read_checkpoint(path: Path) -> None:
-    from mstfilter.smc import load_state
-
     load_state(path / "state.npz")
 
 
 def _write_cache(path: Path) -> None:
-    from mstfilter.scene import DiskCache
-
     cache = DiskCache(path, 10**8, "1")
     cache.store("small", 1, np.zeros(10))
     cache.store("large", 2, np.zeros(10**5))
@@ -276,8 +222,6 @@ def _write_cache(path: Path) -> None:
 
 
 def _read_cache(path: Path) -> None:
-    from mstfilter.scene import DiskCache
-
     cache = DiskCache(path, 10**8, "1")
     for name, key in (("small", 1), ("large", 2)):
         cache.find(name, key, np.ndarray)
@@ -318,9 +262,8 @@ _VALUES: tuple[Any, ...] = (
 
 def spoil(rng: np.random.Generator, path: Path) -> str:
     """Make one change to the files below a folder; returns what was done, for messages."""
-    files = sorted(
-        p for p in path.rglob("*") if p.is_file() and not p.is_symlink() and p.name != "SHA256SUMS" and _is_small(p)
-    )
+    files = sorted(p for p in path.rglob("*") if p.is_file() and not p.is_symlink() and p.name != "SHA256SUMS")
+    files = [p for p in files if p.stat().st_size < 2**28]
     if not files:
         return "nothing left"
     file = files[rng.integers(len(files))]
@@ -334,10 +277,6 @@ def spoil(rng: np.random.Generator, path: Path) -> str:
         way = _truncate
         way(rng, file, files)
     return f"{way.__name__[1:]} of {file.relative_to(path)}"
-
-
-def _is_small(file: Path) -> bool:
-    return file.stat().st_size < 2**28
 
 
 def _flip(rng: np.random.Generator, file: Path, files: list[Path]) -> None:
@@ -500,8 +439,6 @@ _WAYS: dict[_Way, tuple[str, ...]] = {
 
 def outcome(kind: Kind, path: Path) -> str:
     """``"read"`` if an input was read, ``"refused"`` if the error is one clear line; else the error."""
-    from mstfilter.errors import InputError
-
     try:
         kind.read(path)
     except InputError as error:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from mstfilter.errors import InputError
 from mstfilter.registry import load_file
@@ -19,6 +20,7 @@ from mstfilter.segmentation import OptimalCut, SceneCutObjectness, TreeCutPropos
 from tests.segmentation.scenes import TWO, clip_of, frame_of
 
 torch = pytest.importorskip("torch")
+functional = pytest.importorskip("torch.nn.functional")
 
 cob, caffe, network_file = (
     load_file(models_folder() / "published" / name) for name in ("cob.py", "caffe.py", "cob_network.py")
@@ -87,37 +89,19 @@ def model(blobs, tmp_path_factory):
 
 
 def conv(x: np.ndarray, layer: list[np.ndarray], stride: int = 1) -> np.ndarray:
-    """Convolution (C, H, W) by the definition of Caffe, with a padding that keeps the size at stride 1."""
-    w = layer[0].astype(np.float64)
-    k = w.shape[-1]
-    padded = np.pad(x, ((0, 0), (k // 2, k // 2), (k // 2, k // 2)))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (k, k), axis=(1, 2))[:, ::stride, ::stride]
-    out = np.einsum("chwij,ocij->ohw", windows, w, optimize=True)
-    return out if len(layer) == 1 else out + layer[1][:, None, None]
+    """Convolution (C, H, W) in double precision, with a padding that keeps the size at stride 1."""
+    weights, bias = (*(torch.from_numpy(np.asarray(blob, np.float64)) for blob in layer), None)[:2]
+    padding = weights.shape[-1] // 2
+    return functional.conv2d(torch.from_numpy(x), weights, bias, stride, padding).numpy()
 
 
 def deconv(x: np.ndarray, stride: int, size: tuple[int, int]) -> np.ndarray:
-    """Bilinear deconvolution pixel by pixel; the crop is aligned by the centres of the receptive fields."""
+    """Bilinear enlargement of a level that is 0 outside; it is aligned by the centres of the receptive fields."""
     if stride == 1:
         return x
-    k = 2 * stride
-    one = [1 - abs(i - (k - 1) / 2) / stride for i in range(k)]
-    full = np.zeros((len(x), (x.shape[1] - 1) * stride + k, (x.shape[2] - 1) * stride + k))
-    for i in range(x.shape[1]):
-        for j in range(x.shape[2]):
-            full[:, i * stride : i * stride + k, j * stride : j * stride + k] += (
-                np.outer(one, one) * x[:, i, j, None, None]
-            )
-    # The pooling takes pixels 2 i and 2 i + 1, later steps take pixel 2 i: pixel y of a level lies at x = s y + 0.5
-    # of the image, and at s y + (k - 1) / 2 = x + s - 1 of the enlargement.
-    return full[:, stride - 1 :, stride - 1 :][:, : size[0], : size[1]]
-
-
-def pool(x: np.ndarray) -> np.ndarray:
-    h, w = (x.shape[1] + 1) // 2, (x.shape[2] + 1) // 2
-    padded = np.full((len(x), 2 * h, 2 * w), -np.inf)
-    padded[:, : x.shape[1], : x.shape[2]] = x
-    return padded.reshape(len(x), h, 2, w, 2).max(axis=(2, 4))
+    # The pooling takes pixels 2 i and 2 i + 1, later steps take pixel 2 i: pixel i of a level lies at s i + 0.5.
+    at = np.meshgrid(*((np.arange(n) - 0.5) / stride for n in size), indexing="ij")
+    return np.stack([ndimage.map_coordinates(one, at, order=1, mode="grid-constant") for one in x])
 
 
 def reference(layers: dict[str, list[np.ndarray]], x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -126,7 +110,7 @@ def reference(layers: dict[str, list[np.ndarray]], x: np.ndarray) -> tuple[np.nd
     relu = lambda y: np.maximum(y, 0)  # noqa: E731
     x = relu(conv(x, layers["conv1" if "conv1" in layers else "conv1_rgbHHA"]))
     found = {"conv1": x}
-    x = pool(x)
+    x = functional.max_pool2d(torch.from_numpy(x), 2, ceil_mode=True).numpy()
     for stage, blocks in (("2", "abc"), ("3", "abcd"), ("4", "abcdef"), ("5", "abc")):
         for block in blocks:
             name = f"res{stage}{block}"
@@ -168,52 +152,31 @@ def test_the_network_equals_a_plain_reference(blobs, size):
         found = network.double()(data.double())
     expected = reference(blobs, expected_input.transpose(2, 0, 1))
     assert found.orientations.shape == (8, *size)
-    assert expected[2].std() > 0.01
-    assert expected[0].std() > 0.01
-    for one, other in zip(found, expected, strict=True):
+    assert min(expected[0].std(), expected[2].std()) > 0.01
+    for one, rounded, other in zip(found, single, expected, strict=True):
         np.testing.assert_allclose(one.numpy(), other, atol=1e-5)
-    for one, other in zip(single, expected, strict=True):
-        np.testing.assert_allclose(one.numpy(), other, atol=1e-4)  # rounding of 32 bits through 53 layers
+        np.testing.assert_allclose(rounded.numpy(), other, atol=1e-4)  # rounding of 32 bits through 53 layers
 
 
-@pytest.mark.parametrize("stride", [2, 4, 8, 16])
-def test_bilinear_deconvolution(stride):
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((4, 5, 6)).astype(np.float32)
-    size = torch.Size((4 * stride + 1, 5 * stride + stride // 2))
-    found = network_file.enlarge(torch.from_numpy(x)[None], stride, size)[0]
-    np.testing.assert_allclose(found.numpy(), deconv(x, stride, tuple(size)), atol=1e-5)
-    ramp = np.broadcast_to(np.arange(8.0, dtype=np.float32), (1, 1, 8, 8)).copy()
-    grown = network_file.enlarge(torch.from_numpy(ramp), stride, torch.Size((8 * stride, 8 * stride)))[0, 0].numpy()
-    middle = slice(stride, 7 * stride)  # a ramp stays a ramp: the enlargement is bilinear and not shifted
-    expected = (np.arange(8 * stride) - 0.5) / stride  # pixel i of a level lies at s i + 0.5
-    np.testing.assert_allclose(grown[middle, middle], np.broadcast_to(expected[middle], (6 * stride,) * 2), atol=1e-4)
-    assert network_file.bilinear_kernel(stride).sum() == pytest.approx(stride**2)
-
-
-def angle_of(confidence: list[float]) -> float:
+def angle_of(confidence: np.ndarray) -> float:
     """The published rule for one pixel: the two best bins, their mean if they are neighbours; or nan."""
-    order = sorted(range(8), key=lambda k: (-confidence[k], k))
-    best, second = order[:2]
+    best, second = np.argsort(-confidence, kind="stable")[:2]
     if confidence[best] < 0.5:
-        return float("nan")
-    a, b = best * np.pi / 8, second * np.pi / 8
-    if {best, second} == {0, 7}:
-        a, b = (np.pi if k == 0 else k * np.pi / 8 for k in (best, second))
-    neighbours = abs(best - second) == 1 or {best, second} == {0, 7}
-    if neighbours and confidence[second] >= 0.01:
-        return (confidence[best] * a + confidence[second] * b) / (confidence[best] + confidence[second])
-    return a if not neighbours else best * np.pi / 8
+        return np.nan
+    step = (second - best + 4) % 8 - 4  # bins 7 and 0 are neighbours
+    near = abs(step) == 1 and confidence[second] >= 0.01
+    share = confidence[second] / (confidence[best] + confidence[second]) if near else 0.0
+    return (best + share * step) * np.pi / 8
 
 
 def test_orientation_bins():
     rng = np.random.default_rng(0)
-    confidence = rng.random((8, 30, 40)) ** 4
+    confidence = rng.random((8, 30, 40)).astype(np.float32) ** 4
     confidence[:, 0, :5] = np.eye(8)[:, :5]
     confidence[[0, 7], 1, 1] = 0.9, 0.8
     confidence[[0, 7], 1, 2] = 0.7, 0.8
-    found = cob.decode_orientation(confidence.astype(np.float32))
-    expected = [[angle_of(confidence.astype(np.float32)[:, i, j].tolist()) for j in range(40)] for i in range(30)]
+    found = cob.decode_orientation(confidence)
+    expected = np.apply_along_axis(angle_of, 0, confidence)
     np.testing.assert_allclose(np.mod(found, np.pi), np.mod(expected, np.pi), atol=1e-5)
     assert 0.2 < np.isnan(found).mean() < 0.9
 
@@ -296,19 +259,15 @@ def test_the_oriented_watershed_keeps_borders_of_the_right_orientation():
 def test_the_combined_tree_has_the_regions_of_both_scales():
     """The circle is seen at both scales, the chord at the fine one only: it is merged first, at half its height."""
     circle, chord, angle = discs()
-    parent, height, leaves = cob.combine_scales(np.maximum(circle, chord), circle, angle, 0.05, 1.5)
+    _, height, leaves = cob.combine_scales(np.maximum(circle, chord), circle, angle, 0.05, 1.5)
     inner = height[height > 0]
     both = height.max()
     fine_only = inner[inner < 0.8 * both].max()
-    single, single_height, _ = cob.combine_scales(
-        np.maximum(circle, chord), np.maximum(circle, chord), angle, 0.05, 1.5
-    )
-    assert len(single) >= 5
+    _, single_height, _ = cob.combine_scales(np.maximum(circle, chord), np.maximum(circle, chord), angle, 0.05, 1.5)
     alone = single_height[(single_height > 0) & (single_height < 0.8 * single_height.max())].max()
     assert fine_only == pytest.approx(alone / 2, rel=0.1)
     centre, left, right = leaves[2, 2], leaves[32, 25], leaves[32, 38]
     assert len({int(k) for k in (centre, left, right)}) == 3
-    assert len(parent) > 4
 
 
 def test_polygons_of_a_chain():

@@ -23,6 +23,7 @@ from mstfilter.tracking import MaskTracker, PaperRule, StaticTest, TrackingTrans
 from tests.segmentation.scenes import GRID
 
 torch = pytest.importorskip("torch")
+functional = pytest.importorskip("torch.nn.functional")
 
 siammask, network_file = (
     load_file(models_folder() / "published" / name) for name in ("siammask.py", "siammask_network.py")
@@ -103,45 +104,29 @@ def test_outputs_have_the_published_sizes(tensors):
 def test_depthwise_correlation():
     rng = np.random.default_rng(0)
     x, kernel = rng.standard_normal((6, 9, 10)), rng.standard_normal((6, 3, 4))
-    expected = np.zeros((6, 7, 7))
-    for c in range(6):
-        for i in range(7):
-            for j in range(7):
-                expected[c, i, j] = (x[c, i : i + 3, j : j + 4] * kernel[c]).sum()
+    windows = np.lib.stride_tricks.sliding_window_view(x, (3, 4), axis=(1, 2))
     found = network_file.depthwise_correlation(torch.from_numpy(x)[None], torch.from_numpy(kernel)[None])
-    np.testing.assert_allclose(found[0].numpy(), expected, atol=1e-5)
+    np.testing.assert_allclose(found[0].numpy(), np.einsum("chwij,cij->chw", windows, kernel), atol=1e-5)
 
 
-def conv(x, w, b=None, stride=1, padding=0, dilation=1):
-    """Convolution (C, H, W) by its definition."""
-    k = (w.shape[-1] - 1) * dilation + 1
-    padded = np.pad(x, ((0, 0), (padding,) * 2, (padding,) * 2))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (k, k), axis=(1, 2))
-    windows = windows[:, ::stride, ::stride, ::dilation, ::dilation]
-    out = np.einsum("chwij,ocij->ohw", windows, w, optimize=True)
-    return out if b is None else out + b[:, None, None]
-
-
+@torch.inference_mode()
 def test_features_and_masks_equal_a_plain_reference(tensors):
     """The backbone for a template, and the refinement of a position, in double precision."""
-    t = {name: tensor.numpy().astype(np.float64) for name, tensor in tensors.items()}
+    t = {name: tensor.double() for name, tensor in tensors.items()}
     network = SiamMaskNetwork()
     network.load_state(tensors)
     network.double()
-    image = np.random.default_rng(0).random((3, 127, 127)) * 255
+    generator = torch.Generator().manual_seed(0)
+    image = 255 * torch.rand(3, 127, 127, generator=generator, dtype=torch.float64)
 
     def layer(x, name, norm, **options):
-        x = conv(x, t[f"{name}.weight"], **options)
-        scale, shift, mean, variance = (
-            t[f"{norm}.{part}"][:, None, None] for part in ("weight", "bias", "running_mean", "running_var")
-        )
-        return (x - mean) / np.sqrt(variance + 1e-5) * scale + shift
+        x = functional.conv2d(x, t[f"{name}.weight"], **options)
+        mean, variance, scale, shift = (t[f"{norm}.{k}"] for k in ("running_mean", "running_var", "weight", "bias"))
+        return functional.batch_norm(x[None], mean, variance, scale, shift)[0]
 
-    relu = lambda y: np.maximum(y, 0)  # noqa: E731
     base = "features.features"
-    stem = relu(layer(image, f"{base}.conv1", f"{base}.bn1", stride=2))
-    padded = np.pad(stem, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    x = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))[:, ::2, ::2].max(axis=(3, 4))
+    stem = layer(image, f"{base}.conv1", f"{base}.bn1", stride=2).relu()
+    x = functional.max_pool2d(stem, 3, stride=2, padding=1)
     stages = [stem]
     for stage, blocks in ((1, 3), (2, 4), (3, 6)):
         for block in range(blocks):
@@ -150,50 +135,45 @@ def test_features_and_masks_equal_a_plain_reference(tensors):
             options = {"stride": 2, "padding": 0} if stage == 2 and first else {"padding": 1}
             if stage == 3 and not first:
                 options = {"padding": 2, "dilation": 2}
-            y = relu(layer(x, f"{name}.conv1", f"{name}.bn1"))
-            y = relu(layer(y, f"{name}.conv2", f"{name}.bn2", **options))
+            y = layer(x, f"{name}.conv1", f"{name}.bn1").relu()
+            y = layer(y, f"{name}.conv2", f"{name}.bn2", **options).relu()
             y = layer(y, f"{name}.conv3", f"{name}.bn3")
             if first:
                 shortcut = [{}, {"stride": 2}, {"padding": 1}][stage - 1]
                 x = layer(x, f"{name}.downsample.0", f"{name}.downsample.1", **shortcut)
-            x = relu(x + y)
+            x = (x + y).relu()
         stages.append(x)
     reduced = layer(x, "features.downsample.downsample.0", "features.downsample.downsample.1")[:, 4:-4, 4:-4]
-    with torch.inference_mode():
-        found, found_reduced = network.features(torch.from_numpy(image)[None])
+    found, found_reduced = network.features(image[None])
     for one, other in zip([*found, found_reduced], [*stages, reduced], strict=True):
-        np.testing.assert_allclose(one[0].numpy(), other, rtol=1e-5, atol=1e-5 * np.abs(other).max())
+        torch.testing.assert_close(one[0], other, rtol=1e-5, atol=1e-5 * float(other.abs().max()))
 
-    rng = np.random.default_rng(1)
-    shapes = ((64, 125), (256, 63), (512, 31))
-    levels = [rng.standard_normal((c, n, n)) for c, n in shapes]
-    correlation = rng.standard_normal((256, 25, 25))
+    sizes = ((64, 125, 125), (256, 63, 63), (512, 31, 31), (256, 25, 25))
+    *levels, correlation = (torch.randn(size, generator=generator, dtype=torch.float64) for size in sizes)
     row, column = 3, 20
 
-    def two(x, name):
-        for k in (0, 2):
-            name_k = f"refine_model.{name}.{k}"
-            x = relu(conv(x, t[f"{name_k}.weight"], t[f"{name_k}.bias"], padding=1))
-        return x
+    def conv(x, name):
+        return functional.conv2d(x, t[f"refine_model.{name}.weight"], t[f"refine_model.{name}.bias"], padding=1)
 
-    def window(x, margin, step, size):
-        x = np.pad(x, ((0, 0), (margin,) * 2, (margin,) * 2))
+    def two(x, name):
+        return conv(conv(x, f"{name}.0").relu(), f"{name}.2").relu()
+
+    def window(level, margin, step, size):
+        x = functional.pad(levels[level], [margin] * 4)
         return x[:, step * row : step * row + size, step * column : step * column + size]
 
     def post(x, k, size):
-        at = (np.arange(size) * x.shape[1]) // size  # nearest neighbour of the original program
-        x = x[:, at][:, :, at]
-        return conv(x, t[f"refine_model.post{k}.weight"], t[f"refine_model.post{k}.bias"], padding=1)
+        at = (torch.arange(size) * x.shape[1]) // size  # nearest neighbour of the original program
+        return conv(x[:, at][:, :, at], f"post{k}")
 
-    x = np.einsum("c,cohw->ohw", correlation[:, row, column], t["refine_model.deconv.weight"])
+    x = torch.einsum("c,cohw->ohw", correlation[:, row, column], t["refine_model.deconv.weight"])
     x = x + t["refine_model.deconv.bias"][:, None, None]
-    x = post(two(x, "h2") + two(window(levels[2], 4, 1, 15), "v2"), 0, 31)
-    x = post(two(x, "h1") + two(window(levels[1], 8, 2, 31), "v1"), 1, 61)
-    x = post(two(x, "h0") + two(window(levels[0], 16, 4, 61), "v0"), 2, 127)
-    inputs = tuple(torch.from_numpy(level)[None] for level in levels)
-    with torch.inference_mode():
-        mask = network.refine(((*inputs, inputs[2]), torch.from_numpy(correlation)[None]), row, column)
-    np.testing.assert_allclose(mask.numpy(), 1 / (1 + np.exp(-x[0])), atol=1e-5)
+    x = post(two(x, "h2") + two(window(2, 4, 1, 15), "v2"), 0, 31)
+    x = post(two(x, "h1") + two(window(1, 8, 2, 31), "v1"), 1, 61)
+    x = post(two(x, "h0") + two(window(0, 16, 4, 61), "v0"), 2, 127)
+    inputs = tuple(level[None] for level in levels)
+    mask = network.refine(((*inputs, inputs[2]), correlation[None]), row, column)
+    torch.testing.assert_close(mask, x[0].sigmoid(), rtol=0, atol=1e-5)
 
 
 def test_anchors():
@@ -208,16 +188,12 @@ def test_anchors():
 
 @pytest.mark.parametrize("position", [(30.0, 20.0), (2.0, 3.0), (78.0, 58.0), (200.0, 200.0)])
 def test_crops_are_filled_with_the_mean_colour(position):
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)
-    colour = np.array([10.7, 20.2, 30.9])
-    crop = siammask.crop_around(image, np.array(position), 21, 21, colour)
-    low = [int(np.round(p - 11)) for p in position]
-    for i in range(21):
-        for j in range(21):
-            y, x = low[1] + i, low[0] + j
-            inside = 0 <= y < 60 and 0 <= x < 80
-            assert (crop[i, j] == (image[y, x] if inside else [10, 20, 30])).all()
+    image = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    crop = siammask.crop_around(image, np.array(position), 21, 21, np.array([10.7, 20.2, 30.9]))
+    around = np.full((460, 480, 3), [10, 20, 30])
+    around[200:260, 200:280] = image
+    column, row = (200 + int(np.round(p - 11)) for p in position)
+    assert (crop == around[row : row + 21, column : column + 21]).all()
 
 
 class Ideal:
@@ -240,7 +216,7 @@ class Ideal:
 
     def refine(self, red, row, column):
         # The mask of a position covers 127 pixels; position 12 is in the middle of the crop.
-        padded = torch.nn.functional.pad(red.float(), [32] * 4)
+        padded = functional.pad(red.float(), [32] * 4)
         return padded[8 * row : 8 * row + 127, 8 * column : 8 * column + 127]
 
 
@@ -370,13 +346,23 @@ def test_checkpoints_that_cannot_be_used_are_one_clear_error(checkpoint, tensors
             assert str(path) in caught.value.message
             assert "\n" not in caught.value.message
     assert not (tmp_path / "executed").exists()
-    for tracker, message in (
-        (SiamMaskTracker(), "are not given"),
-        (SiamMaskTracker("nowhere.pth"), "do not exist"),
-        (SiamMaskTracker(str(checkpoint), sha256="0"), "have the hash"),
+
+
+@pytest.mark.parametrize(
+    ("make", "name"), [(SiamMaskTracker, "SiamMask"), (Sam2Tracker, "SAM 2"), (CutieTracker, "Cutie")]
+)
+def test_weights_that_are_missing_or_have_another_hash(make, name, tmp_path):
+    images, masks = video(2)
+    path = tmp_path / "x.pth"
+    path.write_bytes(b"")
+    for arguments, message in (
+        ((), f"of {name} are not given"),
+        (("nowhere",), f"of {name} do not exist: nowhere"),
+        ((str(path),), "have the hash"),
     ):
+        tracker = replace(make(*arguments), sha256="0")
         with pytest.raises(InputError, match=message):
-            tracker.track(clip, masks[:1])
+            tracker.track(clip_of(images), masks[:1])
 
 
 class Predictor:
@@ -426,11 +412,6 @@ def test_sam2_tracks_all_masks_with_one_pass_over_the_frames(tmp_path, monkeypat
     monkeypatch.setitem(sys.modules, "sam2.build_sam", None)
     with pytest.raises(MissingLibraryError, match="cannot be imported"):
         replace(tracker, device="cuda").track(clip_of(images), masks[:1])
-    cases = [({}, "of SAM 2 are not given"), ({"checkpoint": "nowhere"}, "do not exist: nowhere")]
-    cases.append(({"checkpoint": str(path), "sha256": "0"}, "have the hash"))
-    for fields, message in cases:
-        with pytest.raises(InputError, match=message):
-            Sam2Tracker(**fields).track(clip_of(images), masks[:1])
 
 
 def test_a_checkpoint_that_a_package_cannot_load_is_one_error(tmp_path, monkeypatch):
@@ -545,5 +526,3 @@ def test_cutie_tracks_overlapping_masks_in_groups_that_share_the_features(tmp_pa
     monkeypatch.setitem(sys.modules, "cutie.model.cutie", None)
     with pytest.raises(MissingLibraryError, match=r"cutie\.model\.cutie cannot be imported"):
         CutieTracker(str(path), device="cuda").track(clip_of(images), given)
-    with pytest.raises(InputError, match="of Cutie are not given"):
-        CutieTracker().track(clip_of(images), given)

@@ -12,6 +12,7 @@ import random
 import time
 from copy import deepcopy
 from dataclasses import dataclass
+from operator import setitem
 
 import numpy as np
 from scipy import stats
@@ -26,6 +27,7 @@ from mstfilter.smc import (
     Normal,
     Poisson,
     Program,
+    Residual,
     Student,
     Uniform,
     observe,
@@ -73,11 +75,11 @@ def seen(x, y, scale=0.5):
     observe("y", Normal(x, scale), y)
 
 
-def named(expected, programs, **options):
+def named(expected, programs, wrap=lambda program: program, **options):
     """Add programs to `FAULTY` by name."""
     for name, program in programs.items():
         program.__name__ = name
-        faulty(expected, **options)(program)
+        faulty(expected, **options)(wrap(program))
 
 
 def in_transition(expected, ys=YS, **functions):
@@ -92,7 +94,7 @@ def in_transition(expected, ys=YS, **functions):
     named(expected, {name: program_of(f) for name, f in functions.items()}, ys=ys)
 
 
-def in_likelihood(expected, **functions):
+def in_likelihood(expected, kind="bootstrap", **functions):
     """Programs whose observation has the density Normal(f(x), 0.5), or Normal(*f(x))."""
 
     def program_of(f):
@@ -102,7 +104,7 @@ def in_likelihood(expected, **functions):
 
         return program
 
-    named(expected, {name: program_of(f) for name, f in functions.items()})
+    named(expected, {name: program_of(f) for name, f in functions.items()}, kind=kind)
 
 
 def in_site(expected, **distributions):
@@ -185,12 +187,6 @@ def a_centred_state(previous, y):
 
 
 @faulty(ALONE)
-def the_spread_of_the_particles_as_noise(previous, y):
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(previous["x"], previous["x"].std()))
-    seen(x, y)
-
-
-@faulty(ALONE)
 def probabilities_normalised_over_particles(previous, y):
     x = walk(previous)
     odds = np.exp(np.stack([x, -x], axis=1))
@@ -204,26 +200,14 @@ def the_covariance_of_the_particles(previous, y):
     observe("y", MultivariateNormal(v, np.cov(v.T) + np.eye(2)), [y, y])
 
 
-@faulty(ALONE)
-def the_most_frequent_regime(previous, y):
-    k = sample("k", Categorical([0.4, 0.6]))
-    seen(np.full(len(k), np.bincount(k).argmax()), y)
-
-
 @faulty(ALONE, ys=[0.3, None, None, 0.2])
 def a_mean_if_the_observation_is_missing(previous, y):
     m = 0.0 if previous is None else previous["x"].mean() if y is None else previous["x"]
     seen(sample("x", Normal(m, 0.6)), y)
 
 
-@faulty(ALONE, kind="auxiliary")
-def a_mean_in_an_auxiliary_filter(previous, y):
-    seen(walk(previous).mean(), y)
-
-
-@faulty(ALONE, kind="resample_move")
-def a_mean_in_a_resample_move_filter(previous, y):
-    seen(walk(previous).mean(), y)
+in_likelihood(ALONE, "auxiliary", a_mean_in_an_auxiliary_filter=np.mean)
+in_likelihood(ALONE, "resample_move", a_mean_in_a_resample_move_filter=np.mean)
 
 
 @faulty(ALONE)
@@ -284,13 +268,6 @@ def a_guide_of_one_branch(previous, y):
 
 
 # --- draws outside of sample, and kept state ----------------------------------------------------------------------
-@faulty(REPEATED)
-def draws_of_numpy(previous, y):
-    x = np.random.normal(size=200) if previous is None else 0.9 * previous["x"] + np.random.normal(size=200)
-    seen(x, y)
-    return {"x": x}
-
-
 GENERATOR, COUNT = np.random.default_rng(1), itertools.count()
 
 
@@ -310,6 +287,7 @@ in_likelihood(
 )
 in_likelihood(ALONE, draws_of_a_new_generator=lambda x: x + 0.3 * np.random.default_rng(0).standard_normal(len(x)))
 LAST: dict = {"x": 0.0}
+HISTORY: list = []
 
 
 @faulty(REPEATED)
@@ -317,16 +295,6 @@ def the_last_value_in_a_global(previous, y):
     x = sample("x", Normal(0.9 * np.mean(LAST["x"]), 0.6))
     LAST["x"] = x
     seen(x, y)
-
-
-HISTORY: list = []
-
-
-@faulty(REPEATED)
-def a_growing_list(previous, y):
-    x = walk(previous)
-    HISTORY.append(y)
-    seen(x, y, 0.5 + 0.1 * len(HISTORY))
 
 
 OBSERVATIONS = iter(YS)
@@ -402,69 +370,39 @@ def a_returned_nan(previous, y):
 
 
 # --- values that copies share, and changes in place ---------------------------------------------------------------
-@faulty("read-only")
-@per_particle
-def a_shared_list(previous, y):
-    x = walk(previous)
-    items = [] if previous is None else previous["items"]
-    items.append(float(x))
-    seen(np.mean(items), y)
-    return {"items": items}
-
-
-@faulty("does not support item assignment")
-@per_particle
-def a_shared_dictionary(previous, y):
-    x = walk(previous)
-    seen_at = {} if previous is None else previous["seen_at"]
-    seen_at[len(seen_at)] = float(x)
-    seen(np.mean(list(seen_at.values())), y)
-    return {"seen_at": seen_at}
-
-
-@faulty("no attribute 'add'")
-@per_particle
-def a_shared_set(previous, y):
-    x = walk(previous)
-    cells = set() if previous is None else previous["cells"]
-    cells.add(round(float(x)))
-    seen(len(cells), y)
-    return {"cells": cells}
-
-
-@faulty("read-only")
-@per_particle
-def a_list_in_a_tuple(previous, y):
-    x = walk(previous)
-    pair = (1, [0.0]) if previous is None else previous["pair"]
-    pair[1][0] += float(x)
-    seen(pair[1][0], y)
-    return {"pair": pair}
-
-
-@faulty("read-only")
-@per_particle
-def a_shared_array(previous, y):
-    x = walk(previous)
-    track = np.zeros(10) if previous is None else previous["track"]
-    track[0] = x
-    seen(x, y)
-    return {"track": track}
-
-
 @dataclass
 class Map:
     cells: list
 
 
-@faulty("changes a value of `previous` in place|" + REPEATED)
-@per_particle
-def a_shared_object(previous, y):
-    x = walk(previous)
-    grid = Map([]) if previous is None else previous["grid"]
-    grid.cells.append(float(x))
-    seen(np.mean(grid.cells), y)
-    return {"grid": grid}
+def changing(expected, **cases):
+    """Particles that keep a value, given at the start, and change it in place: ``name=(value, change(value, x))``."""
+
+    def program_of(first, change):
+        def program(previous, y):
+            x = walk(previous)
+            kept = deepcopy(first) if previous is None else previous["kept"]
+            change(kept, float(x))
+            seen(x, y)
+            return {"kept": kept}
+
+        return program
+
+    named(expected, {name: program_of(*case) for name, case in cases.items()}, per_particle)
+
+
+changing(
+    "read-only",
+    a_shared_list=([], lambda kept, x: kept.append(x)),
+    a_list_in_a_tuple=((1, [0.0]), lambda kept, x: setitem(kept[1], 0, x)),
+    a_shared_array=(np.zeros(10), lambda kept, x: setitem(kept, 0, x)),
+)
+changing("does not support item assignment", a_shared_dictionary=({}, lambda kept, x: setitem(kept, len(kept), x)))
+changing("no attribute 'add'", a_shared_set=(set(), lambda kept, x: kept.add(x)))
+changing(
+    "changes a value of `previous` in place|" + REPEATED,
+    a_shared_object=(Map([]), lambda kept, x: kept.cells.append(x)),
+)
 
 
 @faulty(REPEATED)
@@ -485,16 +423,6 @@ def a_dictionary_that_all_particles_fill(previous, y):
     seen(LANDMARKS.setdefault(round(float(x)), float(x)), y)
 
 
-LARGEST = {"x": 1e-3}
-
-
-@faulty(ALONE)
-def a_running_maximum_of_the_closure(previous, y):
-    x = walk(previous)
-    LARGEST["x"] = max(LARGEST["x"], float(np.max(x)))
-    seen(x / LARGEST["x"], y)
-
-
 class Scaled:
     largest = 1e-3
 
@@ -506,15 +434,6 @@ class Scaled:
 
 FAULTY["a_running_maximum_of_an_object"] = (Program(Scaled()).bootstrap(200), YS, ALONE)
 FAULTY["a_running_maximum_of_a_method"] = (Program(Scaled().__call__).bootstrap(200), YS, ALONE)
-TURN = [0]
-
-
-@faulty("after the particles before it than alone", n=40)
-@per_particle
-def every_second_particle(previous, y):
-    x = walk(previous)
-    TURN[0] = (TURN[0] + 1) % 2
-    observe("y", Normal(x, 1.0 + TURN[0]), y)
 
 
 @faulty(REPEATED)
@@ -644,66 +563,40 @@ class Mine(Distribution):
         return stats.norm.logpdf(value, self.centre_, 0.6)
 
 
-class OtherSign(Mine):
-    def log_prob(self, value):
-        return -super().log_prob(value)
+def of_mine(expected, method, **functions):
+    """Programs that sample from `Mine` with another method."""
+
+    def program_of(kind):
+        def program(previous, y):
+            seen(sample("x", kind(np.zeros(1) if previous is None else 0.9 * previous["x"])), y)
+
+        return program
+
+    kinds = {name: type(name, (Mine,), {method: function}) for name, function in functions.items()}
+    named(expected, {f"a_distribution_{name}": program_of(kind) for name, kind in kinds.items()})
 
 
-class Density(Mine):
-    def log_prob(self, value):
-        return np.exp(super().log_prob(value))
-
-
-class Unnormalised(Mine):
-    def log_prob(self, value):
-        return super().log_prob(value) + 0.92
-
-
-class Variance(Mine):
-    def log_prob(self, value):
-        return stats.norm.logpdf(value, self.centre_, 0.36)
-
-
-class GlobalDraws(Mine):
-    def sample(self, rng, size):
-        return self.centre_ + 0.6 * np.random.standard_normal(size)
-
-
-class OneDrawForAll(Mine):
-    def sample(self, rng, size):
-        return np.full(size, self.centre_ + 0.6 * rng.standard_normal())
-
-
-class SumOverParticles(Mine):
-    def log_prob(self, value):
-        return np.full(len(np.atleast_1d(value)), super().log_prob(value).sum())
-
-
-class IntegersOfAContinuousOne(Mine):
-    def sample(self, rng, size):
-        return np.round(super().sample(rng, size)).astype(int)
-
-
-class NanDraws(Mine):
-    def sample(self, rng, size):
-        x = super().sample(rng, size)
-        return np.where(x > 1.0, np.nan, x)
-
-
-def with_distribution(expected, kind):
-    def program(previous, y):
-        seen(sample("x", kind(np.zeros(1) if previous is None else 0.9 * previous["x"])), y)
-
-    FAULTY[f"a_distribution_{kind.__name__}"] = (Program(program).bootstrap(200), YS, expected)
-
-
-for _kind in (OtherSign, Density, Unnormalised, Variance):
-    with_distribution("draws of .* do not have its density", _kind)
-with_distribution(REPEATED, GlobalDraws)
-with_distribution("do not have its density|" + ALONE, OneDrawForAll)
-with_distribution(ALONE + "|density", SumOverParticles)
-with_distribution("continuous", IntegersOfAContinuousOne)
-with_distribution("draw is NaN", NanDraws)
+of_mine(
+    "draws of .* do not have its density",
+    "log_prob",
+    OtherSign=lambda self, value: -Mine.log_prob(self, value),
+    Density=lambda self, value: np.exp(Mine.log_prob(self, value)),
+    Unnormalised=lambda self, value: Mine.log_prob(self, value) + 0.92,
+    Variance=lambda self, value: stats.norm.logpdf(value, self.centre_, 0.36),
+)
+of_mine(
+    ALONE + "|density",
+    "log_prob",
+    SumOverParticles=lambda self, value: np.full(len(np.atleast_1d(value)), Mine.log_prob(self, value).sum()),
+)
+of_mine(REPEATED, "sample", GlobalDraws=lambda self, rng, size: self.centre_ + 0.6 * np.random.standard_normal(size))
+of_mine(
+    "do not have its density|" + ALONE,
+    "sample",
+    OneDrawForAll=lambda self, rng, size: np.full(size, self.centre_ + 0.6 * rng.standard_normal()),
+)
+of_mine("continuous", "sample", Integers=lambda self, rng, size: np.round(Mine.sample(self, rng, size)).astype(int))
+of_mine("draw is NaN", "sample", NanDraws=lambda self, rng, size: np.log(Mine.sample(self, rng, size)))
 
 
 # --- faults that no check of a step can see -----------------------------------------------------------------------
@@ -727,22 +620,10 @@ def a_guide_without_far_tails(previous, y):
 
 
 # --- correct programs ---------------------------------------------------------------------------------------------
-correct()(model)
-
-
-@correct(ys=[0.3, None, None, 0.2])
-def missing_observations(previous, y):
-    seen(walk(previous), y)
-
-
-@correct(n=1)
-def one_particle(previous, y):
-    seen(walk(previous), y)
-
-
-@correct(n=2)
-def two_particles(previous, y):
-    seen(walk(previous), y)
+CORRECT["model"] = (Program(model).bootstrap(200), YS)
+CORRECT["missing_observations"] = (Program(model).bootstrap(200), [0.3, None, None, 0.2])
+CORRECT["one_particle"] = (Program(model).bootstrap(1), YS)
+CORRECT["two_particles"] = (Program(model).bootstrap(2), YS)
 
 
 @correct(n=3)
@@ -837,9 +718,8 @@ def wide(previous, y):
     sample("x", Normal(0.7 * y if previous is None else 0.5 * y + 0.5 * previous["x"], 1.0))
 
 
-@correct(guide=wide, ys=[0.3, None, 0.5])
-def a_guide(previous, y):
-    seen(walk(previous), y)
+CORRECT["a_guide"] = (Program(model).guided(wide, 200), [0.3, None, 0.5])
+CORRECT["a_guide_with_options"] = (Program(model).guided(wide, 200, resampler=Residual()), YS)
 
 
 def excludes(previous, y):
@@ -860,11 +740,6 @@ def bounded(previous, y):
 def a_bounded_guide_of_a_bounded_likelihood(previous, y):
     x = walk(previous)
     observe("y", Uniform(x - 0.5, x + 0.5), y)
-
-
-@correct(guide=wide, kind="guided", resampler=Program(model).bootstrap(2).resampler)
-def a_guide_with_options(previous, y):
-    seen(walk(previous), y)
 
 
 @correct()
@@ -1054,13 +929,6 @@ def a_discrete_distribution_of_the_user(previous, y):
 def time_in_the_model(previous, y, t):
     m = 0.0 if previous is None else 0.9 * previous["x"] + np.sin(t)
     seen(sample("x", Normal(m, 0.6)), y)
-
-
-@correct()
-def a_table_of_the_closure(previous, y):
-    table = np.array([0.0, 1.0, 2.0])
-    k = sample("k", Categorical(np.ones(3) / 3))
-    seen(table[k], y)
 
 
 @correct(ys=[{"a": 0.2, "b": None}, {"a": None, "b": 1.0}, None])

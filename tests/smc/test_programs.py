@@ -623,17 +623,6 @@ def test_values_of_particles_that_look_like_a_shared_vector():
     np.testing.assert_allclose(np.diff(a.population.log_weights), np.diff(expected))
 
 
-def test_arrays_of_a_trace_are_read_only():
-    @per_particle
-    def model(previous, y):
-        x = sample("x", Normal(np.zeros((1, 2)), 1.0))
-        if previous is not None:
-            previous["kept"][0] = 5.0
-        return {"kept": np.array(x)}
-
-    assert re.search("step 1, transition: the program fails .after site 'x', line .*read-only", errors_of(model))
-
-
 def test_an_observation_of_one_particle_compares_shapes():
     def of(distribution):
         @per_particle

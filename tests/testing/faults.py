@@ -63,6 +63,15 @@ def multinomial(rng, weights, n):
     return np.searchsorted(np.cumsum(weights)[:-1], rng.random(n) * weights.sum(), side="right")
 
 
+def weighing(broken, words, select=systematic, **changes):
+    """Add schemes that select by changed weights, ``change(W, n)`` of the normalised ones."""
+
+    def by(change):
+        return lambda rng, lw, n: select(rng, change(normalise(lw), n), n)
+
+    add_faults(faulty(broken, words), **{name: by(change) for name, change in changes.items()})
+
+
 # --- correct schemes ----------------------------------------------------------------------------------------------
 
 
@@ -162,9 +171,12 @@ def BiasedResidual(rng, lw, n):
     return np.concatenate([np.repeat(np.arange(len(W)), copies.astype(int)), drawn])
 
 
-@faulty("gives_n_particles", "asked to make")
-def IgnoresN(rng, lw, n):
-    return systematic(rng, normalise(lw), len(lw))
+add_faults(
+    faulty("gives_n_particles", "asked to make"),
+    IgnoresN=lambda rng, lw, n: systematic(rng, normalise(lw), len(lw)),
+    # Returns fewer than n without saying so.
+    NoDuplicates=lambda rng, lw, n: np.unique(systematic(rng, normalise(lw), n)),
+)
 
 
 @faulty("zero_weights_are_never_chosen", "weight 0")
@@ -180,19 +192,6 @@ def ZeroAtTheEdge(rng, lw, n):
     """Picks a leading weight of zero where the uniform is exactly 0."""
     points = (np.arange(n) + rng.random()) / n
     return np.searchsorted(np.cumsum(normalise(lw)), points, side="left")
-
-
-@biased
-def RemainderFromWeights(rng, lw, n):
-    """The remainder is W - copies, which may be negative (a fault of a published library)."""
-    W = normalise(lw)
-    copies = np.floor(n * W).astype(int)
-    rest = W - copies
-    with np.errstate(all="ignore"):
-        cumulative = np.cumsum(rest / rest.sum())
-    cumulative[-1] = 1.0
-    drawn = np.searchsorted(cumulative, rng.random(n - copies.sum()))
-    return np.concatenate([np.repeat(np.arange(len(W)), copies), drawn])
 
 
 @biased
@@ -220,22 +219,10 @@ def OffByOneClipped(rng, lw, n):
     return (systematic(rng, normalise(lw), n) + 1) % len(lw)
 
 
-@faulty("carried_weight", "are the particles sorted, and not the ancestors?")
-def OrderMatters(rng, lw, n):
-    """Sorts by weight and forgets to sort back."""
-    return systematic(rng, np.sort(normalise(lw))[::-1], n)
-
-
 @faulty("carried_weight", "n = m must be resampled")
 def KeepsAll(rng, lw, n):
     """Returns all particles if as many are wanted."""
     return np.arange(n) if n == len(lw) else systematic(rng, normalise(lw), n)
-
-
-@faulty("carried_weight", "flattened")
-def Flattens(rng, lw, n):
-    """Selects by a power of the weights if n = m."""
-    return systematic(rng, normalise((0.9 if n == len(lw) else 1.0) * lw), n)
 
 
 @faulty("carried_weight", "equal weight go to the first")
@@ -254,15 +241,6 @@ def OnePosition(rng, lw, n):
     return ancestors
 
 
-@faulty("carried_weight", "dropped")
-def DropsLight(rng, lw, n):
-    """Particles below a thousandth of the largest weight are dropped, if n = m."""
-    weights = normalise(lw)
-    if n == len(weights):
-        weights = np.where(weights < 1e-3 * weights.max(), 0.0, weights)
-    return systematic(rng, weights, n)
-
-
 @faulty("carried_weight", "resampled apart")
 def Halves(rng, lw, n):
     """The halves of a population are resampled apart, if n = m is even."""
@@ -272,29 +250,12 @@ def Halves(rng, lw, n):
     return np.concatenate([systematic(rng, weights[:half], half), half + systematic(rng, weights[half:], half)])
 
 
-@faulty("largest_weight", "heaviest particle gets +")
-def OnePercent(rng, lw, n):
-    """The largest weight is 1 % too large; independent draws hide a small bias best."""
-    weights = normalise(lw)
-    weights[np.argmax(weights)] *= 1.01
-    return multinomial(rng, weights, n)
-
-
 # --- faults at some sizes -----------------------------------------------------------------------------------------
 
 
 @faulty("carried_weight", "5 particles to 1")
 def single_is_heaviest(rng, lw, n):
     return np.array([np.argmax(lw)]) if n == 1 else systematic(rng, normalise(lw), n)
-
-
-@faulty("carried_weight", "125 particles to 5")
-def thins_first(rng, lw, n):
-    """From many particles to few, the lightest half is dropped first."""
-    weights = normalise(lw)
-    if len(lw) > 20 * n:
-        weights[weights < np.median(weights)] = 0.0
-    return multinomial(rng, weights, n)
 
 
 @biased
@@ -333,18 +294,7 @@ def last_is_forgotten(rng, lw, n):
     return np.where((found == n - 1) & (lw[0] > -np.inf), 0, found) if n == len(lw) else found
 
 
-@faulty("many_particles", "single precision")
-def SinglePrecisionSum(rng, lw, n):
-    """Cumulates in single precision: small weights are lost."""
-    return systematic(rng, normalise(lw).astype(np.float32), n)
-
-
 # --- faults at some weights ---------------------------------------------------------------------------------------
-
-
-@faulty("carried_weight", "heaviest particle gets -11 %")
-def at_most_half(rng, lw, n):
-    return systematic(rng, np.minimum(normalise(lw), 0.5), n)
 
 
 @faulty("carried_weight", "particles to 3")
@@ -353,26 +303,42 @@ def winner_takes_all(rng, lw, n):
     return np.full(n, np.argmax(weights)) if weights.max() > 0.9 else systematic(rng, weights, n)
 
 
-@faulty("carried_weight", "heaviest particle gets +")
-def heavy_gains(rng, lw, n):
-    """A particle of more than 0.6 of the weight gets 5 % too much."""
-    weights = normalise(lw)
-    return multinomial(rng, np.where(weights > 0.6, 1.05, 1.0) * weights, n)
-
-
-@faulty("carried_weight", "100 particles to 2")
-def heaviest_of_many(rng, lw, n):
-    """If there are more than twenty times as many as are selected, the light ones are left out."""
-    w = normalise(lw)
-    if len(w) > 20 * n:
-        w = np.where(w >= np.sort(w)[-20 * n], w, 0.0)
-    return systematic(rng, w / w.sum(), n)
-
-
-@biased
-def floor_of_weights(rng, lw, n):
-    weights = normalise(lw)
-    return systematic(rng, np.where(weights > 0, np.maximum(weights, 0.02), 0), n)
+weighing("carried_weight", "heaviest particle gets -11 %", at_most_half=lambda W, n: np.minimum(W, 0.5))
+weighing(
+    "carried_weight", "copies are biased", floor_of_weights=lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0)
+)
+# Particles below a thousandth of the largest weight are dropped, if n = m.
+weighing("carried_weight", "dropped", DropsLight=lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W))
+# A power of the weights, if n = m, or if there are more than a hundred.
+weighing("carried_weight", "flattened", Flattens=lambda W, n: W ** (0.9 if n == len(W) else 1.0))
+weighing("carried_weight", "125 particles to 5", sharpens_many=lambda W, n: W ** (1.1 if len(W) > 100 else 1.0))
+# If there are more than twenty times as many as are selected, the light ones are left out.
+weighing(
+    "carried_weight",
+    "100 particles to 2",
+    heaviest_of_many=lambda W, n: np.where(np.sort(W)[-20 * n] <= W, W, 0.0) if len(W) > 20 * n else W,
+)
+# Sorts by weight and forgets to sort back.
+weighing(
+    "carried_weight",
+    "are the particles sorted, and not the ancestors?",
+    OrderMatters=lambda W, n: np.sort(W)[::-1],
+)
+# Cumulates in single precision: small weights are lost.
+weighing("many_particles", "single precision", SinglePrecisionSum=lambda W, n: W.astype(np.float32))
+# Independent draws hide a small bias best: the largest weight is 1 % too large, or 5 % if it is above 0.6.
+weighing(
+    "largest_weight",
+    "heaviest particle gets +",
+    multinomial,
+    OnePercent=lambda W, n: np.where(W.max() == W, 1.01, 1.0) * W,
+)
+weighing(
+    "carried_weight",
+    "heaviest particle gets +",
+    multinomial,
+    heavy_gains=lambda W, n: np.where(W > 0.6, 1.05, 1.0) * W,
+)
 
 
 @faulty("scale_of_weights_is_irrelevant", "log weights")
@@ -385,11 +351,6 @@ def SinglePrecisionOverflow(rng, lw, n):
     """exp in single precision overflows at 88."""
     weights = np.exp(lw.astype(np.float32))
     return systematic(rng, weights / weights.sum(), n)
-
-
-@faulty("zero_weights_are_never_chosen", "weight 0")
-def zero_is_small(rng, lw, n):
-    return systematic(rng, normalise(np.nan_to_num(lw, neginf=-3.0)), n)
 
 
 @biased
@@ -417,18 +378,7 @@ add_faults(
 )
 
 
-@faulty("carried_weight", "125 particles to 5")
-def sharpens_many(rng, lw, n):
-    """A power of the weights, if there are more than a hundred."""
-    return systematic(rng, normalise((1.1 if len(lw) > 100 else 1.0) * lw), n)
-
-
 # --- random numbers and state -------------------------------------------------------------------------------------
-
-
-@faulty("does_not_use_global_generators", "global generator")
-def GlobalGenerator(rng, lw, n):
-    return systematic(np.random, normalise(lw), n)
 
 
 @faulty("does_not_use_global_generators", "numpy's global generator")
@@ -441,12 +391,6 @@ def python_generator(rng, lw, n):
     found = systematic(rng, normalise(lw), n)
     random.shuffle(found)
     return found
-
-
-@faulty("does_not_use_global_generators", "numpy's global generator")
-def reseeds_the_global(rng, lw, n):
-    np.random.seed(int(rng.integers(1000)))  # noqa: NPY002
-    return systematic(rng, normalise(lw), n)
 
 
 @faulty("depends_on_the_generator", "ignores `rng`")
@@ -488,17 +432,6 @@ class FirstCallCached(WeightResampler):
 
 
 @faulty("keeps_no_state", "keeps state")
-class ResultCached(FirstCallCached):
-    """The result of a call of the same sizes is returned again."""
-
-    def select(self, rng, log_weights, n):
-        key = (len(log_weights), n)
-        if key not in self.cache:
-            self.cache[key] = systematic(rng, normalise(log_weights), n)
-        return self.cache[key], None
-
-
-@faulty("keeps_no_state", "keeps state")
 class EverySecondCall(FirstCallCached):
     def select(self, rng, log_weights, n):
         self.cache["calls"] = self.cache.get("calls", 0) + 1
@@ -513,12 +446,6 @@ _CACHE: dict = {}
 def module_cache(rng, lw, n):
     """Cached by the sizes, beside the class."""
     return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
-
-
-@faulty("does_not_change_input", "in place")
-def ChangesInput(rng, lw, n):
-    lw -= log_mean_exp(lw)
-    return systematic(rng, np.exp(lw), n)
 
 
 @faulty("does_not_change_input", "in place")
@@ -568,12 +495,6 @@ def weights_of_neighbours(rng, lw, n):
 @faulty("gives_n_particles", "float64, expected integers")
 def as_floats(rng, lw, n):
     return systematic(rng, normalise(lw), n).astype(float)
-
-
-@faulty("gives_n_particles", "asked to make")
-def NoDuplicates(rng, lw, n):
-    """Returns fewer than n without saying so."""
-    return np.unique(systematic(rng, normalise(lw), n))
 
 
 @faulty("gives_n_particles", "asked to make", exact_size=False)

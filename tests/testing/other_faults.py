@@ -24,6 +24,7 @@ from mstfilter.smc import (
     Transition,
     Trigger,
     Update,
+    log_mean_exp,
     union,
 )
 from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
@@ -57,6 +58,12 @@ def of(interface, method):
         return type(function.__name__, (interface,), called)
 
     return make
+
+
+def add_methods(interface, method, **faults):
+    """Add components whose method is a function: ``name=(broken property, words, function)``."""
+    for name, (broken, words, function) in faults.items():
+        add_faults(broken, words, None, of(interface, method), **{name: function})
 
 
 def move(function):
@@ -302,21 +309,20 @@ def shared_by_blocks(rng, x, y):
     return walk(x, np.repeat(rng.standard_normal(-(-len(x) // 8)), 8)[: len(x)])
 
 
-@faulty(_ORDER, "alone (n = 1)", None, move)
-def still_alone(rng, x, y):
-    return walk(x, rng.standard_normal(len(x)) if len(x) > 1 else 0.0)
+def step(rng, x, size=1.0):
+    """Moves by independent noise of a size."""
+    return walk(x, size * rng.standard_normal(len(x)))
 
 
-@faulty(_ORDER, "observation=None", None, move)
-def still_without_observation(rng, x, y):
-    return x if y is None else walk(x, rng.standard_normal(len(x)))
-
-
-@faulty(_MOVES, "and sd", exact_walk, move)
-def wide_step(rng, x, y):
-    return walk(x, 1.05 * rng.standard_normal(len(x)))
-
-
+add_faults(_ORDER, "alone (n = 1)", None, move, still_alone=lambda rng, x, y: step(rng, x, float(len(x) > 1)))
+add_faults(
+    _ORDER,
+    "observation=None",
+    None,
+    move,
+    still_without_observation=lambda rng, x, y: x if y is None else step(rng, x),
+)
+add_faults(_MOVES, "and sd", exact_walk, move, wide_step=lambda rng, x, y: step(rng, x, 1.05))
 add_faults(
     _MOVES,
     "is below",
@@ -324,22 +330,8 @@ add_faults(
     move,
     uniform_noise=lambda rng, x, y: walk(x, rng.uniform(-np.sqrt(3), np.sqrt(3), len(x))),
     cut_noise=lambda rng, x, y: walk(x, np.clip(rng.standard_normal(len(x)), -2.8, 2.8)),
-    small_drift=lambda rng, x, y: walk(x, rng.standard_normal(len(x))) + 0.02,
+    small_drift=lambda rng, x, y: step(rng, x) + 0.02,
 )
-
-
-@faulty(_ORDER, "moves differently", None, move)
-def last_is_still(rng, x, y):
-    noise = rng.standard_normal(len(x))
-    noise[-1] = 0.0 if len(x) > 1 else noise[-1]
-    return walk(x, noise)
-
-
-@faulty(_ORDER, "do not move independently", None, move)
-def depends_on_first(rng, x, y):
-    """The noise of the first particle is added to all."""
-    noise = rng.standard_normal(len(x))
-    return walk(x, np.where(np.arange(len(x)) > 0, np.sqrt(0.5) * (noise + noise[0]), noise))
 
 
 @faulty(_MOVES, "is below", exact_walk, move)
@@ -430,6 +422,8 @@ add_faults(
     flat_tails=lambda x, y: np.maximum(Normal(x, TAU).log_prob(y), -3.0),
     tempered=lambda x, y: 0.95 * Normal(x, TAU).log_prob(y),
     shifted=lambda x, y: Normal(x + 0.02, TAU).log_prob(y),
+    # Bounded at 3 nats below the best particle.
+    bounded_relative=lambda x, y: np.maximum(Normal(x, TAU).log_prob(y), Normal(x, TAU).log_prob(y).max() - 3),
     cauchy=lambda x, y: -np.log1p(((x - y) / TAU) ** 2) - np.log(np.pi * TAU),
 )
 
@@ -451,28 +445,19 @@ def without_constant(x, y):
     return -0.5 * ((x - y) / TAU) ** 2
 
 
-@faulty(_OTHERS, "not normalised or ranked", None, likelihood)
-def divided_by_mean(x, y):
-    log_g = Normal(x, TAU).log_prob(y)
-    return log_g - np.log(np.mean(np.exp(log_g)))
+def log_g(x, y):
+    return Normal(x, TAU).log_prob(y)
 
 
-@faulty(_OTHERS, "not normalised or ranked", None, likelihood)
-def divided_by_largest(x, y):
-    log_g = Normal(x, TAU).log_prob(y)
-    return log_g - log_g.max()
-
-
-@faulty(_OTHERS, "not normalised or ranked", None, likelihood)
-def ranks(x, y):
-    return np.log1p(np.argsort(np.argsort(Normal(x, TAU).log_prob(y))))
-
-
-@faulty(_POSTERIOR, "is below", exact_posterior, likelihood)
-def bounded_relative(x, y):
-    """Bounded at 3 nats below the best particle."""
-    log_g = Normal(x, TAU).log_prob(y)
-    return np.maximum(log_g, log_g.max() - 3)
+add_faults(
+    _OTHERS,
+    "not normalised or ranked",
+    None,
+    likelihood,
+    divided_by_mean=lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y)),
+    divided_by_largest=lambda x, y: log_g(x, y) - log_g(x, y).max(),
+    ranks=lambda x, y: np.log1p(np.argsort(np.argsort(log_g(x, y)))),
+)
 
 
 def changed(function):
@@ -663,18 +648,6 @@ def pairs_of_steps(rng, x, previous, y):
     return np.asarray(optimal(previous, y).mean) + float(np.asarray(optimal(0.0, y).sd)) * step
 
 
-@faulty(_KEPT, "no longer exact", None, kernel)
-def greedy(rng, x, previous, y):
-    new = x + 0.2 * rng.standard_normal(len(x))
-    return np.where(np.abs(new - y) < np.abs(x - y), new, x)
-
-
-@faulty(_KEPT, "exact draws are no longer exact", None, kernel)
-def MovesAll(rng, x, previous, y):
-    """Accepts every step."""
-    return x + 0.5 * rng.standard_normal(len(x))
-
-
 @faulty(_KEPT, "x_t - x_{t-1}", None, kernel)
 def ForgetsTheParent(rng, x, previous, y):
     """Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong."""
@@ -702,73 +675,45 @@ def GlobalRejuvenation(rng, population, previous, observation):
 
 
 # --- triggers and sizes -------------------------------------------------------------------------------------------
-
-
-@faulty("ignores_scale_and_order", "adding", None, of(Trigger, "wants"))
-def AbsoluteWeight(population, t):
-    return population.log_weights.max() < 0
-
-
-@faulty("answers", "True or False", None, of(Trigger, "wants"))
-def MaybeTrigger(population, t):
-    return population.ess
-
-
-@faulty("answers", "at least 1", None, of(Size, "choose"))
-def HalfSize(population):
-    return len(population) // 2
+add_methods(
+    Trigger,
+    "wants",
+    AbsoluteWeight=("ignores_scale_and_order", "adding", lambda population, t: population.log_weights.max() < 0),
+    MaybeTrigger=("answers", "True or False", lambda population, t: population.ess),
+)
+add_methods(Size, "choose", HalfSize=("answers", "at least 1", lambda population: len(population) // 2))
 
 
 # --- similarities and equivalences --------------------------------------------------------------------------------
-
-
-@faulty("similarities_are_shares", "to itself", None, of(Similarity, "matrix"))
-def Distance(particles):
+def distances(particles):
     return np.abs(particles[:, None] - particles[None, :])
 
 
-@faulty("pairs_do_not_depend_on_others", "if only these are given", None, of(Similarity, "matrix"))
-def RelativeSimilarity(particles):
-    d = np.abs(particles[:, None] - particles[None, :])
-    return 1 - d / max(d.max(), 1e-12)
-
-
-@faulty("similarities_are_shares", "similarity of particles", None, of(Similarity, "matrix"))
-def OneSided(particles):
-    return np.tril(np.ones((len(particles), len(particles))))
-
-
-@faulty("classes_are_numbered", "classes are", None, of(Equivalence, "classes"))
-def CountsFromOne(particles):
-    return np.arange(1, len(particles) + 1)
-
-
-@faulty("pairs_do_not_depend_on_others", "if there are copies", None, of(Equivalence, "classes"))
-def AllDifferent(particles):
-    return np.arange(len(particles))
+_PAIRS = "pairs_do_not_depend_on_others"
+add_methods(
+    Similarity,
+    "matrix",
+    Distance=("similarities_are_shares", "to itself", distances),
+    RelativeSimilarity=(_PAIRS, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
+    OneSided=("similarities_are_shares", "similarity of particles", lambda x: np.tril(np.ones((len(x), len(x))))),
+)
+add_methods(
+    Equivalence,
+    "classes",
+    CountsFromOne=("classes_are_numbered", "classes are", lambda particles: np.arange(1, len(particles) + 1)),
+    AllDifferent=(_PAIRS, "if there are copies", lambda particles: np.arange(len(particles))),
+)
 
 
 # --- lookaheads ---------------------------------------------------------------------------------------------------
-
-
-@faulty("ignores_weights", "changes the priorities", None, of(Lookahead, "log_priority"))
-def LooksAtWeights(population, observation):
-    return population.log_weights + population.particles
-
-
-@faulty("scores_are_finite", "-inf", None, of(Lookahead, "log_priority"))
-def RulesOut(population, observation):
-    return np.where(population.particles > 1, -np.inf, 0.0)
-
-
-@faulty("scores_are_finite", "shape (1,)", None, of(Lookahead, "log_priority"))
-def OneForAll(population, observation):
-    return np.zeros(1)
-
-
-@faulty(_ORDER, "in another order", None, of(Lookahead, "log_priority"))
-def ByPlace(population, observation):
-    return 0.1 * np.arange(len(population))
+add_methods(
+    Lookahead,
+    "log_priority",
+    LooksAtWeights=("ignores_weights", "changes the priorities", lambda p, y: p.log_weights + p.particles),
+    RulesOut=("scores_are_finite", "-inf", lambda p, y: np.where(p.particles > 1, -np.inf, 0.0)),
+    OneForAll=("scores_are_finite", "shape (1,)", lambda p, y: np.zeros(1)),
+    ByPlace=(_ORDER, "in another order", lambda p, y: 0.1 * np.arange(len(p))),
+)
 
 
 @faulty("keeps_no_state", "keeps state")
@@ -841,26 +786,14 @@ class Keeps(Codec):
 
 # --- evidence -----------------------------------------------------------------------------------------------------
 _COPIES = "copies_score_the_same"
-
-
-@faulty("scores_are_finite", "-inf", None, of(Evidence, "log_score"))
-def RulesOutOdd(hypotheses, clip):
-    return np.where(np.arange(len(hypotheses)) % 2, -np.inf, 0.0)
-
-
-@faulty(_ORDER, "another order", None, of(Evidence, "log_score"))
-def FirstIsBest(hypotheses, clip):
-    return -np.arange(float(len(hypotheses)))
-
-
-@faulty("scores_are_finite", "shape (1,)", None, of(Evidence, "log_score"))
-def OneScore(hypotheses, clip):
-    return np.zeros(1)
-
-
-@faulty(_COPIES, "other numbers", None, of(Evidence, "log_score"))
-def HighNamesWin(hypotheses, clip):
-    return np.array([float(h.labels.max()) for h in hypotheses])
+add_methods(
+    Evidence,
+    "log_score",
+    RulesOutOdd=("scores_are_finite", "-inf", lambda h, clip: np.where(np.arange(len(h)) % 2, -np.inf, 0.0)),
+    FirstIsBest=(_ORDER, "another order", lambda h, clip: -np.arange(float(len(h)))),
+    OneScore=("scores_are_finite", "shape (1,)", lambda h, clip: np.zeros(1)),
+    HighNamesWin=(_COPIES, "other numbers", lambda h, clip: np.array([float(one.labels.max()) for one in h])),
+)
 
 
 @faulty(_COPIES, "its copy", None, of(Evidence, "log_score"))
