@@ -58,6 +58,10 @@ def systematic(rng, weights, n):
     return np.minimum(np.searchsorted(cumulative, points * cumulative[-1], side="right"), last)
 
 
+def by_weight(rng, lw, n):
+    return systematic(rng, normalise(lw), n)
+
+
 def multinomial(rng, weights, n):
     """Another correct scheme, with the largest variance."""
     return np.searchsorted(np.cumsum(weights)[:-1], rng.random(n) * weights.sum(), side="right")
@@ -77,7 +81,7 @@ def weighing(broken, words, select=systematic, **changes):
 
 @selecting
 def Correct(rng, lw, n):
-    return systematic(rng, normalise(lw), n)
+    return by_weight(rng, lw, n)
 
 
 @selecting
@@ -175,7 +179,7 @@ add_faults(
     faulty("gives_n_particles", "asked to make"),
     IgnoresN=lambda rng, lw, n: systematic(rng, normalise(lw), len(lw)),
     # Returns fewer than n without saying so.
-    NoDuplicates=lambda rng, lw, n: np.unique(systematic(rng, normalise(lw), n)),
+    NoDuplicates=lambda rng, lw, n: np.unique(by_weight(rng, lw, n)),
 )
 
 
@@ -207,35 +211,53 @@ def GreedyCalledProper(rng, lw, n):
     return best[np.arange(n) % len(best)]
 
 
-@faulty("gives_n_particles", "expected 0 to")
-def OffByOne(rng, lw, n):
-    """Counts particles from 1."""
-    return systematic(rng, normalise(lw), n) + 1
-
-
-@faulty("carried_weight", "off by one")
-def OffByOneClipped(rng, lw, n):
-    """Selects the next particle, inside the range."""
-    return (systematic(rng, normalise(lw), n) + 1) % len(lw)
-
-
-@faulty("carried_weight", "n = m must be resampled")
-def KeepsAll(rng, lw, n):
-    """Returns all particles if as many are wanted."""
-    return np.arange(n) if n == len(lw) else systematic(rng, normalise(lw), n)
+# Counts particles from 1; and the same inside the range.
+add_faults(faulty("gives_n_particles", "expected 0 to"), OffByOne=lambda rng, lw, n: by_weight(rng, lw, n) + 1)
+add_faults(
+    faulty("carried_weight", "off by one"),
+    OffByOneClipped=lambda rng, lw, n: (by_weight(rng, lw, n) + 1) % len(lw),
+)
+add_faults(
+    faulty("carried_weight", "n = m must be resampled"),
+    KeepsAll=lambda rng, lw, n: np.arange(n) if n == len(lw) else by_weight(rng, lw, n),
+)
+add_faults(
+    faulty("carried_weight", "5 particles to 1"),
+    single_is_heaviest=lambda rng, lw, n: np.array([np.argmax(lw)]) if n == 1 else by_weight(rng, lw, n),
+)
+add_faults(
+    faulty("many_particles", "too few bits"),
+    sixteen_bits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int),
+)
+add_faults(
+    faulty("gives_n_particles", "float64, expected integers"),
+    as_floats=lambda rng, lw, n: by_weight(rng, lw, n).astype(float),
+)
+add_faults(
+    faulty("gives_n_particles", "asked to make", exact_size=False),
+    MoreThanAsked=lambda rng, lw, n: by_weight(rng, lw, n + 1),
+)
+add_faults(
+    faulty("repeats_with_the_same_generator", "draws = False", draws=False),
+    CallsItDrawless=lambda rng, lw, n: by_weight(rng, lw, n),
+)
+add_faults(
+    faulty("depends_on_the_generator", "ignores `rng`"),
+    SeedIgnored=lambda rng, lw, n: by_weight(np.random.default_rng(0), lw, n),
+)
 
 
 @faulty("carried_weight", "equal weight go to the first")
 def TiesToTheFirst(rng, lw, n):
     """Finds particles by their weight."""
     _, first, index = np.unique(lw, return_index=True, return_inverse=True)
-    return first[index[systematic(rng, normalise(lw), n)]]
+    return first[index[by_weight(rng, lw, n)]]
 
 
 @faulty("carried_weight", "positions always goes to particle")
 def OnePosition(rng, lw, n):
     """The first position always goes to the heaviest particle, if n = m."""
-    ancestors = systematic(rng, normalise(lw), n)
+    ancestors = by_weight(rng, lw, n)
     if n == len(lw) > 1:
         ancestors[0] = np.argmax(lw)
     return ancestors
@@ -253,14 +275,9 @@ def Halves(rng, lw, n):
 # --- faults at some sizes -----------------------------------------------------------------------------------------
 
 
-@faulty("carried_weight", "5 particles to 1")
-def single_is_heaviest(rng, lw, n):
-    return np.array([np.argmax(lw)]) if n == 1 else systematic(rng, normalise(lw), n)
-
-
 @biased
 def odd_is_special(rng, lw, n):
-    found = systematic(rng, normalise(lw), n)
+    found = by_weight(rng, lw, n)
     if n % 2 and n > 1:
         found[-1] = found[0]
     return found
@@ -277,20 +294,15 @@ def more_than_there_are(rng, lw, n):
 
 add_faults(
     faulty("carried_weight", "300 particles to 300"),
-    eight_bits=lambda rng, lw, n: systematic(rng, normalise(lw), n).astype(np.uint8).astype(int),
+    eight_bits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
     # Particles from number 256 on are never selected.
     block_of_256=lambda rng, lw, n: systematic(rng, normalise(lw)[:256], n),
 )
 
 
-@faulty("many_particles", "too few bits")
-def sixteen_bits(rng, lw, n):
-    return systematic(rng, normalise(lw), n).astype(np.int16).astype(int)
-
-
 @biased
 def last_is_forgotten(rng, lw, n):
-    found = systematic(rng, normalise(lw), n)
+    found = by_weight(rng, lw, n)
     return np.where((found == n - 1) & (lw[0] > -np.inf), 0, found) if n == len(lw) else found
 
 
@@ -383,19 +395,14 @@ add_faults(
 
 @faulty("does_not_use_global_generators", "numpy's global generator")
 def global_if_more(rng, lw, n):
-    return systematic(np.random if n > len(lw) else rng, normalise(lw), n)
+    return by_weight(np.random if n > len(lw) else rng, lw, n)
 
 
 @faulty("does_not_use_global_generators", "Python's global generator")
 def python_generator(rng, lw, n):
-    found = systematic(rng, normalise(lw), n)
+    found = by_weight(rng, lw, n)
     random.shuffle(found)
     return found
-
-
-@faulty("depends_on_the_generator", "ignores `rng`")
-def SeedIgnored(rng, lw, n):
-    return systematic(np.random.default_rng(0), normalise(lw), n)
 
 
 _other_generator = faulty("repeats_with_the_same_generator", "does not come from `rng`")
@@ -452,7 +459,7 @@ def module_cache(rng, lw, n):
 def in_place_if_equal(rng, lw, n):
     if n == len(lw):
         lw -= lw.max()
-    return systematic(rng, normalise(lw), n)
+    return by_weight(rng, lw, n)
 
 
 # --- output -------------------------------------------------------------------------------------------------------
@@ -461,27 +468,27 @@ def in_place_if_equal(rng, lw, n):
 @faulty("carried_weight", "output weights are wrong")
 def OldWeightsKept(rng, lw, n):
     """Selects by weight and keeps the weight, so the weight counts twice."""
-    ancestors = systematic(rng, normalise(lw), n)
+    ancestors = by_weight(rng, lw, n)
     return ancestors, lw[ancestors]
 
 
 add_faults(
     faulty("carried_weight", "mean weight after selection"),
     # Equal weights, but not those that keep the evidence.
-    WeightsForgotten=lambda rng, lw, n: (systematic(rng, normalise(lw), n), np.full(n, -np.log(n))),
-    sum_for_mean=lambda rng, lw, n: (systematic(rng, normalise(lw), n), np.full(n, np.logaddexp.reduce(lw))),
+    WeightsForgotten=lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, -np.log(n))),
+    sum_for_mean=lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, np.logaddexp.reduce(lw))),
 )
 
 
 @faulty("carried_weight", "positive weights only")
 def MeanOfPositive(rng, lw, n):
     """The evidence is the mean of the positive weights."""
-    return systematic(rng, normalise(lw), n), np.full(n, log_mean_exp(lw[lw > -np.inf]))
+    return by_weight(rng, lw, n), np.full(n, log_mean_exp(lw[lw > -np.inf]))
 
 
 @faulty("scale_of_weights_is_irrelevant", "do not add it")
 def single_precision_output(rng, lw, n):
-    return systematic(rng, normalise(lw), n), np.full(n, log_mean_exp(lw)).astype(np.float32)
+    return by_weight(rng, lw, n), np.full(n, log_mean_exp(lw)).astype(np.float32)
 
 
 @faulty("carried_weight", "output weights are wrong")
@@ -492,6 +499,7 @@ def weights_of_neighbours(rng, lw, n):
     return ancestors, lw[np.sort(ancestors)[::-1]] + np.log(even.mean())
 
 
+<<<<<<< HEAD
 @faulty("gives_n_particles", "float64, expected integers")
 def as_floats(rng, lw, n):
     return systematic(rng, normalise(lw), n).astype(float)
@@ -505,12 +513,17 @@ def MoreThanAsked(rng, lw, n):
 @faulty("repeats_with_the_same_generator", "draws = False", draws=False)
 def CallsItDrawless(rng, lw, n):
     return systematic(rng, normalise(lw), n)
+=======
+@faulty("states_a_small_tolerance", "tolerance is 0.9")
+class StatesALargeBias(GreedyCalledProper):
+    tolerance: ClassVar[float] = 0.9
+>>>>>>> w5
 
 
 @faulty("batched_runs_equal_single_runs", "are runs mixed", batched=True)
 def MixesRuns(rng, lw, n):
     if lw.ndim == 1:
-        return systematic(rng, normalise(lw), n)
+        return by_weight(rng, lw, n)
     return np.array([systematic(g, normalise(lw.mean(axis=0)), n) for g in rng.generators()]), None
 
 
