@@ -499,27 +499,6 @@ def weights_of_neighbours(rng, lw, n):
     return ancestors, lw[np.sort(ancestors)[::-1]] + np.log(even.mean())
 
 
-<<<<<<< HEAD
-@faulty("gives_n_particles", "float64, expected integers")
-def as_floats(rng, lw, n):
-    return systematic(rng, normalise(lw), n).astype(float)
-
-
-@faulty("gives_n_particles", "asked to make", exact_size=False)
-def MoreThanAsked(rng, lw, n):
-    return systematic(rng, normalise(lw), n + 1)
-
-
-@faulty("repeats_with_the_same_generator", "draws = False", draws=False)
-def CallsItDrawless(rng, lw, n):
-    return systematic(rng, normalise(lw), n)
-=======
-@faulty("states_a_small_tolerance", "tolerance is 0.9")
-class StatesALargeBias(GreedyCalledProper):
-    tolerance: ClassVar[float] = 0.9
->>>>>>> w5
-
-
 @faulty("batched_runs_equal_single_runs", "are runs mixed", batched=True)
 def MixesRuns(rng, lw, n):
     if lw.ndim == 1:
