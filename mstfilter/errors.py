@@ -148,9 +148,14 @@ def missing_library(error: ImportError, what: str, *hints: str, library: str = "
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
         f"{what} needs {library}, which cannot be imported: {error}",
-        f"pip install {_PACKAGES.get(library, library)}",
+        install_hint(library),
         *hints,
     )
+
+
+def install_hint(library: str) -> str:
+    """How to install a library, by the name of its module."""
+    return f"pip install {_PACKAGES.get(library, library)}"
 
 
 #: What pip installs for a library if the name is another, or the library belongs to an extra of this package.

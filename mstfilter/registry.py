@@ -42,7 +42,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import InputError, missing_library, place_in_user_file, short_path, suggestion
+from mstfilter.errors import InputError, install_hint, missing_library, place_in_user_file, short_path, suggestion
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -405,6 +405,8 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
         place = place_in_user_file(error)
         hints = [place] if place else []
         if isinstance(error, ModuleNotFoundError):
+            missing = str(error.name).partition(".")[0]
+            hints.append(f"if {missing} is a library: {install_hint(missing)}")
             hints.append("a file beside it is found if its folder is in the environment variable PYTHONPATH")
         raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}", *hints) from error
     for cls in _classes_of(module):
