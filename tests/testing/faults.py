@@ -247,14 +247,14 @@ add_faults(
 )
 
 
-@faulty("carried_weight", "equal weight go to the first")
+@faulty("carried_weight", "copies are biased")
 def TiesToTheFirst(rng, lw, n):
     """Finds particles by their weight."""
     _, first, index = np.unique(lw, return_index=True, return_inverse=True)
     return first[index[by_weight(rng, lw, n)]]
 
 
-@faulty("carried_weight", "positions always goes to particle")
+@faulty("carried_weight", "copies are biased")
 def OnePosition(rng, lw, n):
     """The first position always goes to the heaviest particle, if n = m."""
     ancestors = by_weight(rng, lw, n)
@@ -263,7 +263,7 @@ def OnePosition(rng, lw, n):
     return ancestors
 
 
-@faulty("carried_weight", "resampled apart")
+@faulty("carried_weight", "copies are biased")
 def Halves(rng, lw, n):
     """The halves of a population are resampled apart, if n = m is even."""
     weights, half = normalise(lw), n // 2
@@ -320,9 +320,11 @@ weighing(
     "carried_weight", "copies are biased", floor_of_weights=lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0)
 )
 # Particles below a thousandth of the largest weight are dropped, if n = m.
-weighing("carried_weight", "dropped", DropsLight=lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W))
+weighing(
+    "carried_weight", "copies are biased", DropsLight=lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W)
+)
 # A power of the weights, if n = m, or if there are more than a hundred.
-weighing("carried_weight", "flattened", Flattens=lambda W, n: W ** (0.9 if n == len(W) else 1.0))
+weighing("carried_weight", "copies are biased", Flattens=lambda W, n: W ** (0.9 if n == len(W) else 1.0))
 weighing("carried_weight", "125 particles to 5", sharpens_many=lambda W, n: W ** (1.1 if len(W) > 100 else 1.0))
 # If there are more than twenty times as many as are selected, the light ones are left out.
 weighing(
@@ -480,7 +482,7 @@ add_faults(
 )
 
 
-@faulty("carried_weight", "positive weights only")
+@faulty("carried_weight", "by the number of all particles")
 def MeanOfPositive(rng, lw, n):
     """The evidence is the mean of the positive weights."""
     return by_weight(rng, lw, n), np.full(n, log_mean_exp(lw[lw > -np.inf]))
@@ -529,9 +531,9 @@ def ForgetsAncestors(chosen, population, rng, n):
     return Population(chosen.particles, chosen.log_weights)
 
 
-@changing("keeps_parents", '"mate"')
-def LosesMates(chosen, population, rng, n):
-    return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "mate"})
+@changing("keeps_parents", '"proposed"')
+def LosesProposed(chosen, population, rng, n):
+    return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "proposed"})
 
 
 @changing("keeps_parents", '"previous"')

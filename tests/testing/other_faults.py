@@ -199,7 +199,7 @@ def FirstIsSpecial(rng, x, y):
     return x + step
 
 
-@faulty("scale_of_weights_is_irrelevant", "log weights + 50", None, of(Transition, "predict"))
+@faulty("scale_of_weights_is_irrelevant", "do not add it", None, of(Transition, "predict"))
 def NormalisesWeights(rng, population, observation):
     return replace(population, log_weights=np.log(population.weights))
 
@@ -225,7 +225,7 @@ class Guided(Transition):
         return population.moved(new).reweighted(self.sign * change)
 
 
-@faulty(_MOVES, "opposite sign", exact_moves)
+@faulty(_MOVES, "is below", exact_moves)
 @dataclass(frozen=True)
 class WrongSign(Guided):
     sign: float = -1.0
@@ -314,14 +314,7 @@ def step(rng, x, size=1.0):
     return walk(x, size * rng.standard_normal(len(x)))
 
 
-add_faults(_ORDER, "alone (n = 1)", None, move, still_alone=lambda rng, x, y: step(rng, x, float(len(x) > 1)))
-add_faults(
-    _ORDER,
-    "observation=None",
-    None,
-    move,
-    still_without_observation=lambda rng, x, y: x if y is None else step(rng, x),
-)
+add_faults(_MOVES, "n = 1", exact_walk, move, still_alone=lambda rng, x, y: step(rng, x, float(len(x) > 1)))
 add_faults(_MOVES, "and sd", exact_walk, move, wide_step=lambda rng, x, y: step(rng, x, 1.05))
 add_faults(
     _MOVES,
@@ -474,7 +467,7 @@ def PermutesUpdate(rng, out, predicted):
     return Population(out.particles[::-1], out.log_weights[::-1], out.parents)
 
 
-@faulty("scale_of_weights_is_irrelevant", "log weights + 50", None, changed)
+@faulty("scale_of_weights_is_irrelevant", "do not add it", None, changed)
 def ForgetsOldWeights(rng, out, predicted):
     return out if predicted is None or len(out) > len(predicted) else out.reweighted(-predicted.log_weights)
 
@@ -489,32 +482,6 @@ def NoisyWeights(rng, out, predicted):
 def CorrectNoise(rng, out, predicted):
     """Random factors of mean 1."""
     return out.reweighted(np.log(rng.standard_exponential(len(out))))
-
-
-@changed
-def CorrectSelection(rng, out, predicted):
-    """Resamples what it weighted."""
-    return out.select(rng.choice(len(out), len(out), p=out.weights), np.full(len(out), out.log_mean_weight))
-
-
-def thinned(rng, out):
-    """Drops light particles at random; the others carry their weight. Also the share of those that are kept."""
-    p = np.minimum(1.0, 2 * len(out) * out.weights)
-    kept = np.flatnonzero(rng.random(len(out)) < p)
-    return out.select(kept, out.log_weights[kept] - np.log(p[kept])), len(kept) / len(out)
-
-
-@changed
-def CorrectThinning(rng, out, predicted):
-    """Keeps the mean weight."""
-    kept, share = thinned(rng, out)
-    return kept.reweighted(np.full(len(kept), np.log(share)))
-
-
-@faulty(_POSTERIOR, "the mean weight is", exact_evidence, changed)
-def ThinsBySum(rng, out, predicted):
-    """Keeps the sum of the weights instead of their mean."""
-    return thinned(rng, out)[0]
 
 
 # --- proposals ----------------------------------------------------------------------------------------------------
@@ -541,7 +508,7 @@ def one_number_for_two_axes(rng, y, n):
     return SD0 * np.broadcast_to(rng.standard_normal((n, 1)), (n, 2))
 
 
-@faulty(_DRAWN, "opposite sign", exact_prior, proposal)
+@faulty(_DRAWN, "is below", exact_prior, proposal)
 def inverted_weights(rng, y, n):
     x = 1.5 * SD0 * rng.standard_normal(n)
     return x, Normal(0.0, 1.5 * SD0).log_prob(x) - Normal(0.0, SD0).log_prob(x)
@@ -678,7 +645,11 @@ def GlobalRejuvenation(rng, population, previous, observation):
 add_methods(
     Trigger,
     "wants",
-    AbsoluteWeight=("ignores_scale_and_order", "adding", lambda population, t: population.log_weights.max() < 0),
+    AbsoluteWeight=(
+        "scale_of_weights_is_irrelevant",
+        "change its answer",
+        lambda population, t: population.log_weights.max() < 0,
+    ),
     MaybeTrigger=("answers", "True or False", lambda population, t: population.ess),
 )
 add_methods(Size, "choose", HalfSize=("answers", "at least 1", lambda population: len(population) // 2))
@@ -689,19 +660,18 @@ def distances(particles):
     return np.abs(particles[:, None] - particles[None, :])
 
 
-_PAIRS = "pairs_do_not_depend_on_others"
 add_methods(
     Similarity,
     "matrix",
     Distance=("similarities_are_shares", "to itself", distances),
-    RelativeSimilarity=(_PAIRS, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
+    RelativeSimilarity=(_ORDER, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
     OneSided=("similarities_are_shares", "similarity of particles", lambda x: np.tril(np.ones((len(x), len(x))))),
 )
 add_methods(
     Equivalence,
     "classes",
     CountsFromOne=("classes_are_numbered", "classes are", lambda particles: np.arange(1, len(particles) + 1)),
-    AllDifferent=(_PAIRS, "if there are copies", lambda particles: np.arange(len(particles))),
+    AllDifferent=(_ORDER, "if there are copies", lambda particles: np.arange(len(particles))),
 )
 
 
@@ -709,7 +679,7 @@ add_methods(
 add_methods(
     Lookahead,
     "log_priority",
-    LooksAtWeights=("ignores_weights", "changes the priorities", lambda p, y: p.log_weights + p.particles),
+    LooksAtWeights=("ignores_weights", "change the priorities", lambda p, y: p.log_weights + p.particles),
     RulesOut=("scores_are_finite", "-inf", lambda p, y: np.where(p.particles > 1, -np.inf, 0.0)),
     OneForAll=("scores_are_finite", "shape (1,)", lambda p, y: np.zeros(1)),
     ByPlace=(_ORDER, "in another order", lambda p, y: 0.1 * np.arange(len(p))),
@@ -843,6 +813,4 @@ CORRECT = [
 CORRECT_RANDOM = [
     (CorrectNoise(), exact_weights),
     (CorrectNoise(), exact_evidence),
-    (CorrectSelection(), exact_evidence),
-    (CorrectThinning(), exact_evidence),
 ]

@@ -5,10 +5,9 @@ must fulfil (`check_result`). Each ``test_`` method checks one more property; th
 the property, and the message of a failed assertion states how it is violated:
 
 >>> class TriggerContract(Contract):
+...     returns = bool
 ...     def call(self, component, rng, inputs):
 ...         return component.wants(inputs["population"], 0)
-...     def check_result(self, result, inputs):
-...         assert isinstance(result, bool), f"its answer is {result!r}, expected True or False"
 ...     def test_answers_yes_or_no(self):
 ...         \"\"\"It returns True or False.\"\"\"
 ...         self.checked_call(self.make(), self.inputs(5))
@@ -79,6 +78,8 @@ class Contract:
     A contract for another interface defines `inputs`, `call` and `check_result`, and adds tests.
     """
 
+    returns: ClassVar[type] = object  #: type of the result of a call
+
     def make(self) -> Any:
         """The component to test."""
         raise NotImplementedError(f"{type(self).__name__} needs a method make(self) that returns the component")
@@ -97,26 +98,16 @@ class Contract:
         raise NotImplementedError
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        """Assert what the result of every call must fulfil."""
+        """Assert what the result of every call must fulfil, beyond its type."""
 
     def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
         """Use the component once; an exception or a wrong result is reported with a description of the inputs."""
         with reports_errors(inputs):
             result = self.call(component, seeded(3) if rng is None else rng, inputs)
+        kind, expected = type(result).__name__, self.returns.__name__
+        assert isinstance(result, self.returns), f"it returns {kind}, expected {expected}"
         self.check_result(result, inputs)
         return result
-
-    def check_relation(
-        self,
-        inputs: dict[str, Any],
-        changes: dict[str, Any],
-        fault: str,
-        expected: Callable[[Any], Any] = lambda result: result,
-    ) -> None:
-        """Check that changed arguments give the `expected` change of the result, by default the same result."""
-        component = self.make()
-        result = expected(self.checked_call(component, inputs))
-        assert close(self.checked_call(component, {**inputs, **changes}), result), fault
 
     def variants(self) -> list[dict[str, Any]]:
         """Arguments of several calls, for properties that hold for any: six particles; for arrays also one."""
@@ -162,32 +153,58 @@ class Contract:
     def test_repeats_with_the_same_generator(self) -> None:
         """Equal generators give equal results; with ``draws = False`` it does not use its generator."""
         for inputs in self.variants():
-            for seed in (7, 8):
-                rng = seeded(seed)
-                with skips_errors():
-                    a, b = (_plain(self.call(self.fresh(), r, inputs)) for r in (rng, seeded(seed)))
-                assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
-                unused = rng.bit_generator.state == seeded(seed).bit_generator.state
-                assert unused or getattr(self.make(), "draws", True), (
-                    "it declares draws = False and draws from its generator"
-                )
+            rng = seeded(7)
+            with skips_errors():
+                a, b = (_plain(self.call(self.fresh(), r, inputs)) for r in (rng, seeded(7)))
+            assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
+            unused = rng.bit_generator.state == seeded(7).bit_generator.state
+            assert unused or getattr(self.make(), "draws", True), (
+                "it declares draws = False and draws from its generator"
+            )
 
     @prerequisite
     def test_keeps_no_state(self) -> None:
         """A call does not change the result of later calls."""
-        arguments = [(9, 1), (6, 0), (6, 2)]
         used = self.fresh()
-        with skips_errors():
-            expected = [self._plain_call(self.fresh(), *a) for a in arguments]
-            found = [self._plain_call(used, *arguments[k]) for k in (0, 1, 2, 1)]
-        for k, result in zip((0, 1, 2, 1), found, strict=True):
-            assert same(result, expected[k]), (
+        for n, seed in ((9, 1), (6, 0), (6, 2), (6, 0)):
+            inputs = self.inputs(n, seed)
+            with skips_errors():
+                found, expected = (_plain(self.call(c, seeded(1), inputs)) for c in (used, self.fresh()))
+            assert same(found, expected), (
                 "a component that was used before gives another result than a new one: it keeps state, for example "
                 "values of its first call"
             )
 
-    def _plain_call(self, component: Any, n: int, seed: int) -> Any:
-        return _plain(self.call(component, seeded(1), self.inputs(n, seed=seed)))
+
+class ScaleContract(Contract):
+    """Base class of contracts for components that take weighted particles."""
+
+    weighted: ClassVar[str] = "population"  #: name of the argument with the weights
+
+    def weighted_inputs(self) -> list[dict[str, Any]]:
+        """Arguments of calls in which only the argument `weighted` has weights."""
+        return self.variants()
+
+    def test_scale_of_weights_is_irrelevant(self) -> None:
+        """A common factor of the weights has no effect, except that the weights of the result have it too."""
+        component = self.make()
+        for inputs in self.weighted_inputs():
+            population, result = inputs[self.weighted], self.checked_call(component, inputs)
+            for shift in (0.5, 50.0, -50.0, 1e4, -1e4):
+                given = population.reweighted(np.full(len(population), shift))
+                fault = f"log weights + {shift:g} (overflow or underflow?)"
+                try:
+                    with np.errstate(all="ignore"):
+                        found = self.checked_call(component, {**inputs, self.weighted: given})
+                except AssertionError as error:
+                    raise AssertionError(f"{fault}: {error}") from error
+                if not isinstance(result, Population):
+                    assert result == found, f"{fault} change its answer"
+                    continue
+                a, b = (_selected(one) for one in (result, found))
+                assert all(map(close, a, b)), f"{fault} change the particles"
+                kept = close(found.log_weights - shift, result.log_weights)
+                assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
 
 
 @dataclass(frozen=True)
@@ -223,7 +240,12 @@ class BatchedContract(Contract):
             filter = ParticleFilter(n=n, **{"trigger": Always(), **slots, self.slot: component})
             with reports_errors(f"a batch of {n_runs} runs of {n} particles"):
                 last: dict[int, Any] = {}
-                run_many(filter, [y] * 3, range(n_runs), kept=functools.partial(_keep, last))
+
+                def keep(state: State, info: Info, last: dict[int, Any] = last) -> float:
+                    last[state.key.seed] = state.population
+                    return 0.0
+
+                run_many(filter, [y] * 3, range(n_runs), kept=keep)
                 alone = [filter.run([y] * 3, seed)[0].population for seed in range(n_runs)]
             for r, expected in enumerate(alone):
                 assert same(_plain(last[r])[:2], _plain(expected)[:2]), (
@@ -231,15 +253,15 @@ class BatchedContract(Contract):
                 )
 
 
-def _keep(populations: dict[int, Any], state: State, info: Info) -> float:
-    """A collector that keeps the last population of each run."""
-    populations[state.key.seed] = state.population
-    return 0.0
-
-
 def _row_sums(particles: Any, observation: Any) -> np.ndarray:
     """Unequal log weights."""
     return 3 * np.sin(as_matrix(particles)).sum(axis=1)
+
+
+def _selected(population: Population) -> list[np.ndarray]:
+    """Arrays that describe the particles of a result: their parents, and their coordinates if they have some."""
+    numbers = isinstance(population.particles, (np.ndarray, Mapping))
+    return [*population.parents.values(), *([as_matrix(population.particles)] if numbers else [])]
 
 
 def copied(component: Any) -> Any:
@@ -376,8 +398,7 @@ def _writes_to_read_only(error: Exception) -> bool:
 
 
 def close(a: Any, b: Any) -> bool:
-    """Whether numbers, arrays, or the log weights of populations are equal up to rounding."""
-    a, b = (value.log_weights if isinstance(value, Population) else value for value in (a, b))
+    """Whether numbers or arrays are equal up to rounding."""
     return np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=1e-9, atol=2e-9)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import combinations
 from time import process_time
 from typing import Any
@@ -13,27 +12,20 @@ import numpy as np
 from scipy.special import ndtri
 
 from mstfilter.smc import Population
-from mstfilter.smc.testing.contract import FALSE_ALARM, Contract, seeded, skip_unless_properly_weighted
+from mstfilter.smc.testing.contract import FALSE_ALARM, Contract, seeded
 from mstfilter.smc.testing.copies import quantile
 
 
 class PopulationContract(Contract):
     """What contracts share of components that return a population."""
 
-    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        assert isinstance(result, Population), f"it returns {type(result).__name__}, expected a Population"
+    returns = Population
 
-    def check_scale(self, inputs: dict[str, Any], name: str) -> None:
-        """Check that adding a number to the log weights of the population `name` adds it to those of the result."""
-        skip_unless_properly_weighted(self.make())
-        for shift in (50.0, -50.0):
-            shifted = inputs[name].reweighted(np.full(len(inputs[name]), shift))
-            fault = f"log weights + {shift:g} in do not give log weights + {shift:g} out"
-            self.check_relation(inputs, {name: shifted}, fault, partial(_shifted, shift=shift))
-
-
-def _shifted(out: Population, shift: float) -> np.ndarray:
-    return out.log_weights + shift
+    def check_parents(self, result: Population, name: str, n: int) -> None:
+        """Assert that the parents of a name, if there are some, are indices of `n` particles or -1."""
+        index = result.parents.get(name, np.array([-1]))
+        wrong = index[(index < -1) | (index >= n)]
+        assert not len(wrong), f'parents "{name}" contain {wrong[0]}, and there were {n} particles'
 
 
 #: Numbers of exact draws. The second follows if a call with the first takes less than _FAST seconds.
@@ -123,24 +115,6 @@ class ExactContract(PopulationContract):
                 f"{_sd(exact[:, j], samples[1]):.4g}"
             )
 
-    def compare_changed(
-        self, found: np.ndarray, change: np.ndarray, log_g: Any, exact: np.ndarray, exact_lw: np.ndarray
-    ) -> None:
-        """`compare_weighted` for the log weights ``log_g + change``; says if -`change` would be correct."""
-        try:
-            self.compare_weighted(found, log_g + change, exact, exact_lw)
-        except (AssertionError, SkipTest) as error:
-            try:
-                self.compare_weighted(found, log_g - change, exact, exact_lw)
-            except (AssertionError, SkipTest):
-                raise error from None
-            if not np.ptp(change):
-                raise
-            raise AssertionError(
-                "the weighted distribution is right if the change of the log weights has the opposite sign: "
-                "is it log q - log f?"
-            ) from error
-
     def check_independent(self, x: np.ndarray) -> None:
         """Check rank correlations between particles: of neighbours, of halves, and of mirrored positions."""
         half = len(x) // 2
@@ -208,20 +182,6 @@ def _moments_of_scores(
     scores = np.array([z, z * z])
     means = scores @ w
     return means, np.sqrt((scores - means[:, None]) ** 2 @ (w * w))
-
-
-def without_copies(x: np.ndarray, out: Population) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and log weights of a result, without copies of a parent "previous": the first gets the sum of the weights.
-
-    Copies are not independent draws. Particles that are equal and have different parents are.
-    """
-    parent = out.parents.get("previous")
-    if parent is None or len(np.unique(parent)) == len(x):
-        return x, out.log_weights
-    _, first, which = np.unique(np.column_stack([parent, x]), axis=0, return_index=True, return_inverse=True)
-    highest = out.log_weights.max()
-    with np.errstate(divide="ignore"):
-        return x[first], highest + np.log(np.bincount(which.ravel(), np.exp(out.log_weights - highest)))
 
 
 def _sd(x: np.ndarray, w: np.ndarray) -> float:

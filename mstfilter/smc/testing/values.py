@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import io
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from mstfilter.smc import Population
 from mstfilter.smc.testing.contract import (
     BatchedContract,
     Contract,
+    ScaleContract,
     close,
     prerequisite,
     reports_errors,
@@ -21,15 +22,54 @@ from mstfilter.smc.testing.contract import (
 )
 
 _SIZES = (1, 2, 9)
+#: Selections of nine particles.
+_SELECTIONS: dict[str, tuple[np.ndarray, ...]] = {
+    "in another order": (np.arange(9)[::-1], seeded(1).permutation(9)),
+    "if there are copies": (np.repeat(np.arange(9), 2), np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 3, 0])),
+    "if only these are given": (np.array([7, 2, 4, 0, 8]), np.array([5, 1])),
+}
 
 
-class DecisionContract(Contract):
+class RowsContract(Contract):
+    """Properties of components whose result depends on the particles, and not on their order."""
+
+    compared: ClassVar[tuple[str, ...]] = ("in another order", "if there are copies")  #: keys of the selections
+
+    def relation(self, result: Any) -> Any:
+        """What is compared of a result."""
+        return result
+
+    def of_rows(self, relation: Any, rows: np.ndarray) -> Any:
+        """The part of the relation of nine particles that belongs to a selection of them."""
+        return relation[rows]
+
+    def test_order_of_particles_is_irrelevant(self) -> None:
+        """The result for a particle, or a pair, depends neither on the order of the particles nor on copies."""
+        component = self.make()
+        for seed in range(3):
+            inputs = self.inputs(9, seed)
+            every = self.relation(self.checked_call(component, inputs))
+            for when in self.compared:
+                for rows in _SELECTIONS[when]:
+                    given = inputs["population"].take(rows)
+                    found = self.relation(self.checked_call(component, {**inputs, "population": given}))
+                    assert np.allclose(found, self.of_rows(every, rows), rtol=1e-6, atol=1e-6), (
+                        f"the same particles have another result {when}"
+                    )
+
+
+class DecisionContract(ScaleContract, RowsContract):
     """Properties of triggers and sizes, which give one answer per population."""
+
+    compared = ("in another order",)
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {"population": self.example(seeded(seed), n)[0], "t": 2}
 
-    def populations(self) -> list[Population]:
+    def of_rows(self, relation: Any, rows: np.ndarray) -> Any:
+        return relation
+
+    def variants(self) -> list[dict[str, Any]]:
         """1, 2 and 12 particles with unequal weights; 12 with equal ones, a dominant one, zeros, and copies."""
         rng = seeded()
         populations = [self.example(rng, n)[0] for n in (1, 2, 12)]
@@ -38,32 +78,16 @@ class DecisionContract(Contract):
         zeros = np.where(np.arange(12) < 5, -np.inf, 0.0)
         weighted = [Population(particles, lw) for lw in (np.zeros(12), peaked, zeros)]
         copies = populations[-1].take(np.repeat(np.arange(4), 3))
-        return [*populations, *weighted, copies]
+        return [{"population": population, "t": 3} for population in (*populations, *weighted, copies)]
 
     def test_answers(self) -> None:
         """It gives one answer for any population and time: a trigger True or False, a size an integer above 0."""
         component = self.make()
-        for population in self.populations():
+        for inputs in self.variants():
             for t in (0, 1, 7, 10_000):
-                answers = [self.checked_call(component, {"population": population, "t": t}) for _ in range(12)]
+                answers = [self.checked_call(component, {**inputs, "t": t}) for _ in range(12)]
                 assert all(answer == answers[0] for answer in answers), (
                     f"asked twelve times about the same particles it answers {answers}: it keeps state, or draws"
-                )
-
-    def test_ignores_scale_and_order(self) -> None:
-        """It does not depend on a common factor of the weights, nor on the order of the particles."""
-        for population in self.populations():
-            n, inputs = len(population), {"population": population, "t": 3}
-            for shift in (3.0, -3.0, 1000.0, -1000.0, 1e5, -1e5):
-                shifted = population.reweighted(np.full(n, shift))
-                self.check_relation(
-                    inputs, {"population": shifted}, f"adding {shift:g} to all log weights changes its answer"
-                )
-            for order in (np.arange(n)[::-1], np.roll(np.arange(n), 1), seeded(1).permutation(n)):
-                self.check_relation(
-                    inputs,
-                    {"population": population.take(order)},
-                    "another order of the particles changes its answer",
                 )
 
 
@@ -76,7 +100,7 @@ class TriggerContract(BatchedContract, DecisionContract):
         return component.wants(inputs["population"], inputs["t"])
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        assert isinstance(result, (bool, np.bool_)), f"its answer is {result!r}, expected True or False"
+        assert isinstance(result, (bool, np.bool_)), f"it returns {result!r}, expected True or False"
 
 
 class SizeContract(DecisionContract):
@@ -87,10 +111,10 @@ class SizeContract(DecisionContract):
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         valid = isinstance(result, (int, np.integer)) and not isinstance(result, bool) and result >= 1
-        assert valid, f"its answer is {result!r}, expected an int of at least 1"
+        assert valid, f"it returns {result!r}, expected an int of at least 1"
 
 
-class ScoreContract(Contract):
+class ScoreContract(RowsContract):
     """Properties of components that give one number per particle."""
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
@@ -106,14 +130,6 @@ class ScoreContract(Contract):
             wrong = scores[~np.isfinite(scores)]
             assert not len(wrong), f"a score is {wrong[0]}: it rules the particle out, bound it from below"
 
-    def test_order_of_particles_is_irrelevant(self) -> None:
-        """The order of the particles does not matter."""
-        inputs, order = self.inputs(9), seeded(1).permutation(9)
-        fault = "the same particles in another order have other scores"
-        self.check_relation(
-            inputs, {"population": inputs["population"].take(order)}, fault, lambda scores: scores[order]
-        )
-
 
 class LookaheadContract(ScoreContract):
     """The contract of every `Lookahead`."""
@@ -121,33 +137,15 @@ class LookaheadContract(ScoreContract):
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
         return np.asarray(component.log_priority(inputs["population"], inputs["observation"]), dtype=np.float64)
 
-    def test_copies_have_one_score(self) -> None:
-        """A particle and its copy have the same score."""
-        twice = self.inputs(5)["population"].take(np.repeat(np.arange(5), 2))
-        scores = self.checked_call(self.make(), {**self.inputs(5), "population": twice})
-        assert close(scores[::2], scores[1::2]), "a particle and its copy have different scores"
-
     def test_ignores_weights(self) -> None:
         """It does not depend on the weights, which the filter multiplies by the priorities."""
-        inputs = self.inputs(6)
-        for shift in (3.0, 1000.0, -1000.0):
-            shifted = inputs["population"].reweighted(np.full(6, shift))
-            fault = f"adding {shift:g} to all log weights changes the priorities"
-            self.check_relation(inputs, {"population": shifted}, fault)
-        other = inputs["population"].reweighted(np.linspace(0, 2, 6))
-        fault = "other log weights of the same particles change the priorities: the weights would count twice"
-        self.check_relation(inputs, {"population": other}, fault)
-
-    def test_uses_the_observation(self) -> None:
-        """Priorities that differ between particles depend on the observation, if that is an array of numbers."""
-        component, inputs = self.make(), self.inputs(9)
-        y, scores = np.asarray(inputs["observation"]), self.checked_call(component, inputs)
-        if y.dtype.kind != "f" or np.ptp(scores) < 1e-9:
-            return
-        others = [self.checked_call(component, {**inputs, "observation": y + step}) for step in (1.0, -1.0, 0.1)]
-        assert not all(close(scores, other) for other in others), (
-            "the priorities are the same for other observations: it ignores the observation"
-        )
+        component, inputs = self.make(), self.inputs(6)
+        scores = self.checked_call(component, inputs)
+        for log_weights in (np.linspace(0, 2, 6), np.full(6, 1000.0), np.full(6, -1000.0)):
+            population = Population(inputs["population"].particles, log_weights)
+            assert close(self.checked_call(component, {**inputs, "population": population}), scores), (
+                "other log weights of the same particles change the priorities: the weights would count twice"
+            )
 
 
 class ParticlesContract(Contract):
@@ -157,30 +155,13 @@ class ParticlesContract(Contract):
         return {"population": self.example(seeded(seed), n)[0].realised()}
 
 
-class PairsContract(ParticlesContract):
+class PairsContract(ParticlesContract, RowsContract):
     """Properties of similarities and equivalences, which relate pairs of particles."""
 
-    def relation(self, result: np.ndarray) -> np.ndarray:
-        """(n, n) relation of all pairs."""
-        return result
+    compared = tuple(_SELECTIONS)
 
-    def test_pairs_do_not_depend_on_others(self) -> None:
-        """The relation of two particles does not depend on the others, nor on their order; copies are equal."""
-        component, rng = self.make(), seeded(4)
-        selections = {
-            "if only these are given": [rng.permutation(9)[:k] for k in (5, 2)],
-            "in another order": [rng.permutation(9)],
-            "if there are copies": [np.repeat(np.arange(9), 2), np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 3, 0])],
-        }
-        for seed in range(4):
-            population = self.inputs(9, seed)["population"]
-            every = self.relation(self.checked_call(component, {"population": population}))
-            for when, selected in selections.items():
-                for rows in selected:
-                    some = self.relation(self.checked_call(component, {"population": population.take(rows)}))
-                    assert np.allclose(some, every[np.ix_(rows, rows)], atol=1e-6), (
-                        f"of nine particles, {len(set(rows.tolist()))} have other similarities or classes {when}"
-                    )
+    def of_rows(self, relation: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return relation[np.ix_(rows, rows)]
 
 
 class SimilarityContract(PairsContract):
@@ -240,9 +221,9 @@ class CodecContract(ParticlesContract):
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
         return component.encode(inputs["population"].particles)
 
+    returns = Mapping
+
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        kind = type(result).__name__
-        assert isinstance(result, Mapping), f"encode returns {kind}, expected a mapping of names to arrays"
         for name, array in result.items():
             assert isinstance(name, str), f"encode names an array {name!r}, expected a str"
             kind = type(array).__name__
