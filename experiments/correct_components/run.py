@@ -184,7 +184,6 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
         "Chopthin, 4": smc.Chopthin(4.0),
     }
     own = {f"user: {scheme!r}": scheme for scheme in (faults.Correct(), faults.CorrectWeighted(), *faults.CORRECT)}
-    own["user: rejection"] = faults.Rejection()
     own.update({f"user: heaps at {p}": faults.RareHeaps(p) for p in (0.0001, 0.0005, 0.002, 0.01, 0.1, 0.5, 1.0)})
     yield from ((name, scheme, numbers, None) for name, scheme in {**basic, **own}.items())
     for name, scheme in basic.items():

@@ -68,9 +68,7 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
 class EvidenceContract(ScoreContract):
     """The contract of every `Evidence`. The default example is a scene."""
 
-    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """`n` hypotheses and a clip."""
-        return scene_example(rng, n)
+    example = staticmethod(scene_example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
         """Log scores, rounded to 9 digits."""
@@ -98,15 +96,10 @@ class EvidenceContract(ScoreContract):
 class StageContract(Contract):
     """The contract of a stage of MST, which is tested in its place in the proposal, the tracking or the update."""
 
-    def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """`n` hypotheses and a clip."""
-        return scene_example(rng, n)
+    example = staticmethod(scene_example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        return self.step(component, rng, inputs)
-
-    def step(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        """Use the component in its place in a filter."""
+        """The result of the step of a filter that uses the component."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
         if isinstance(owner, Proposal):
@@ -120,24 +113,16 @@ class StageContract(Contract):
                 found = found.take(np.arange(0, len(found), 5))
         return found.realised()
 
-    def checked_step(self, component: Any, inputs: dict[str, Any]) -> None:
-        """Use the component in its place; an exception is reported with a description of the inputs."""
-        with reports_errors(inputs):
-            result = self.step(component, seeded(3), inputs)
-        assert all(isinstance(h, Hypothesis) for h in result.particles), "the result has no hypotheses"
-
     @prerequisite
     def test_works_in_its_place(self) -> None:
-        """It works in a filter: the step that uses it gives hypotheses."""
-        for n in (1, 4):
-            self.checked_step(self.make(), self.inputs(n))
-
-    def test_works_for_an_empty_scene(self) -> None:
-        """It works for hypotheses without objects."""
+        """It works in a filter, also for hypotheses without objects: the step that uses it gives hypotheses."""
         inputs = self.inputs(2)
-        clip = inputs["observation"]
-        empty = Hypothesis.from_labels(np.zeros(clip.grid.shape, np.uint16), clip.grid)
-        self.checked_step(self.make(), {**inputs, "population": Population((empty, empty))})
+        grid = inputs["observation"].grid
+        empty = Hypothesis.from_labels(np.zeros(grid.shape, np.uint16), grid)
+        for given in (self.inputs(1), self.inputs(4), {**inputs, "population": Population((empty, empty))}):
+            with reports_errors(given):
+                result = StageContract.call(self, self.make(), seeded(3), given)
+            assert all(isinstance(h, Hypothesis) for h in result.particles), "the result has no hypotheses"
 
 
 class CompleterContract(StageContract):
@@ -148,31 +133,32 @@ class CompleterContract(StageContract):
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
-    def _case(self, cut: bool = False) -> tuple[Completer, list[ObservedBox], Clip]:
-        """The component, boxes of three objects, and the clip."""
-        component, inputs = self.make(), self.inputs(1)
-        return component, _boxes(component, _correct(inputs), inputs["observation"], cut), inputs["observation"]
+    def _seen(self, cut: bool = False) -> tuple[list[ObservedBox], Clip]:
+        """Boxes of three objects, and the clip."""
+        inputs = self.inputs(1)
+        return _boxes(self.make(), _correct(inputs), inputs["observation"], cut), inputs["observation"]
+
+    def _filled(self, seen: list[ObservedBox], clip: Clip, first: int = 0) -> list[np.ndarray]:
+        with skips_errors():
+            return _estimated(self.make(), seeded(0), seen, clip, first)
 
     def test_works_for_any_box(self) -> None:
         """It works for a box with edges of different lengths, and for one without voxels."""
-        component, seen, clip = self._case()
+        seen, clip = self._seen()
         odd = [_cropped(seen[0], *size) for size in ((7, 6, 5), (0, 0, 0))]
         with reports_errors("boxes of shape (7, 6, 5) and (0, 0, 0)"):
-            _estimated(component, seeded(0), odd, clip)
+            _estimated(self.make(), seeded(0), odd, clip)
 
     def test_follows_what_is_seen(self) -> None:
         """Its probabilities are not constant, and visible surface is probably occupied."""
-        component, seen, clip = self._case()
-        with skips_errors():
-            filled = _estimated(component, seeded(0), seen, clip)
-        fault = fault_of(seen, filled)
-        assert fault is None, f"{type(component).__name__}.fill {fault}"
+        seen, clip = self._seen()
+        fault = fault_of(seen, self._filled(seen, clip))
+        assert fault is None, f"{type(self.make()).__name__}.fill {fault}"
 
     def test_axes_are_those_of_the_grid(self) -> None:
         """The axes of its result are those of the box: reversed, it fits the visible surface less well."""
-        component, seen, clip = self._case(cut=True)
-        with skips_errors():
-            filled = _estimated(component, seeded(0), seen, clip)
+        seen, clip = self._seen(cut=True)
+        filled = self._filled(seen, clip)
         choices = [axes for n in range(4) for axes in combinations(range(3), n)]
         fit = {axes: _on_surface(filled, seen, axes) for axes in choices}
         best = max(choices, key=lambda axes: fit[axes])
@@ -183,12 +169,8 @@ class CompleterContract(StageContract):
 
     def test_objects_do_not_depend_on_others(self) -> None:
         """The result for an object does not depend on the others, nor on their order."""
-        component, seen, clip = self._case()
-        with skips_errors():
-            every, last = (
-                _estimated(component, seeded(0), boxes, clip, first)
-                for boxes, first in ((seen, 0), (seen[-1:], len(seen) - 1))
-            )
+        seen, clip = self._seen()
+        every, last = self._filled(seen, clip), self._filled(seen[-1:], clip, len(seen) - 1)
         assert same(np.asarray(every[-1]), np.asarray(last[0])), (
             "an object is completed differently without the others"
         )

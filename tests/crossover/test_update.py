@@ -17,7 +17,6 @@ from mstfilter.scene import Clip, Crop, Frame, FreeSpace, Hypothesis, NoFreeSpac
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
 from tests.scene.scenes import CAMERA, GRID, table_scene
-from tests.smc.published_updates import ProjectOnto
 
 SMALL = VoxelGrid((0, 0, 0), 0.01, (5, 4, 3))
 labels = hnp.arrays(np.uint16, SMALL.shape, elements=st.sampled_from([0, 0, 1, 2, 3, 65535]))
@@ -164,8 +163,7 @@ def test_without_a_proposal_it_is_the_manifold_filter():
     nowhere[30, 5, 20] = 1
     both = Population((predicted.particles[0], Hypothesis.from_labels(nowhere, GRID)), None, predicted.parents)
     fused = CrossoverUpdate(quality_exponent=2.0).update(np.random.default_rng(0), both, None, clip())
-    onto = ProjectOnto(lambda particles, y: FreeSpace().refine(particles, y)[0])
-    wanted = onto.update(np.random.default_rng(0), both, None, clip()).particles
+    wanted = FreeSpace().refine(both.particles, clip())[0]
     assert [h.key for h in fused.particles] == [h.key for h in wanted]
     assert fused.notes["quality"] == [1.0, 0.0]
     np.testing.assert_allclose(np.diff(fused.log_weights), [2 * np.log(1e-3)])

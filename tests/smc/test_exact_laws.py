@@ -177,19 +177,6 @@ def test_clusters(n, least_mass):
     np.testing.assert_allclose(found, np.exp(GROUPS.log_weights) / 5, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_fearnhead_clifford_and_tempered_optimal(n):
-    population = of(np.arange(4.0), [1.0, 4.0, 1.0, 2.0])
-    want = np.exp(population.log_weights) / 4
-    np.testing.assert_allclose(carried(FearnheadClifford(), population, n, cells=24), want, atol=1e-12)
-    flat = Tempered(FearnheadClifford(), 0.0)
-    np.testing.assert_allclose(carried(flat, population, n, cells=24), want, atol=1e-12)
-    # Square roots of these weights are whole numbers as well.
-    squares = of(np.arange(4.0), [1.0, 4.0, 9.0, 4.0])
-    root = Tempered(Systematic(), 0.5)
-    np.testing.assert_allclose(carried(root, squares, n, cells=8), np.exp(squares.log_weights) / 4, atol=1e-12)
-
-
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_shuffled_and_coalesced(n):
     """All orders of the particles; equal ones merged, whose weight the heaviest carries."""

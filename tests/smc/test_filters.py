@@ -34,7 +34,6 @@ from tests.smc.models import (
     SIGMA,
     SYMBOLS,
     ar1_observations,
-    forward,
     hmm,
     kalman_ar1,
     mean_ratio,
@@ -98,25 +97,6 @@ def test_a_priority_that_says_nothing_changes_nothing():
     flat, _ = auxiliary(AR1, lambda x, y: np.full(len(x), 2.5), 50).run(YS, 3)
     np.testing.assert_allclose(plain.population.particles, flat.population.particles)
     np.testing.assert_allclose(plain.population.log_weights, flat.population.log_weights)
-
-
-@pytest.mark.parametrize("trigger", [Always(), EssBelow(0.5)], ids=lambda t: type(t).__name__)
-def test_a_hidden_chain(trigger):
-    """Evidence within 4 standard errors (6e-5), filtered marginals within 5."""
-    marginals, exact = forward()
-
-    def share(state, info):
-        return np.bincount(state.population.particles, state.population.weights, minlength=3)
-
-    filter = bootstrap(hmm("vector"), 700, trigger=trigger)
-    runs = run_many(filter, SYMBOLS, range(400), z=log_evidence, share=share)
-    ratios = np.exp(runs["z"][:, -1] - exact)
-    shares = runs["share"][:, -1]
-    standard = ratios.std(ddof=1) / np.sqrt(len(ratios))
-    assert abs(ratios.mean() - 1) < 4 * standard
-    assert standard < 0.005
-    error = shares.std(axis=0, ddof=1) / np.sqrt(len(shares))
-    assert (np.abs(shares.mean(axis=0) - marginals[-1]) < 5 * error + 0.005).all()
 
 
 @pytest.mark.parametrize("kind", ["mapping", "objects"])

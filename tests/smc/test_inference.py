@@ -23,7 +23,6 @@ from mstfilter.smc import (
     Population,
     Program,
     Proposal,
-    Reweight,
     StateSpaceModel,
     Transition,
     Uniform,
@@ -56,7 +55,6 @@ from tests.smc.models import (
     predictive,
     states_of,
 )
-from tests.smc.published_updates import CrossVectors
 
 # --- conditional SMC: sweeps from an exact path give an exact path -------------------------------------------------
 
@@ -183,7 +181,7 @@ def test_what_has_no_conditional_form():
     ys = ar1_observations(3)
     for filter, message in (
         (auxiliary(AR1, predictive, 5), "a filter with `lookahead`"),
-        (replace(bootstrap(AR1, 5), update=CrossVectors(AR1.log_likelihood)), "not properly weighted"),
+        (bootstrap(AR1, 5, LargestWeights()), "not properly weighted"),
         (bootstrap(AR1, 1), "n is 1"),
         (replace(bootstrap(AR1, 5), transition=Branching(Dynamics(AR1))), "transition made 20 particles of 5"),
         (replace(bootstrap(AR1, 5), transition=Drift()), "Drift that weights its particles"),
@@ -269,24 +267,6 @@ def test_pmmh_has_the_exact_posterior():
     density = log_prior([rho]) + chains.log_evidence
     np.testing.assert_allclose(chains.log_density, density)
     assert 1 < chains.autocorrelation_times()[0] < 30 and chains.effective_sizes(20)[0] > 100
-
-
-def test_pmmh_is_the_same_in_one_sweep_and_run_by_run():
-    """Also where a run is lost."""
-    one, many = (pmmh(filter_of, YS, log_prior, STARTS[:3], 0.5, 5, batched=b) for b in (False, True))
-    np.testing.assert_array_equal(one.theta, many.theta)
-    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
-
-    def fragile(theta):
-        """Particles far from the observation are impossible, so some proposed coefficients lose their run."""
-
-        def near(x, y):
-            return np.where(np.abs(x - y) < 1.6, 0.0, -np.inf)
-
-        return replace(filter_of(theta, 8), update=Reweight(near, batched=True))
-
-    one, many = (pmmh(fragile, YS[:3], log_prior, STARTS[:6] * 0 + 0.4, 0.5, 10, 3, batched=b) for b in (False, True))
-    np.testing.assert_array_equal(one.theta, many.theta)
 
 
 def test_emcee_over_the_evidence_has_the_exact_posterior():

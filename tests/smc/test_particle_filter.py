@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ from mstfilter.smc import (
     mean,
     run_many,
 )
-from tests.smc.models import filterpy_class, mean_ratio
+from tests.smc.models import filterpy_class
 
 F, Q = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.2, 0.05], [0.05, 0.3]])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.7]])
@@ -77,47 +77,6 @@ def test_bootstrap_filter_agrees_with_kalman(scheme, trigger):
     assert abs(ratios.mean() - 1) < 4.5 * standard
     assert standard < 0.025, "noise could hide a bias"
     assert (np.abs(errors.mean(axis=0)) < 5 * errors.std(axis=0, ddof=1) / np.sqrt(len(errors)) + 0.01).all()
-
-
-def test_resampling_after_the_update_is_unbiased_too():
-    ys = observations(T=6)
-    exact = kalman(ys)[2]
-    ratio, standard, _ = mean_ratio(replace(bootstrap(MODEL, 400), resample="after"), ys, exact, range(150))
-    assert abs(ratio - 1) < 4.5 * standard
-
-
-def test_particles_of_every_kind_give_the_same_numbers():
-    """Objects and a mapping of arrays through the same draws as a vector."""
-    ys = observations(T=5)
-    reference, _ = bootstrap(MODEL, 50).run(ys, 1)
-
-    @dataclass(frozen=True)
-    class Boxed:
-        value: tuple
-
-    def unbox(particles):
-        return np.array([p.value for p in particles])
-
-    def box(array):
-        return tuple(Boxed(tuple(row)) for row in array)
-
-    from mstfilter.smc import StateSpaceModel
-
-    objects = StateSpaceModel(
-        lambda rng, n: box(MODEL.sample_initial(rng, n)),
-        lambda rng, p: box(MODEL.sample_transition(rng, unbox(p))),
-        lambda p, y: MODEL.log_likelihood(unbox(p), y),
-    )
-    mapping = StateSpaceModel(
-        lambda rng, n: {"x": MODEL.sample_initial(rng, n)},
-        lambda rng, p: {"x": MODEL.sample_transition(rng, p["x"])},
-        lambda p, y: MODEL.log_likelihood(p["x"], y),
-    )
-    a, _ = bootstrap(objects, 50).run(ys, 1)
-    b, _ = bootstrap(mapping, 50).run(ys, 1)
-    np.testing.assert_array_equal(unbox(a.population.particles), reference.population.particles)
-    np.testing.assert_array_equal(b.population.particles["x"], reference.population.particles)
-    assert a.log_evidence == b.log_evidence == reference.log_evidence
 
 
 def test_steps_run_and_resumed_runs_are_the_same():

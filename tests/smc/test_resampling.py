@@ -259,14 +259,6 @@ def test_killing_leaves_even_particles_in_their_place():
     np.testing.assert_array_equal(ancestors, np.arange(50))
 
 
-def test_the_evidence_is_kept_and_ancestors_are_recorded():
-    population = Population(np.arange(4.0), np.log([1.0, 2.0, 3.0, 4.0]), {"previous": np.array([3, 2, 1, 0])})
-    out = Systematic().resample(np.random.default_rng(0), population, 9)
-    assert log_mean_exp(out.log_weights) == pytest.approx(log_mean_exp(population.log_weights), abs=1e-14)
-    np.testing.assert_array_equal(out.particles, population.particles[out.parents["ancestor"]])
-    np.testing.assert_array_equal(out.parents["previous"], 3 - out.parents["ancestor"])
-
-
 def test_keep_weights_keeps_them():
     population = Population(np.arange(3.0), np.log([1.0, 5.0, 2.0]))
     out = KeepWeights().resample(np.random.default_rng(0), population, 6)

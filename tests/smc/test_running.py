@@ -7,10 +7,8 @@ import io
 import os
 import pickle
 import re
-import signal
 import subprocess
 import sys
-import time
 import tracemalloc
 from dataclasses import replace
 from functools import partial
@@ -458,38 +456,6 @@ def test_a_hash_follows_the_constants_that_a_function_uses(monkeypatch):
     before = digest(lambda x: FACTOR * x)
     monkeypatch.setitem(globals(), "FACTOR", 3.0)
     assert digest(lambda x: FACTOR * x) != before
-
-
-def killed(kind, path, delays):
-    """Run a script and kill it after each delay."""
-    script = REPOSITORY / "tests" / "smc" / "killed.py"
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    for delay in delays:
-        process = subprocess.Popen([sys.executable, script, kind, path], env=environment, stdout=subprocess.PIPE)
-        process.stdout.readline()  # the run has begun
-        time.sleep(delay)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
-    subprocess.run([sys.executable, script, kind, path], check=True, env=environment)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="kills a process by a signal")
-@pytest.mark.parametrize(("kind", "n_kills"), [("checkpoint", 4), ("run_many", 2)])
-def test_a_killed_run_ends_as_one_that_was_not(kind, n_kills, tmp_path):
-    """Kills at random moments; experiments/reliability stops a run at every operation on files."""
-    whole, path = tmp_path / "whole.npz", tmp_path / "run.npz"
-    killed(kind, whole, [])
-    killed(kind, path, np.random.default_rng(1).uniform(0, 0.12, n_kills))
-    pairs = (
-        [(whole, path)] if kind == "checkpoint" else [(f, path / f.relative_to(whole)) for f in whole.rglob("*.npz")]
-    )
-    assert len(pairs) == (1 if kind == "checkpoint" else 2 * 8 + 1)
-    for files in pairs:
-        with np.load(files[0]) as a, np.load(files[1]) as b:
-            assert a.files == b.files
-            for name in a.files:
-                np.testing.assert_array_equal(a[name], b[name])
 
 
 class Table:

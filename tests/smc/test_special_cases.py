@@ -1,8 +1,7 @@
-"""Rao-Blackwellised, manifold and evolutionary filters: the same driver with other parts."""
+"""Rao-Blackwellised filters: the same driver with other parts."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -14,13 +13,8 @@ from mstfilter.smc import (
     ConditionallyLinear,
     EssBelow,
     Linear,
-    Population,
-    Proposal,
-    bootstrap,
-    linear_gaussian,
     rao_blackwellised,
 )
-from tests.smc.published_updates import CrossVectors, ProjectOnto
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, kalman, observations
 
 YS = observations(6)
@@ -78,79 +72,3 @@ def test_a_switching_model_agrees_with_enumeration(trigger):
     standard = ratios.std(ddof=1) / np.sqrt(len(ratios))
     assert abs(ratios.mean() - 1) < 4 * standard
     assert standard < 0.005
-
-
-def test_projection_onto_an_exact_observation():
-    """H x = y without noise: x + K (y - H x) is distributed as x given y (Matheron), so Kalman's moments hold."""
-    K = P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T)
-    model = linear_gaussian(F, Q, H, R, M0, P0)
-    update = ProjectOnto(lambda x, y: x + (y - x @ H.T) @ K.T)
-    filter = replace(bootstrap(model, 20000), update=update)
-    state, _ = filter.run([np.array([1.3])], 0)
-    x = state.population.particles
-    np.testing.assert_allclose(x @ H.T, 1.3, atol=1e-12)
-    mean, cov = M0 + K @ (1.3 - H @ M0), P0 - K @ H @ P0
-    assert np.abs(x.mean(axis=0) - mean).max() < 5 * np.sqrt(cov.max() / 20000)
-    np.testing.assert_allclose(np.cov(x.T), cov, atol=0.02)
-    assert state.log_evidence is None
-    # The same weights where the likelihood of the projected particles is flat.
-    flat = replace(filter, update=replace(update, log_likelihood=lambda x, y: np.full(len(x), -3.0)))
-    np.testing.assert_array_equal(flat.run([np.array([1.3])], 0)[0].population.weights, state.population.weights)
-
-
-def test_crossover_without_mates_is_the_bootstrap_filter_bit_for_bit():
-    model = linear_gaussian(F, Q, H, R, M0, P0)
-    plain = bootstrap(model, 40)
-    crossed = replace(plain, update=CrossVectors(model.log_likelihood))
-    a, b = plain.run(YS, 4)[0], crossed.run(YS, 4)[0]
-    np.testing.assert_array_equal(a.population.particles, b.population.particles)
-    np.testing.assert_array_equal(a.population.log_weights, b.population.log_weights)
-    assert b.log_evidence is None
-
-
-@dataclass(frozen=True)
-class Around(Proposal):
-    def sample(self, rng, observation, n):
-        return Population(np.column_stack([rng.normal(observation[0], 0.5, n), rng.normal(0, 1, n)]))
-
-
-def test_children_take_each_entry_from_a_parent():
-    model = linear_gaussian(F, Q, H, R, M0, P0)
-    rng = np.random.default_rng(0)
-    predicted = Population(rng.normal(size=(20, 2)), parents={"previous": np.arange(20)})
-    proposed = Population(rng.normal(10, 1, size=(30, 2)), parents={"proposed": np.arange(30)})
-    fused = CrossVectors(model.log_likelihood).update(rng, predicted, proposed, YS[0])
-    assert len(fused) == 20 + 30 + 10
-    for k in range(50, 60):
-        i, j = fused.parents["previous"][k], fused.parents["proposed"][k]
-        child = fused.particles[k]
-        assert all(child[d] in (predicted.particles[i, d], proposed.particles[j, d]) for d in range(2))
-    filter = replace(
-        bootstrap(model, 40),
-        update=CrossVectors(model.log_likelihood, among=True),
-        proposal=Around(),
-        resample="after",
-    )
-    state, infos = filter.run(YS, 0)
-    assert len(state.population) == 40 and infos[0].n_candidates == 40 + 40 + 20
-
-
-def test_crossing_previous_particles_records_both_parents():
-    """Every entry of a child comes from one of its two parents, also through a resampling before the prediction."""
-    model = linear_gaussian(F, 1e-18 * Q, H, R, M0, P0)
-    filter = replace(
-        bootstrap(model, 30, trigger=Always()), transition=None, update=CrossVectors(model.log_likelihood, among=True)
-    )
-    state, before = filter.start(1), None
-    for y in YS[:4]:
-        state, _ = filter.step(state, y)
-        particles, parents = state.population.particles, state.population.parents
-        if before is not None:
-            assert set(parents) >= {"previous", "mate"}
-            first, mate = before[parents["previous"]], before[parents["mate"]]
-            children = parents["mate"] >= 0
-            assert 0 < children.sum() < len(children)
-            assert ((particles == first) | (particles == mate))[children].all()
-            assert (particles == mate)[children].any()
-            assert (particles == first)[~children].all()
-        before = particles

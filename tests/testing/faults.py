@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import random
-import time
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -90,17 +89,6 @@ def CorrectWeighted(rng, lw, n):
     even = (lw > -np.inf) / 1.0
     ancestors = systematic(rng, even, n)
     return ancestors, lw[ancestors] + np.log(even.mean())
-
-
-@selecting
-def Rejection(rng, lw, n):
-    """Draws evenly and accepts with probability w / max w; the cost grows with max w / mean w."""
-    weights = np.exp(lw - lw.max())
-    ancestors, waiting = np.empty(n, int), np.arange(n)
-    while len(waiting):
-        ancestors[waiting] = rng.integers(len(weights), size=len(waiting))
-        waiting = waiting[rng.random(len(waiting)) >= weights[ancestors[waiting]]]
-    return ancestors
 
 
 @dataclass(frozen=True)
@@ -205,12 +193,6 @@ def FirstAlwaysStays(rng, lw, n):
     return np.concatenate([[np.flatnonzero(lw > -np.inf)[0]], drawn])[:n]
 
 
-@biased
-def GreedyCalledProper(rng, lw, n):
-    best = np.argsort(-lw)[: np.isfinite(lw).sum()]
-    return best[np.arange(n) % len(best)]
-
-
 # Counts particles from 1; and the same inside the range.
 add_faults(faulty("gives_n_particles", "expected 0 to"), OffByOne=lambda rng, lw, n: by_weight(rng, lw, n) + 1)
 add_faults(
@@ -295,15 +277,7 @@ def more_than_there_are(rng, lw, n):
 add_faults(
     faulty("carried_weight", "300 particles to 300"),
     eight_bits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
-    # Particles from number 256 on are never selected.
-    block_of_256=lambda rng, lw, n: systematic(rng, normalise(lw)[:256], n),
 )
-
-
-@biased
-def last_is_forgotten(rng, lw, n):
-    found = by_weight(rng, lw, n)
-    return np.where((found == n - 1) & (lw[0] > -np.inf), 0, found) if n == len(lw) else found
 
 
 # --- faults at some weights ---------------------------------------------------------------------------------------
@@ -367,34 +341,6 @@ def SinglePrecisionOverflow(rng, lw, n):
     return systematic(rng, weights / weights.sum(), n)
 
 
-@biased
-def rounds_up(rng, lw, n):
-    """Residual resampling that rounds instead of taking the floor."""
-    copies = np.rint(n * normalise(lw)).astype(int)
-    kept = np.repeat(np.arange(len(lw)), copies)
-    return kept[:n] if len(kept) >= n else np.concatenate([kept, systematic(rng, normalise(lw), n - len(kept))])
-
-
-def selected_at(points, lw):
-    """The particles at points of the cumulated weights."""
-    weights = normalise(lw)
-    return np.minimum(np.searchsorted(np.cumsum(weights), points, side="right"), np.flatnonzero(weights)[-1])
-
-
-add_faults(
-    biased,
-    # The systematic offset lies in the first half of a stratum.
-    offset_of_half=lambda rng, lw, n: selected_at((np.arange(n) + 0.5 * rng.random()) / n, lw),
-    # Strata of width 1 / (n - 1).
-    last_stratum=lambda rng, lw, n: selected_at(
-        np.minimum((np.arange(n) + rng.random(n)) / max(n - 1, 1), 1 - 1e-12), lw
-    ),
-)
-
-
-# --- random numbers and state -------------------------------------------------------------------------------------
-
-
 @faulty("does_not_use_global_generators", "numpy's global generator")
 def global_if_more(rng, lw, n):
     return by_weight(np.random if n > len(lw) else rng, lw, n)
@@ -415,7 +361,6 @@ add_faults(
     # A new generator of unknown seed at each call.
     OwnGenerator=lambda rng, lw, n: systematic(np.random.default_rng(), normalise(lw), n),
     module_generator=lambda rng, lw, n: systematic(_OWN, normalise(lw), n),
-    seeded_by_time=lambda rng, lw, n: systematic(np.random.default_rng(time.time_ns()), normalise(lw), n),
 )
 
 
@@ -437,14 +382,6 @@ class FirstCallCached(WeightResampler):
 
     def select(self, rng, log_weights, n):
         weights = self.cache.setdefault(len(log_weights), normalise(log_weights))
-        return systematic(rng, weights, n), None
-
-
-@faulty("keeps_no_state", "keeps state")
-class EverySecondCall(FirstCallCached):
-    def select(self, rng, log_weights, n):
-        self.cache["calls"] = self.cache.get("calls", 0) + 1
-        weights = normalise(log_weights if self.cache["calls"] % 2 else 0.5 * log_weights)
         return systematic(rng, weights, n), None
 
 
@@ -478,7 +415,6 @@ add_faults(
     faulty("carried_weight", "mean weight after selection"),
     # Equal weights, but not those that keep the evidence.
     WeightsForgotten=lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, -np.log(n))),
-    sum_for_mean=lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, np.logaddexp.reduce(lw))),
 )
 
 
@@ -491,21 +427,6 @@ def MeanOfPositive(rng, lw, n):
 @faulty("scale_of_weights_is_irrelevant", "do not add it")
 def single_precision_output(rng, lw, n):
     return by_weight(rng, lw, n), np.full(n, log_mean_exp(lw)).astype(np.float32)
-
-
-@faulty("carried_weight", "output weights are wrong")
-def weights_of_neighbours(rng, lw, n):
-    """Even draws that carry the weight of another particle."""
-    even = (lw > -np.inf) / 1.0
-    ancestors = systematic(rng, even, n)
-    return ancestors, lw[np.sort(ancestors)[::-1]] + np.log(even.mean())
-
-
-@faulty("batched_runs_equal_single_runs", "are runs mixed", batched=True)
-def MixesRuns(rng, lw, n):
-    if lw.ndim == 1:
-        return by_weight(rng, lw, n)
-    return np.array([systematic(g, normalise(lw.mean(axis=0)), n) for g in rng.generators()]), None
 
 
 # --- particles and parents ----------------------------------------------------------------------------------------
@@ -534,13 +455,6 @@ def ForgetsAncestors(chosen, population, rng, n):
 @changing("keeps_parents", '"proposed"')
 def LosesProposed(chosen, population, rng, n):
     return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "proposed"})
-
-
-@changing("keeps_parents", '"previous"')
-def OldParents(chosen, population, rng, n):
-    """The parents "previous" are those of the first n particles."""
-    previous = np.resize(population.parents.get("previous", np.arange(len(population))), n)
-    return chosen.labelled({**chosen.parents, "previous": previous})
 
 
 @changing("keeps_parents", "not those of the ancestors")

@@ -204,11 +204,6 @@ def NormalisesWeights(rng, population, observation):
     return replace(population, log_weights=np.log(population.weights))
 
 
-@faulty("does_not_use_global_generators", "global generator", None, move)
-def GlobalMove(rng, x, y):
-    return x + np.random.randn()  # noqa: NPY002
-
-
 @dataclass(frozen=True)
 class Guided(Transition):
     """Draws from p(x_t | x_{t-1}, y_t) of the AR(1) model; the weights have a sign."""
@@ -288,12 +283,6 @@ def shared_by_pairs(rng, x, y):
     return walk(x, np.repeat(rng.standard_normal(-(-len(x) // 2)), 2)[: len(x)])
 
 
-@faulty(_ORDER, "do not move independently", None, move)
-def antithetic_halves(rng, x, y):
-    noise = rng.standard_normal(-(-len(x) // 2))
-    return walk(x, np.concatenate([noise, -noise])[: len(x)])
-
-
 @faulty(_MOVES, "mirrored positions", exact_walk, move)
 def mirrored(rng, x, y):
     """Antithetic pairs of the first and the last particle, if there are many."""
@@ -314,7 +303,6 @@ def step(rng, x, size=1.0):
     return walk(x, size * rng.standard_normal(len(x)))
 
 
-add_faults(_MOVES, "n = 1", exact_walk, move, still_alone=lambda rng, x, y: step(rng, x, float(len(x) > 1)))
 add_faults(_MOVES, "and sd", exact_walk, move, wide_step=lambda rng, x, y: step(rng, x, 1.05))
 add_faults(
     _MOVES,
@@ -377,11 +365,6 @@ add_faults(
     WiderDensity=lambda previous, new: Normal(previous, 1.1).log_prob(new),
     DensityOfAnotherMove=lambda previous, new: Normal(RHO * previous, 1.0).log_prob(new),
 )
-
-
-@faulty(_DENSITY, "too certain", None, lambda function: density(function, SIGMA))
-def VarianceForSd(previous, new):
-    return Normal(previous, SIGMA**2).log_prob(new)
 
 
 # --- updates ------------------------------------------------------------------------------------------------------
@@ -493,16 +476,6 @@ def OneTooFew(rng, y, n):
     return rng.standard_normal(max(n - 1, 1))
 
 
-@faulty("keeps_no_state", "keeps state")
-@dataclass(frozen=True)
-class Remembers(Proposal):
-    calls: list = field(default_factory=list)
-
-    def sample(self, rng, observation, n):
-        self.calls.append(n)
-        return Population(rng.standard_normal(n) + len(self.calls))
-
-
 @faulty(_DRAWN, "coordinate 0 of x +", exact_prior_in_plane, proposal)
 def one_number_for_two_axes(rng, y, n):
     return SD0 * np.broadcast_to(rng.standard_normal((n, 1)), (n, 2))
@@ -530,11 +503,6 @@ add_faults(
 @faulty(_DRAWN, "times the variance", exact_prior, proposal)
 def pairs(rng, y, n):
     return SD0 * np.repeat(rng.standard_normal(-(-n // 2)), 2)[:n]
-
-
-@faulty(_DRAWN, "n = 1", exact_prior, proposal)
-def mean_if_single(rng, y, n):
-    return np.zeros(1) if n == 1 else SD0 * rng.standard_normal(n)
 
 
 def _weighed(rng, y, n, factor):
@@ -570,14 +538,13 @@ _KEPT = "keeps_the_distribution"
 _NUMBER = "keeps_number_and_weights"
 
 
-def _metropolis(rng, x, previous, y, step, temperature=1.0, n_uniforms=None):
+def _metropolis(rng, x, previous, y, step, temperature=1.0):
     """A Metropolis step for p(x_t | x_{t-1}, y_t), at a temperature."""
 
     def log_p(v):
         return (Normal(RHO * previous, SIGMA).log_prob(v) + Normal(v, TAU).log_prob(y)) / temperature
 
-    u = rng.random(len(x) if n_uniforms is None else n_uniforms)
-    return np.where(np.log1p(-u) < log_p(x + step) - log_p(x), x + step, x)
+    return np.where(np.log1p(-rng.random(len(x))) < log_p(x + step) - log_p(x), x + step, x)
 
 
 @kernel
@@ -636,11 +603,6 @@ def LosesOne(rng, population, previous, observation):
     return population.take(np.arange(max(1, len(population) - 1)))
 
 
-@faulty("does_not_use_global_generators", "global generator", None, of(Rejuvenation, "move"))
-def GlobalRejuvenation(rng, population, previous, observation):
-    return population.moved(population.particles + np.random.randn())  # noqa: NPY002
-
-
 # --- triggers and sizes -------------------------------------------------------------------------------------------
 add_methods(
     Trigger,
@@ -684,23 +646,6 @@ add_methods(
     OneForAll=("scores_are_finite", "shape (1,)", lambda p, y: np.zeros(1)),
     ByPlace=(_ORDER, "in another order", lambda p, y: 0.1 * np.arange(len(p))),
 )
-
-
-@faulty("keeps_no_state", "keeps state")
-@dataclass(frozen=True)
-class Counts(Lookahead):
-    calls: list = field(default_factory=list)
-
-    def log_priority(self, population, observation):
-        self.calls.append(1)
-        return population.particles * len(self.calls)
-
-
-@faulty("does_not_change_input", "in place", None, of(Lookahead, "log_priority"))
-def PriorityInPlace(population, observation):
-    particles = population.particles.base if population.particles.base is not None else population.particles
-    particles *= 2
-    return particles
 
 
 # --- codecs -------------------------------------------------------------------------------------------------------
@@ -759,9 +704,6 @@ _COPIES = "copies_score_the_same"
 add_methods(
     Evidence,
     "log_score",
-    RulesOutOdd=("scores_are_finite", "-inf", lambda h, clip: np.where(np.arange(len(h)) % 2, -np.inf, 0.0)),
-    FirstIsBest=(_ORDER, "another order", lambda h, clip: -np.arange(float(len(h)))),
-    OneScore=("scores_are_finite", "shape (1,)", lambda h, clip: np.zeros(1)),
     HighNamesWin=(_COPIES, "other numbers", lambda h, clip: np.array([float(one.labels.max()) for one in h])),
 )
 
@@ -773,30 +715,6 @@ def ByIdentity(hypotheses, clip):
     return np.array([float(born[id(h.objects)]) for h in hypotheses])
 
 
-@faulty("keeps_no_state", "keeps state")
-@dataclass(frozen=True)
-class GrowsTired(Evidence):
-    asked: list = field(default_factory=list)
-
-    def log_score(self, hypotheses, clip):
-        self.asked.append(clip)
-        return np.full(len(hypotheses), -float(len(self.asked)))
-
-
-# --- faults that are not found, and correct components ------------------------------------------------------------
-
-
-@kernel
-def one_uniform(rng, x, previous, y):
-    """One uniform number decides for all particles."""
-    return _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)), n_uniforms=1)
-
-
-#: Faults that are not found, and why.
-NOT_FOUND = {
-    one_uniform: "a random number that decides for all particles may also be a choice between two kernels, which is "
-    "valid; the moves of a particle have the right distribution in any number of calls",
-}
 #: Correct components and their exact draws.
 CORRECT = [
     (CorrectDensity(), exact_density),

@@ -6,7 +6,6 @@ False alarms: each contract has three statistical properties at 1e-6, so below 2
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from unittest import SkipTest
 
 import numpy as np
 import pytest
@@ -48,19 +47,7 @@ class TestCorrectWeighted(WeightResamplerContract):
 
 @pytest.mark.parametrize("scheme", CORRECT, ids=lambda scheme: type(scheme).__name__)
 def test_correct_schemes_pass(scheme):
-    results = run_contract(scheme)
-    assert [r for r in results if r.failure] == []
-    assert all("too slow" in r.skipped for r in results if r.skipped)
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("largest_weight", "too slow at this weight"), ("many_particles", "max w / mean w = 1e5")],
-)
-def test_what_costs_too_much_is_left_out_by_count(name, words):
-    """The cost of `Rejection` grows with max w / mean w."""
-    with pytest.raises(SkipTest, match=words):
-        run_property(faults.Rejection(), name)
+    assert [r for r in run_contract(scheme) if r.failure or r.skipped] == []
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
@@ -72,7 +59,7 @@ def test_planted_faults_are_reported(fault):
 
 
 def test_no_planted_fault_is_lost():
-    assert len(FAULTS) == 62
+    assert len(FAULTS) == 50
 
 
 def test_the_global_generators_are_restored():

@@ -72,10 +72,10 @@ def test_faults_are_errors_of_a_run_and_of_the_contract(name):
 
 
 @pytest.mark.parametrize("kind", [faults.CompletesMany, faults.CompletesEach])
-@pytest.mark.parametrize("fault", faults.PROBABILITIES)
+@pytest.mark.parametrize("fault", ["logits", "one nan", "axes", "none", "list", "exception"])
 def test_faulty_probabilities_of_other_methods_are_errors(kind, fault):
     change, words = faults.PROBABILITIES[fault]
-    if kind is faults.CompletesEach and fault in ("axes", "one more axis", "flat", "one for the object"):
+    if kind is faults.CompletesEach and fault == "axes":
         words = "returns shape"
     message = message_of(kind(change=change))
     assert words in message and (f"{kind.__name__}." in message or fault == "exception")

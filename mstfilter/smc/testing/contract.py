@@ -18,7 +18,6 @@ pytest is not imported: `SkipTest` skips a test, in pytest too.
 from __future__ import annotations
 
 import copy
-import functools
 import inspect
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,20 +29,7 @@ from unittest import SkipTest
 import numpy as np
 
 from mstfilter.errors import InputError, describe_error
-from mstfilter.smc import (
-    Always,
-    Info,
-    ParticleFilter,
-    Population,
-    Proposal,
-    Reweight,
-    RunGenerators,
-    State,
-    Systematic,
-    as_matrix,
-    run_many,
-    union,
-)
+from mstfilter.smc import Population, as_matrix
 
 #: Largest probability that a statistical test fails for a correct component.
 FALSE_ALARM = 1e-6
@@ -205,57 +191,6 @@ class ScaleContract(Contract):
                 assert all(map(close, a, b)), f"{fault} change the particles"
                 kept = close(found.log_weights - shift, result.log_weights)
                 assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
-
-
-@dataclass(frozen=True)
-class _Examples(Proposal):
-    """The particles of an example, as the first ones of a filter."""
-
-    example: Callable[..., Any]
-
-    batched: ClassVar[bool] = True
-
-    def sample(self, rng: Any, observation: Any, n: int) -> Population:
-        if not isinstance(rng, RunGenerators):
-            return Population(self.example(rng, n)[0].particles)
-        parts = [Population(self.example(g, n // len(rng))[0].particles) for g in rng.generators()]
-        return functools.reduce(union, parts)
-
-
-class BatchedContract(Contract):
-    """Base class of contracts for components that may work on the particles of several runs together."""
-
-    slot: ClassVar[str]  #: of a `ParticleFilter` that takes the component
-
-    def test_batched_runs_equal_single_runs(self) -> None:
-        """If it declares ``batched = True``, every run of a batch equals the run alone."""
-        component = self.make()
-        if not component.batched:
-            return
-        example = number_example if self.slot in ("resampler", "trigger") else self.example  # they use weights only
-        y = example(seeded(), 2)[1]
-        slots = {"initial": _Examples(example), "update": Reweight(_row_sums, True), "resampler": Systematic()}
-        # The numbers of runs include that of the particles, since arrays of another axis fit then.
-        for n, n_runs in ((5, 3), (5, 5), (1, 4), (4, 1)):
-            filter = ParticleFilter(n=n, **{"trigger": Always(), **slots, self.slot: component})
-            with reports_errors(f"a batch of {n_runs} runs of {n} particles"):
-                last: dict[int, Any] = {}
-
-                def keep(state: State, info: Info, last: dict[int, Any] = last) -> float:
-                    last[state.key.seed] = state.population
-                    return 0.0
-
-                run_many(filter, [y] * 3, range(n_runs), kept=keep)
-                alone = [filter.run([y] * 3, seed)[0].population for seed in range(n_runs)]
-            for r, expected in enumerate(alone):
-                assert same(_plain(last[r])[:2], _plain(expected)[:2]), (
-                    f"run {r} of {n_runs} runs of {n} particles in a batch is not the run alone: are runs mixed?"
-                )
-
-
-def _row_sums(particles: Any, observation: Any) -> np.ndarray:
-    """Unequal log weights."""
-    return 3 * np.sin(as_matrix(particles)).sum(axis=1)
 
 
 def _selected(population: Population) -> list[np.ndarray]:

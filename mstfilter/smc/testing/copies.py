@@ -1,4 +1,4 @@
-"""What particles carry after a resampling: test cases, their statistics, likely faults, and generators that count.
+"""What particles carry after a resampling: test cases, their statistics, and likely faults.
 
 A `Case` is a list of weights and a number of particles to select. A `Sample` collects over many calls what each
 particle and each group of particles carries, in units of the total weight. `fault_message` compares its mean with the
@@ -7,7 +7,6 @@ weights and names the likely fault.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
@@ -75,8 +74,6 @@ CASES = (
 #: multinomial copies.
 HEAVY_CASES = (Case(_mixed(8, 0.4985), 2001, 1700),)
 HEAVY_CASES_OF_WEIGHTS = (*HEAVY_CASES, Case(_mixed(2000, 0.49983), 2000, 500))
-#: Random numbers that a case may draw; a call of a generator counts as 15 numbers.
-BUDGET = 40_000_000
 #: A case with a deviation of this many standard errors gets more calls, up to so many times as many as at first.
 _SUSPICIOUS = 4.0
 MOST_CALLS = 16
@@ -202,45 +199,15 @@ def log_of(weights: Any) -> np.ndarray:
         return np.log(np.asarray(weights, dtype=np.float64))
 
 
-class CountingGenerator(np.random.Generator):
-    """The generator ``default_rng(seed)``, which counts what it draws and skips the test beyond a budget.
+class ConstantGenerator(np.random.Generator):
+    """A generator whose `random` always returns one value. A scheme that does not end with it is skipped."""
 
-    `budget` is in numbers; a call counts as 15 numbers. `slow` is the reason of the skip.
-    """
-
-    def __init__(self, seed: int, budget: int, slow: str) -> None:
-        super().__init__(np.random.PCG64(np.random.SeedSequence(seed)))
-        self.budget, self.slow, self.drawn = budget, slow, 0
-
-    def count(self, size: int) -> None:
-        self.drawn += size + 15
-        if self.drawn > self.budget:
-            raise SkipTest(f"{self.slow}: more than {self.budget:.3g} random numbers are drawn")
-
-
-def _counted(name: str) -> Callable[..., Any]:
-    draw = getattr(np.random.Generator, name)
-
-    def method(self: CountingGenerator, *arguments: Any, **named: Any) -> Any:
-        result = draw(self, *arguments, **named)
-        self.count(np.size(result))
-        return result
-
-    return method
-
-
-for _name, _value in vars(np.random.Generator).items():
-    if callable(_value) and not _name.startswith("_") and _name not in ("spawn", "shuffle"):
-        setattr(CountingGenerator, _name, _counted(_name))
-
-
-class ConstantGenerator(CountingGenerator):
-    """A generator whose `random` always returns the same value."""
-
-    def __init__(self, value: float, budget: int) -> None:
-        super().__init__(0, budget, "constant")
-        self._value = value
+    def __init__(self, value: float) -> None:
+        super().__init__(np.random.PCG64(0))
+        self._value, self._calls = value, 0
 
     def random(self, size=None, dtype=np.float64, out=None):  # type: ignore[no-untyped-def]
-        self.count(int(np.prod(size or ())))
+        self._calls += 1
+        if self._calls > 10_000:
+            raise SkipTest("it does not end")
         return self._value if size is None else np.full(size, self._value)

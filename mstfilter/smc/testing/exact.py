@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import combinations
 from time import process_time
 from typing import Any
 from unittest import SkipTest
 
 import numpy as np
-from scipy.special import ndtri
 
 from mstfilter.smc import Population
 from mstfilter.smc.testing.contract import FALSE_ALARM, Contract, seeded
@@ -28,9 +27,8 @@ class PopulationContract(Contract):
         assert not len(wrong), f'parents "{name}" contain {wrong[0]}, and there were {n} particles'
 
 
-#: Numbers of exact draws. The second follows if a call with the first takes less than _FAST seconds.
+#: Numbers of exact draws: the second if a call with the first takes less than _FAST seconds.
 _DRAWS, _FAST = (10_000, 200_000), 0.04
-SINGLE = 400  # number of tests of a single particle
 _TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025)
 _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reversed(_TAILS))])
 
@@ -44,7 +42,7 @@ class ExactContract(PopulationContract):
     the weights f / q of a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
 
     The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 of them the tests find a
-    standard deviation that is 2 % off, and a shift by 3 % of it. They also find a cut of the tails that holds 0.1 %
+    standard deviation that is 3 % off, and a shift by 3 % of it. They also find a cut of the tails that holds 0.1 %
     of the probability and a correlation of 0.02 between particles.
     """
 
@@ -56,18 +54,16 @@ class ExactContract(PopulationContract):
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
         return self.exact(seeded(seed), n)
 
-    def numbers_of_draws(self, call: Callable[[int], Any]) -> Iterator[int]:
-        """Numbers of draws of a test that does ``call(n)``: 10,000, and 200,000 if that is fast."""
-        yield _DRAWS[0]
+    def number_of_draws(self, call: Callable[[int], Any]) -> int:
+        """Number of draws of a test that does ``call(n)``: 200,000, or 10,000 if the component is slow."""
         start = process_time()
         call(_DRAWS[0])
-        if process_time() - start < _FAST:
-            yield _DRAWS[1]
+        return _DRAWS[process_time() - start < _FAST]
 
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
         """Compare the weighted distributions of rows: of each column, and of the sums of pairs of columns.
 
-        Probabilities of intervals, means and spreads are compared. The sums find columns that share a random number.
+        Probabilities of intervals are compared. The sums find columns that share a random number.
 
         The difference of two weighted means is normal up to errors that a twentieth of the level allows for. A tail
         is compared if its probability is that of 50 of the largest weights, so that no rare weight is decisive.
@@ -89,28 +85,17 @@ class ExactContract(PopulationContract):
         levels = _LEVELS[np.minimum(_LEVELS, 1 - _LEVELS) >= min(least, 0.05)]
         for j in range(found.shape[1]):
             order = np.argsort(exact[:, j])
-            cumulative = np.cumsum(samples[1][order])[:-1]
-            limits = exact[order[cumulative.searchsorted(levels)], j]
+            limits = exact[order[np.cumsum(samples[1][order])[:-1].searchsorted(levels)], j]
             (p, s), (q, r) = (
                 _weighted_fractions(x[:, j], w, limits) for x, w in zip((found, exact), samples, strict=True)
             )
             what = self.columns(j, d) if j < d else " + ".join(self.columns(k, d) for k in pairs[j - d])
-            bound = quantile(4 * len(_DRAWS) * 20 * found.shape[1] * len(limits)) * np.hypot(s, r) + 1e-9
+            bound = quantile(4 * 20 * found.shape[1] * len(limits)) * np.hypot(s, r) + 1e-9
             excess = np.abs(p - q) - bound
             k = int(np.argmax(excess))
             assert excess[k] <= 0, (
                 f"the weighted distribution is wrong: {what} is below {limits[k]:.3g} with probability {p[k]:.4f}, "
-                f"expected {q[k]:.4f}"
-            )
-            # The mean and the spread, by normal scores: they have more power against a shift and another scale.
-            F = np.concatenate([[0.0], cumulative, [1.0]])
-            (p, s), (q, r) = (
-                _moments_of_scores(x[:, j], w, exact[order, j], F, min(max(least, 1e-4), 0.05))
-                for x, w in zip((found, exact), samples, strict=True)
-            )
-            wrong = np.abs(p - q) > quantile(2 * len(_DRAWS) * 20 * found.shape[1] * 2) * np.hypot(s, r) + 1e-9
-            assert not wrong.any(), (
-                f"the weighted distribution is wrong: {what} has mean {samples[0] @ found[:, j]:.4g} and sd "
+                f"expected {q[k]:.4f}; it has mean {samples[0] @ found[:, j]:.4g} and sd "
                 f"{_sd(found[:, j], samples[0]):.4g}, expected {samples[1] @ exact[:, j]:.4g} and "
                 f"{_sd(exact[:, j], samples[1]):.4g}"
             )
@@ -123,16 +108,11 @@ class ExactContract(PopulationContract):
             f"particles {half} positions apart": (x[:half], x[half:]),
             "particles at mirrored positions": (x[:half], x[::-1][:half]),
         }
-        n_tests = len(_DRAWS) * 20 * len(pairs) * x.shape[1]
+        n_tests = 20 * len(pairs) * x.shape[1]
         for j in range(x.shape[1]):
             for who, (a, b) in pairs.items():
                 n = min(len(a), len(b))
                 check_uncorrelated(a[:n, j], b[:n, j], n_tests, f"{self.columns(j, x.shape[1])} of {who}")
-
-    def check_single(self, find: Callable[[int], np.ndarray], exact: np.ndarray) -> None:
-        """Check that particles alone, ``find(row)`` (d,), have the distribution of the rows of `exact`."""
-        alone = np.array([find(row) for row in range(SINGLE)])
-        check_same_law(alone, exact, 1, "a single particle (n = 1) has another distribution")
 
     #: Whether the second half of the columns are differences from the particles before.
     moves = False
@@ -170,20 +150,6 @@ def _weighted_fractions(x: np.ndarray, w: np.ndarray, limits: np.ndarray) -> tup
     return p, np.sqrt(np.maximum(below * (1 - 2 * p) + total * p * p, 0.0))
 
 
-def _moments_of_scores(
-    x: np.ndarray, w: np.ndarray, exact: np.ndarray, F: np.ndarray, least: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means of z and z^2, and standard errors: z is the normal quantile of the rank of x in sorted draws.
-
-    `F` (n + 1,) are the cumulative weights of the draws; ranks nearer to 0 or 1 than `least` are moved there.
-    """
-    rank = (F[exact.searchsorted(x)] + F[exact.searchsorted(x, side="right")]) / 2
-    z = ndtri(np.clip(rank, least, 1 - least))
-    scores = np.array([z, z * z])
-    means = scores @ w
-    return means, np.sqrt((scores - means[:, None]) ** 2 @ (w * w))
-
-
 def _sd(x: np.ndarray, w: np.ndarray) -> float:
     """Weighted standard deviation."""
     return float(np.sqrt(w @ (x - w @ x) ** 2))
@@ -213,7 +179,7 @@ def check_same_law(found: np.ndarray, expected: np.ndarray, n_tests: int, fault:
 
 def check_mean_weight(w: np.ndarray, v: np.ndarray) -> None:
     """Check that two samples of weights have one mean."""
-    bound = quantile(2 * len(_DRAWS) * 20) * np.hypot(w.std() / len(w) ** 0.5, v.std() / len(v) ** 0.5) + 1e-9
+    bound = quantile(2 * 20) * np.hypot(w.std() / len(w) ** 0.5, v.std() / len(v) ** 0.5) + 1e-9
     assert abs(w.mean() - v.mean()) <= bound, (
         f"the mean weight is {w.mean():.4g}, expected {v.mean():.4g}: constant factors change the evidence"
     )

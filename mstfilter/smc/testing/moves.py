@@ -12,7 +12,6 @@ import numpy as np
 from mstfilter.smc import DensityTransition, Population, as_matrix
 from mstfilter.smc.population import take
 from mstfilter.smc.testing.contract import (
-    BatchedContract,
     ScaleContract,
     reports_errors,
     same,
@@ -22,7 +21,6 @@ from mstfilter.smc.testing.contract import (
 )
 from mstfilter.smc.testing.copies import quantile
 from mstfilter.smc.testing.exact import (
-    SINGLE,
     ExactContract,
     check_mean_weight,
     check_same_law,
@@ -33,7 +31,7 @@ from mstfilter.smc.testing.exact import (
 _N = 6
 
 
-class TransitionContract(BatchedContract, ScaleContract, ExactContract):
+class TransitionContract(ScaleContract, ExactContract):
     """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
 
     One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
@@ -41,7 +39,6 @@ class TransitionContract(BatchedContract, ScaleContract, ExactContract):
     transition weights by the observation, the population of x_t has these weights.
     """
 
-    slot = "transition"
     moves = True
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
@@ -75,25 +72,23 @@ class TransitionContract(BatchedContract, ScaleContract, ExactContract):
         """Weighted moves have the distribution of the model, also jointly with x_{t-1}, and keep the total weight."""
         component = skip_unless_properly_weighted(self.make())
 
-        def moved(n: int, missing: bool = False, row: int | None = None) -> tuple[Population, Population]:
-            """Particles and their moves; of a single one, for the `row` of the exact draws."""
+        def moved(n: int, missing: bool = False) -> tuple[Population, Population]:
+            """Particles and their moves."""
             population, _, observation, *_ = self.exact_case(1, n)
-            population = population.take(seeded(4).permutation(n) if row is None else np.array([row]))
+            population = population.take(seeded(4).permutation(n))
             inputs = {"population": population, "observation": None if missing else observation}
-            after = self.checked_call(component, inputs, seeded(2 if row is None else row))
+            after = self.checked_call(component, inputs, seeded(2))
             return population.take(after.parents.get("previous", np.arange(len(after)))), after
 
-        for n in self.numbers_of_draws(moved):
-            before, after = moved(n)
-            other, fresh, _, *likelihood = self.exact_case(3, n)
-            self._compare_moves(before, after, other, fresh, likelihood)
-            guided = not same(after.log_weights, before.log_weights)
-            if guided and not np.ptp(fresh.log_weights):
-                self._compare_moves(*moved(n, missing=True), other, fresh, [])
-            if len(after) == n:
-                self.check_independent(_columns(before, after))
-        if not guided and len(after) == n:
-            self.check_single(lambda row: _columns(*moved(SINGLE, row=row))[0], _columns(other, fresh))
+        n = self.number_of_draws(moved)
+        before, after = moved(n)
+        other, fresh, _, *likelihood = self.exact_case(3, n)
+        self._compare_moves(before, after, other, fresh, likelihood)
+        guided = not same(after.log_weights, before.log_weights)
+        if guided and not np.ptp(fresh.log_weights):
+            self._compare_moves(*moved(n, missing=True), other, fresh, [])
+        if len(after) == n:
+            self.check_independent(_columns(before, after))
 
     def _compare_moves(
         self, before: Population, after: Population, other: Population, fresh: Population, likelihood: list[Any]
@@ -201,15 +196,13 @@ class DensityTransitionContract(TransitionContract):
             return np.asarray(component.log_prob(old, moved.particles, inputs["observation"]))
 
 
-class ProposalContract(BatchedContract, ExactContract):
+class ProposalContract(ExactContract):
     """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
     particles, and the observation. For the initial proposal these are draws of p(x_0). A third item
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
     """
-
-    slot = "initial"
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {"observation": self.example(seeded(0), 2)[1], "n": n}
@@ -233,13 +226,13 @@ class ProposalContract(BatchedContract, ExactContract):
             observation = self.exact_case(1, 1)[1]
             return self.checked_call(component, {"observation": observation, "n": n}, seeded(seed))
 
-        for n in self.numbers_of_draws(sampled):
-            found = sampled(n)
-            fresh, _, *likelihood = self.exact_case(3, n)
-            log_g, exact_g = (sum(log_g(p.particles) for log_g in likelihood) for p in (found, fresh))
-            x, exact, exact_lw = as_matrix(found.particles), as_matrix(fresh.particles), fresh.log_weights + exact_g
-            self.compare_weighted(x, found.log_weights + log_g, exact, exact_lw)
-            check_mean_weight(np.exp(found.log_weights + log_g), np.exp(exact_lw))
+        n = self.number_of_draws(sampled)
+        found = sampled(n)
+        fresh, _, *likelihood = self.exact_case(3, n)
+        lw, exact_lw = (p.log_weights + sum(log_g(p.particles) for log_g in likelihood) for p in (found, fresh))
+        x = as_matrix(found.particles)
+        self.compare_weighted(x, lw, as_matrix(fresh.particles), exact_lw)
+        check_mean_weight(np.exp(lw), np.exp(exact_lw))
         means = np.array([as_matrix(sampled(100, seed).particles).mean(axis=0) for seed in range(100, 500)])
         with np.errstate(invalid="ignore"):
             ratio = 100 * means.var(axis=0) / x.var(axis=0)
@@ -248,11 +241,9 @@ class ProposalContract(BatchedContract, ExactContract):
             f"means of 100 draws have {ratio.max():.3g} times the variance of independent ones: is a random number "
             "used for several particles?"
         )
-        if not np.ptp(found.log_weights) and not np.ptp(fresh.log_weights):
-            self.check_single(lambda row: as_matrix(sampled(1, row + 10).particles)[0], exact)
 
 
-class UpdateContract(BatchedContract, ScaleContract, ExactContract):
+class UpdateContract(ScaleContract, ExactContract):
     """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of
@@ -261,7 +252,7 @@ class UpdateContract(BatchedContract, ScaleContract, ExactContract):
     item of `exact` is log p(y), a number.
     """
 
-    slot, weighted = "update", "predicted"
+    weighted = "predicted"
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         predicted, observation = self.example(seeded(seed), n)
@@ -331,19 +322,19 @@ class UpdateContract(BatchedContract, ScaleContract, ExactContract):
             inputs = {"predicted": predicted, "proposed": None, "observation": observation}
             return predicted, self.checked_call(component, inputs, seeded(seed))
 
-        for n in self.numbers_of_draws(updated):
-            predicted, out = updated(n)
-            _, weighted, _, *evidence = self.exact_case(1, n)
-            if not same(out.particles, predicted.particles):
-                raise SkipTest("it makes other particles than the predicted ones")
-            repeats = same(out.log_weights, updated(n, seed=5)[1].log_weights)
-            if repeats and same(weighted.particles, predicted.particles):
-                compare_factors(out.log_weights, weighted.log_weights)
-            _, exact, *_ = self.exact_case(3, n)
-            x, lw = as_matrix(out.particles), out.log_weights
-            self.compare_weighted(x, lw, as_matrix(exact.particles), exact.log_weights)
-            for log_evidence in evidence:
-                check_mean_weight(np.exp(lw - predicted.log_mean_weight - log_evidence), np.ones(n))
+        n = self.number_of_draws(updated)
+        predicted, out = updated(n)
+        _, weighted, _, *evidence = self.exact_case(1, n)
+        if not same(out.particles, predicted.particles):
+            raise SkipTest("it makes other particles than the predicted ones")
+        repeats = same(out.log_weights, updated(n, seed=5)[1].log_weights)
+        if repeats and same(weighted.particles, predicted.particles):
+            compare_factors(out.log_weights, weighted.log_weights)
+        _, exact, *_ = self.exact_case(3, n)
+        x, lw = as_matrix(out.particles), out.log_weights
+        self.compare_weighted(x, lw, as_matrix(exact.particles), exact.log_weights)
+        for log_evidence in evidence:
+            check_mean_weight(np.exp(lw - predicted.log_mean_weight - log_evidence), np.ones(n))
 
 
 class RejuvenationContract(ExactContract):
@@ -376,25 +367,23 @@ class RejuvenationContract(ExactContract):
         """It leaves p(x_t | x_{t-1}, y_t) unchanged, and moves particles independently."""
         component = skip_unless_properly_weighted(self.make())
 
-        def moved(n: int, row: int | None = None) -> np.ndarray:
-            """x_t, and x_t - x_{t-1}, of exact draws, or of one of them alone, after five moves."""
+        def moved(n: int) -> np.ndarray:
+            """x_t, and x_t - x_{t-1}, of exact draws after five moves."""
             previous, population, observation = self.exact_case(1, n)
-            rows = seeded(4).permutation(n) if row is None else np.array([row])
+            rows, rng = seeded(4).permutation(n), seeded(2)
             previous, population = None if previous is None else previous.take(rows), population.take(rows)
-            rng = seeded(2 if row is None else row)
             for _ in range(5):
                 inputs = {"population": population, "previous": previous, "observation": observation}
                 population = self.checked_call(component, inputs, rng)
             return _columns(previous, population)
 
-        for n in self.numbers_of_draws(moved):
-            found, exact = moved(n), _columns(*self.exact_case(3, n)[:2])
-            try:
-                self.compare_weighted(found, np.zeros(n), exact, np.zeros(n))
-            except AssertionError as error:
-                raise AssertionError(f"exact draws are no longer exact after five moves: {error}") from error
-            self.check_independent(found)
-        self.check_single(lambda row: moved(SINGLE, row)[0], exact)
+        n = self.number_of_draws(moved)
+        found, exact = moved(n), _columns(*self.exact_case(3, n)[:2])
+        try:
+            self.compare_weighted(found, np.zeros(n), exact, np.zeros(n))
+        except AssertionError as error:
+            raise AssertionError(f"exact draws are no longer exact after five moves: {error}") from error
+        self.check_independent(found)
 
     @property
     def moves(self) -> bool:  # type: ignore[override]

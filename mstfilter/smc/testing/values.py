@@ -11,7 +11,6 @@ import numpy as np
 
 from mstfilter.smc import Population
 from mstfilter.smc.testing.contract import (
-    BatchedContract,
     Contract,
     ScaleContract,
     close,
@@ -91,10 +90,8 @@ class DecisionContract(ScaleContract, RowsContract):
                 )
 
 
-class TriggerContract(BatchedContract, DecisionContract):
+class TriggerContract(DecisionContract):
     """The contract of every `Trigger`."""
-
-    slot = "trigger"
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
         return component.wants(inputs["population"], inputs["t"])
@@ -218,10 +215,10 @@ class EquivalenceContract(PairsContract):
 class CodecContract(ParticlesContract):
     """The contract of every `Codec`."""
 
+    returns = Mapping
+
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
         return component.encode(inputs["population"].particles)
-
-    returns = Mapping
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         for name, array in result.items():
