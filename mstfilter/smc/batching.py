@@ -355,6 +355,7 @@ class _Sweep:
         self.log_weights = self.log_weights.copy()
         self.log_weights[rows] = self.log_mean[rows, None] if out is None else out
         if out is not None:
+            self.log_mean = self.log_mean.copy()  # `record` keeps the array of the step before
             self.log_mean[rows] = summaries(out)[1]
         if self.ancestors is not None:
             self.ancestors[rows] = index

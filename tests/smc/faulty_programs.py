@@ -151,9 +151,7 @@ def in_branch(expected, probs=(0.5, 0.5), **functions):
 in_transition(
     ALONE,
     the_first_particle_for_all=lambda x: 0.9 * x[0],
-    the_last_particle_for_all=lambda x: 0.9 * x[-1],
     sorted_particles=np.sort,
-    the_neighbour=lambda x: np.roll(x, 1),
     a_median=np.median,
     a_mean_at_later_steps_only=lambda x: x.mean() + 0.0 * x,
 )
@@ -163,9 +161,6 @@ in_likelihood(
     a_standardised_state=lambda x: (x - x.mean()) / x.std(),
     a_maximum_decides=lambda x: (x, 2.0 if x.max() > 1.5 else 0.5),
     any_decides=lambda x: x if not (x > 1.0).any() else x - 1.0,
-    reversed_particles=lambda x: x[::-1],
-    a_running_sum_over_particles=lambda x: 0.01 * np.cumsum(x),
-    ranks=lambda x: np.argsort(np.argsort(x)) / len(x),
     a_dot_product_over_particles=lambda x: (x, 0.5 + 0.001 * (x @ x)),
     the_length_of_the_population=lambda x: x.sum() / 200,
     half_of_the_particles_differ=lambda x: np.where(np.arange(len(x)) < len(x) // 2, x, -x),
@@ -184,20 +179,6 @@ def a_centred_state(previous, y):
     x = walk(previous)
     seen(x, y)
     return {"centred": x - x.mean()}
-
-
-@faulty(ALONE)
-def probabilities_normalised_over_particles(previous, y):
-    x = walk(previous)
-    odds = np.exp(np.stack([x, -x], axis=1))
-    k = sample("k", Categorical(odds / odds.sum(axis=0)))
-    seen(k * 1.0, y)
-
-
-@faulty(ALONE)
-def the_covariance_of_the_particles(previous, y):
-    v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 0.5))
-    observe("y", MultivariateNormal(v, np.cov(v.T) + np.eye(2)), [y, y])
 
 
 @faulty(ALONE, ys=[0.3, None, None, 0.2])
@@ -235,7 +216,6 @@ def guided_by(expected, guide, name, ys=YS, n=200):
 
 
 guided_by(ALONE, guide_by("mean", lambda x, y: x.mean()), "a_guide_with_a_mean")
-guided_by(ALONE, guide_by("first", lambda x, y: 0.9 * x[0] + 0.0 * x), "a_guide_with_the_first_particle")
 guided_by(ALONE, guide_by("max", lambda x, y: x if x.max() < 1 else x + y), "a_guide_with_a_maximum")
 guided_by(REPEATED, guide_by("noise", lambda x, y: x + np.random.normal(size=len(x))), "a_guide_with_other_draws")
 
@@ -297,14 +277,6 @@ def the_last_value_in_a_global(previous, y):
     seen(x, y)
 
 
-OBSERVATIONS = iter(YS)
-
-
-@faulty(REPEATED)
-def observations_from_an_iterator(previous, y):
-    seen(walk(previous), next(OBSERVATIONS))
-
-
 @faulty(REPEATED, ys=[np.array([0.3, 0.1]), np.array([0.2, 0.5])])
 def a_changed_observation(previous, y):
     v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 1.0))
@@ -334,12 +306,6 @@ in_observation(
     [0.3, 0.3],
     a_covariance_of_a_row=lambda x: MultivariateNormal(np.zeros((1, 2)), np.eye(2) + x[:, None, None] * SWAP),
 )
-
-
-@faulty("covariance is not symmetric")
-def an_asymmetric_covariance(previous, y):
-    v = sample("v", MultivariateNormal([0.0, 0.0], [[1.0, 0.8], [0.0, 1.0]]))
-    observe("y", Normal(v, 1.0), [y, y])
 
 
 def draw_jump():
@@ -456,13 +422,6 @@ def an_entry_of_previous_replaced(previous, y):
     seen(walk(previous), y)
 
 
-@faulty("in place")
-def a_site_changed_in_place(previous, y):
-    x = walk(previous)
-    x *= 0.5
-    seen(x, y)
-
-
 # --- shapes, names, sites -----------------------------------------------------------------------------------------
 @faulty("the value is that of a site")
 def a_draw_observed_by_accident(previous, y):
@@ -481,46 +440,6 @@ def a_returned_value_over_a_site(previous, y):
 def weights_by_hand(previous, y):
     x = walk(previous)
     return {"log_weights": -0.5 * (x - y) ** 2}
-
-
-@faulty("expected ()", ys=[np.full(200, 0.3)] * 3)
-def an_observation_for_each_particle(previous, y):
-    seen(walk(previous), y)
-
-
-@faulty(r"expected \(200,\)")
-def a_column_and_a_row(previous, y):
-    v = sample("v", MultivariateNormal([0.0], [[1.0]]))
-    x = walk(previous)
-    seen(v + x, y)
-
-
-@faulty("decides by an array")
-def a_decision_by_an_array(previous, y):
-    x = walk(previous)
-    if x > 0:
-        sample("z", Normal(0.0, 1.0))
-    seen(x, y)
-
-
-@faulty("sampled twice")
-def a_site_sampled_twice(previous, y):
-    seen(walk(previous) + walk(previous), y)
-
-
-@faulty("previous has no 'z'")
-def a_site_that_vanishes(previous, y):
-    x = walk(previous)
-    if previous is None:
-        sample("z", Normal(0.0, 1.0))
-    else:
-        seen(x + previous["z"], y)
-
-
-@faulty("one row for each of 200 particles")
-def an_argument_of_other_rows(previous, y):
-    x = walk(previous)
-    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(-v, y)], x[:50])
 
 
 @faulty(ALONE)
@@ -667,13 +586,6 @@ def a_network_in_single_precision(previous, y):
     return {"features": h}
 
 
-@correct(n=300)
-def another_network_in_single_precision(previous, y):
-    x = walk(previous)
-    h = np.tanh(np.float32(x)[:, None] @ WEIGHTS[:1] @ WEIGHTS).astype(np.float32)
-    seen(h.mean(axis=1), y, 0.02)
-
-
 @correct()
 def a_switch(previous, y):
     x = switch(
@@ -699,13 +611,6 @@ def moves_beyond_the_support(previous, y):
     s = sample("s", Gamma(1.0, 2.0) if previous is None else Gamma(4.0, 4.0 / previous["s"]))
     x = sample("x", Normal(0.0, np.sqrt(s)))
     seen(x, y)
-
-
-@correct(kind="resample_move", trigger=Always())
-def moves_of_probabilities(previous, y):
-    p = sample("p", Uniform(0.0, 1.0))
-    k = sample("k", Bernoulli(p))
-    seen(k.astype(float), y)
 
 
 @correct(kind="auxiliary")
@@ -833,15 +738,6 @@ def a_number_of_particles_in_the_closure(previous, y):
     return {"age": age}
 
 
-CALLS: list = []
-
-
-@correct()
-def a_log_of_calls(previous, y):
-    CALLS.append(y)
-    seen(walk(previous), y)
-
-
 @correct(n=30)
 @per_particle
 def immutable_use_of_containers(previous, y):
@@ -852,30 +748,6 @@ def immutable_use_of_containers(previous, y):
     track = np.append(np.zeros(1) if previous is None else previous["track"], x)
     seen(np.mean(items) + 0.1 * len(cells) + 0.1 * len(at) + track[0], y)
     return {"items": items, "cells": cells, "at": at, "track": track, "grid": Map([1])}
-
-
-@correct(n=30)
-@per_particle
-def copies_of_containers(previous, y):
-    x = walk(previous)
-    items, at = ([[]], {}) if previous is None else (deepcopy(previous["items"]), deepcopy(previous["at"]))
-    items[0].append(float(x))
-    at[len(at)] = [float(x)]
-    seen(np.mean(items[0]) + 0.1 * len(at), y)
-    return {"items": items, "at": at}
-
-
-SCALES: dict = {}
-
-
-@correct(n=30)
-@per_particle
-def a_cache_of_all_particles(previous, y):
-    x = walk(previous)
-    k = round(float(x))
-    if k not in SCALES:
-        SCALES[k] = 1.0 + abs(k)
-    observe("y", Normal(x, SCALES[k]), y)
 
 
 @correct(n=30)
@@ -892,13 +764,6 @@ def sites_that_come_and_go(previous, y):
 def moves_of_one_particle(previous, y):
     s = sample("s", Gamma(2.0))
     seen(sample("x", Normal(0.0, s)), y)
-
-
-@correct()
-def residuals_of_particles(previous, y):
-    x = walk(previous)
-    observe("residual", Normal(0.0, 0.5), y - x)
-    observe("factor", Normal(x, 3.0), 0.0)
 
 
 @correct()
@@ -923,19 +788,6 @@ class Clipped(Distribution):
 @correct()
 def a_discrete_distribution_of_the_user(previous, y):
     seen(sample("k", Clipped()) * 1.0, y)
-
-
-@correct()
-def time_in_the_model(previous, y, t):
-    m = 0.0 if previous is None else 0.9 * previous["x"] + np.sin(t)
-    seen(sample("x", Normal(m, 0.6)), y)
-
-
-@correct(ys=[{"a": 0.2, "b": None}, {"a": None, "b": 1.0}, None])
-def observations_that_are_mappings(previous, y):
-    x = walk(previous)
-    for name, value in (y or {}).items():
-        observe(name, Normal(x, 0.5), value)
 
 
 @correct(n=1000)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from mstfilter import smc
 from mstfilter.errors import InputError
 from mstfilter.smc import (
     Always,
@@ -29,6 +30,7 @@ from mstfilter.smc import (
     Stratified,
     Systematic,
     Uniform,
+    WeightResampler,
     WithInput,
     bootstrap,
     collect,
@@ -194,6 +196,14 @@ FILTERS = {
 TOGETHER = ("always", "after", "every third", "many draws", "many strata", "never", "rows", "vectors")
 
 
+@pytest.mark.parametrize("name", sorted(smc.__components__["resampler"]))
+def test_every_scheme_of_the_package_keeps_its_promise(name):
+    scheme = getattr(smc, smc.__components__["resampler"][name])()
+    found = [keeps_its_promise(bootstrap(raw(1), n, scheme, Always()), YS, range(r)) for n, r in ((5, 5), (4, 3))]
+    together = isinstance(scheme, WeightResampler) and scheme.exact_size
+    assert found == ["together" if together else "single"] * 2
+
+
 @pytest.mark.parametrize("name", FILTERS)
 def test_every_run_equals_its_single_run(name):
     ys = {"objects": [0, 2, 1, 3, 0], "vectors": observations(5, 1)}.get(name, [0.3, -0.2, 1.0, None, 0.1])
@@ -269,22 +279,15 @@ def test_an_error_names_slot_step_run_values_and_what_to_do():
             run_many(good, YS, seeds)
 
 
-def test_a_model_that_differs_later_only_is_found_then():
-    def later(rng, x, t):
-        return x + rng.standard_normal(x.shape) + (x.mean() if t >= 3 else 0.0)
+@pytest.mark.parametrize(("differs", "found"), [(lambda t: t >= 3, 5), (lambda t: t % 3 == 0, 12)])
+def test_a_model_that_differs_at_some_steps_only_is_found(differs, found):
+    def move(rng, x, t):
+        return x + rng.standard_normal(x.shape) + (x.mean() if differs(t) else 0.0)
 
-    stated = replace(GOOD, sample_transition=later)
-    with pytest.raises(InputError, match="step 5, transition"):
-        run_many(bootstrap(stated, 4), [0.1] * 6, range(5))
-    assert keeps_its_promise(bootstrap(replace(stated, batched=None), 4), [0.1] * 6, range(5)) == "single"
-
-
-def test_a_model_that_differs_at_every_third_step_is_found():
-    def periodic(rng, x, t):
-        return x + rng.standard_normal(x.shape) + (x.mean() if t % 3 == 0 else 0.0)
-
-    with pytest.raises(InputError, match="step 12, transition"):
-        run_many(bootstrap(replace(GOOD, sample_transition=periodic), 4), [0.1] * 14, range(5))
+    stated = replace(GOOD, sample_transition=move)
+    with pytest.raises(InputError, match=f"step {found}, transition"):
+        run_many(bootstrap(stated, 4), [0.1] * 14, range(5))
+    assert keeps_its_promise(bootstrap(replace(stated, batched=None), 4), [0.1] * 14, range(5)) == "single"
 
 
 def test_a_program_that_mixes_particles_is_named_by_its_first_batch():

@@ -32,6 +32,7 @@ from mstfilter.smc import (
 )
 from mstfilter.smc.diverse_resampling import optimal_threshold
 from mstfilter.smc.resampling import inverse_cdf
+from mstfilter.smc.testing.copies import ConstantGenerator as Uniform
 from tests.smc.enumeration import outcomes
 
 
@@ -185,17 +186,6 @@ def test_shuffled_and_coalesced(n):
     np.testing.assert_allclose(found, np.exp(population.log_weights) / 4, atol=1e-12)
     found = carried(Coalesced(Systematic()), population, n, cells=8)
     np.testing.assert_allclose(found, np.array([0.0, 2.0, 4.0, 2.0]) / 4, atol=1e-12)
-
-
-class Uniform(np.random.Generator):
-    """A generator whose uniforms are all u."""
-
-    def __init__(self, u):
-        super().__init__(np.random.PCG64(0))
-        self.u = u
-
-    def random(self, size=None):
-        return self.u if size is None else np.full(size, self.u)
 
 
 CHOPPED = [(1.0, 4.0, 1.0, 2.0), (40.0, 1.0, 1.0, 2.0), (3.0, 3.0), (1.0,), (0.0, 1.0, 12.0)]

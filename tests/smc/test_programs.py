@@ -317,6 +317,7 @@ def changed(x):
         # names
         ("expected a distribution", lambda s: sample(Normal(), "s")),
         ("the name of a site is a int", lambda s: sample(3, Normal())),
+        ("site 'x': sampled twice", lambda s: sample("x", Normal(s.x, 1))),
         # arrays of all particles used as one number
         (r"as one number .*after site 'k', line \d+ `.*float\(s.x\).*TypeError.*numpy", lambda s: float(s.x)),
         ("as one number .*after site 'k'.*numpy.exp", lambda s: math.exp(s.x)),
