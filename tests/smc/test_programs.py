@@ -90,13 +90,10 @@ def test_a_guide_gives_the_draws_of_the_guided_filter():
 @pytest.mark.parametrize(
     "filter",
     [
-        Program(ar1).bootstrap(1500, trigger=EssBelow(0.5)),
-        Program(ar1).guided(best, 600, trigger=Always()),
-        Program(ar1).auxiliary(1500, trigger=EssBelow(0.5), power=0.5),
         Program(ar1).auxiliary(600, best, trigger=Always(), power=0.5),
         Program(ar1).resample_move(1500, steps=2, scale=0.8, trigger=EssBelow(0.5)),
     ],
-    ids=["bootstrap", "guided", "auxiliary", "auxiliary guided", "resample-move"],
+    ids=["auxiliary guided", "resample-move"],
 )
 def test_filters_of_a_program_agree_with_kalman(filter):
     """Within 4 standard errors (false alarm 6e-5 a case); 3.5 % of bias would be seen."""
@@ -121,7 +118,6 @@ def test_a_program_that_is_run_particle_by_particle():
     cov = np.array([[1.0, RHO], [RHO, RHO**2 + SIGMA**2]]) + 4.0 * np.eye(2)
     exact_mild = float(stats.multivariate_normal(np.zeros(2), cov).logpdf(YS[:2]))
     for make in (
-        lambda p, guide: p.bootstrap(60),
         lambda p, guide: p.guided(guide, 30),
         lambda p, guide: p.auxiliary(60, power=0.5),
         lambda p, guide: p.resample_move(40, steps=1),
