@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Annotated, Literal, get_origin, get_type_hints
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.fields import Bounded, Bounds, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
+from mstfilter.presets import REGISTRY
 
 
 class Interface(Bounded):
@@ -70,6 +71,26 @@ def test_bounds_are_checked_before_the_conditions_of_the_class():
     for wrong in ({"n": 0}, {"n": 3}):
         with pytest.raises(InputError, match="n is 0, expected an integer" if wrong["n"] == 0 else "at least n = 3"):
             Own(**wrong)
+
+
+def checks_its_fields(part):
+    """Numbers with bounds and choices, also of the parts of a component."""
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, Bounded) and is_dataclass(value):
+            checks_its_fields(value)
+        hint = get_type_hints(type(part), include_extras=True)[field.name]
+        if get_origin(hint) in (Annotated, Literal):
+            with pytest.raises(InputError, match=f"{field.name} is 'nonsense'"):
+                replace(part, **{field.name: "nonsense"})
+
+
+@pytest.mark.parametrize("kind", REGISTRY.kinds)
+def test_every_component_checks_its_fields(kind):
+    for name in REGISTRY.known(kind):
+        component = REGISTRY.build(kind, name)
+        if is_dataclass(component):
+            checks_its_fields(component)
 
 
 def test_a_class_with_names_that_its_module_lacks_is_made():

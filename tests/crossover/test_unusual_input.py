@@ -170,14 +170,6 @@ def test_the_mode_filter_with_the_largest_labels():
     np.testing.assert_array_equal(FILTER.apply(labels) % (MAX_LABEL - 3), FILTER.apply(A))
 
 
-@pytest.mark.parametrize(
-    "fields", [{"window": 5.0}, {"margin": float("nan")}, {"isolation": "many"}, {"max_sweeps": None}]
-)
-def test_fields_of_the_mode_filter(fields):
-    with pytest.raises(InputError, match=f"{next(iter(fields))} is .*expected"):
-        ModeFilter(**fields)
-
-
 def test_free_space_of_unusual_grids():
     """Free space uses the grid of the hypothesis. Empty hypotheses and hypotheses of single voxels are allowed."""
     project = FreeSpace().project

@@ -11,7 +11,6 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.crossover import Crossover, CrossoverUpdate, ModeFilter, RandomOrder, SpanningTree
-from mstfilter.errors import InputError
 from mstfilter.presets import REGISTRY, load_config
 from mstfilter.scene import Clip, Crop, Frame, FreeSpace, Hypothesis, NoFreeSpace, Occupancy, Projection, VoxelGrid
 from mstfilter.scoring import weighted_coverage
@@ -269,9 +268,3 @@ def test_the_drop_rule_drops_late_objects_without_conflict():
         np.random.default_rng(0), Hypothesis.from_labels(a, SMALL, 1), Hypothesis.from_labels(b, SMALL)
     )
     assert ((same.labels > 0) == ((a > 0) | (b > 0))).all()
-
-
-@pytest.mark.parametrize("wrong", [{"eta": 0}, {"eta": -1}, {"quality_exponent": float("nan")}])
-def test_wrong_fields(wrong):
-    with pytest.raises(InputError):
-        CrossoverUpdate(**wrong)

@@ -239,15 +239,6 @@ def test_predictions_are_drawn_by_their_weights():
     assert len(PartitionUpdate().update(np.random.default_rng(0), predicted, proposed, clip)) == 3
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [({"threshold": 1.5}, "threshold"), ({"n_views": -1}, "n_views")],
-)
-def test_invalid_fields(fields, message):
-    with pytest.raises(InputError, match=message):
-        PartitionUpdate(**fields)
-
-
 def test_hypotheses_of_another_grid_are_refused():
     clip = clip_of(ALONE)
     other = Hypothesis(np.zeros((2, 2, 2), np.uint16), type(GRID)((0, 0, 0), 0.01, (2, 2, 2)))

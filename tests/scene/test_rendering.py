@@ -9,8 +9,8 @@ from hypothesis import given, settings, strategies as st
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.open3d_import import import_open3d
 from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.rendering import project, render
-from mstfilter.scene.voxels import Hypothesis, VoxelGrid
+from mstfilter.scene.rendering import render
+from mstfilter.scene.voxels import VoxelGrid
 
 GRID = VoxelGrid((-0.1, -0.1, 0.0), 0.02, (10, 11, 9))
 CAMERA = Camera.from_intrinsics(40, 42, 15.3, 12.1, 32, 24, look_at((0.03, -0.5, 0.4), (0, 0, 0.05)))
@@ -99,11 +99,3 @@ def test_an_empty_grid_gives_an_empty_image_and_a_wrong_shape_an_error():
     assert np.isnan(got.depth).all()
     with pytest.raises(InputError, match="shape"):
         render(np.zeros((2, 2, 2), int), GRID, CAMERA)
-
-
-def test_project_of_a_hypothesis():
-    labels = np.zeros(GRID.shape, np.uint16)
-    labels[3:6, 3:6, :4] = 7
-    hypothesis = Hypothesis.from_labels(labels, GRID)
-    np.testing.assert_array_equal(project(hypothesis, CAMERA), render(labels, GRID, CAMERA).labels)
-    assert set(np.unique(project(hypothesis, CAMERA))) == {0, 7}

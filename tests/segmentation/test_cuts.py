@@ -136,14 +136,7 @@ def test_autocorrelation_time_needs_a_long_trace_that_varies():
     assert mh._autocorrelation(np.ones(200)) is None
 
 
-def test_invalid_fields_are_reported():
-    with pytest.raises(InputError, match="moves is 'x'"):
-        MetropolisHastingsCuts(moves="x")
-    with pytest.raises(InputError, match="sigma2 is 0"):
-        MetropolisHastingsCuts(sigma2=0)
-    for sampler in (MetropolisHastingsCuts, ExactCuts):
-        with pytest.raises(InputError, match="temperature is -1"):
-            sampler(temperature=-1)
+def test_invalid_node_values_are_reported():
     tree, w = case(5, 2)
     with pytest.raises(InputError, match="node values have shape"):
         optimal_cut(tree, w[:-1])

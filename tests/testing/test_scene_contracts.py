@@ -16,7 +16,7 @@ from mstfilter.completion import Completer
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.partition import PartitionUpdate
 from mstfilter.presets import REGISTRY
-from mstfilter.scene import component_key, scene_cache
+from mstfilter.scene import scene_cache
 from mstfilter.segmentation import TreeCutProposal
 from mstfilter.testing import STAGE_OWNERS, run_contract, scene_example
 from mstfilter.tracking import StaticTest, TrackingTransition
@@ -168,13 +168,3 @@ def test_methods_of_any_form_are_checked():
             return super().fill(rng, seen) / 100
 
     step(Repairs(change=lambda p: 100 * p))
-
-
-def test_the_key_of_a_component_depends_on_its_checked_methods():
-    def of(value):
-        source = f"class Mine(Completer):\n def fill(self, rng, seen):\n  return seen.surface * {value}"
-        namespace: dict[str, Any] = {"Completer": Completer, "__name__": "mine"}
-        exec(source, namespace)
-        return component_key(dataclass(frozen=True)(namespace["Mine"])())
-
-    assert of(0.5) == of(0.5) != of(0.6)

@@ -3,18 +3,13 @@ import json
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
 from mstfilter.scene import Clip, Frame, Hypothesis
-from mstfilter.segmentation import TreeCutProposal, UcmTree
 from mstfilter.smc import Population
 from mstfilter.tracking import (
     AuthorsRule,
-    DenseFlow,
     IdentityTransition,
     MstRule,
     PaperRule,
-    SiftMatching,
-    SmallGicp,
     StaticTest,
     TrackingTransition,
     Warp,
@@ -221,21 +216,3 @@ def test_splat_removes_the_source(textured):
     transition = TrackingTransition(warp=Warp("splat", "label"))
     moved = predict(clip, scene.hypothesis(), transition=transition).particles[0]
     assert all(r.source is None for r in moved.objects)
-
-
-@pytest.mark.parametrize(
-    ("component", "field", "value"),
-    [
-        (DenseFlow, "preset", "slow"),
-        (SiftMatching, "search_distance", 0),
-        (SmallGicp, "method", "icp"),
-        (MstRule, "select", "all"),
-        (Warp, "method", "push"),
-        (Warp, "collisions", "random"),
-        (TreeCutProposal, "weight_rule", "x"),
-        (UcmTree, "max_leaves", 0),
-    ],
-)
-def test_wrong_options_raise_an_error(component, field, value):
-    with pytest.raises(InputError, match=f"{field} is {value!r}"):
-        component(**{field: value})
