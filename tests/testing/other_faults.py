@@ -32,78 +32,79 @@ from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
 FAULTS: list = []
 
 
-def faulty(broken, words, exact=None, make=lambda cls: cls):
-    """Add a class to the list; of a function, the class that `make` gives. The broken property comes first."""
+def faulty(broken, words, exact=None):
+    """Add a class to the list."""
 
-    def add(fault):
-        cls = fault if isinstance(fault, type) else make(fault)
+    def add(cls):
         FAULTS.append((cls, broken, words, exact))
         return cls
 
     return add
 
 
-def add_faults(broken, words, exact, make, **functions):
-    """Add classes of functions whose messages have the same words."""
-    for name, function in functions.items():
+def plant(make, *common, **faults):
+    """Add the classes that `make` gives of functions: ``name=(broken property, words, function, exact draws)``.
+
+    `common` are values that all faults begin with.
+    """
+    for name, values in faults.items():
+        broken, words, function, *exact = (*common, *(values if isinstance(values, tuple) else (values,)))
         function.__name__ = name
-        faulty(broken, words, exact, make)(function)
+        faulty(broken, words, *exact)(make(function))
 
 
-def of(interface, method):
-    """A class of an interface whose method is a function without ``self``."""
+# --- components of functions --------------------------------------------------------------------------------------
+
+
+def of(interface, **methods):
+    """A function that makes a class of an interface: ``method=function(of its argument, *arguments)``."""
 
     def make(function):
-        called = {method: lambda self, *args, **named: function(*args, **named), "__doc__": function.__doc__}
-        return type(function.__name__, (interface,), called)
+        def bound(method):
+            return lambda self, *args, **named: method(function, *args, **named)
+
+        called = {name: bound(method) for name, method in methods.items()}
+        return type(function.__name__, (interface,), {**called, "__doc__": function.__doc__})
 
     return make
 
 
-def add_methods(interface, method, **faults):
-    """Add components whose method is a function: ``name=(broken property, words, function)``."""
-    for name, (broken, words, function) in faults.items():
-        add_faults(broken, words, None, of(interface, method), **{name: function})
+def plainly(function, *args, **named):
+    return function(*args, **named)
 
 
-def move(function):
-    """A transition that replaces the particles by ``function(rng, x, y)``."""
-
-    def predict(self, rng, population, observation):
-        return population.moved(function(rng, population.particles, observation))
-
-    return type(function.__name__, (Transition,), {"predict": predict, "__doc__": function.__doc__})
-
-
-def likelihood(function):
-    """An update that adds ``function(x, y)`` to the log weights."""
-
-    def update(self, rng, predicted, proposed, observation):
-        population = union(predicted, proposed)
-        return population.reweighted(function(population.particles, observation))
-
-    return type(function.__name__, (Update,), {"update": update, "__doc__": function.__doc__})
+#: A transition that replaces the particles by ``function(rng, x, y)``.
+move = of(
+    Transition,
+    predict=lambda f, rng, population, observation: population.moved(f(rng, population.particles, observation)),
+)
+predict = of(Transition, predict=plainly)
 
 
-def proposal(function):
-    """A proposal of ``function(rng, y, n)``: particles, or particles and log weights."""
-
-    def sample(self, rng, observation, n):
-        found = function(rng, observation, n)
-        return Population(*found) if isinstance(found, tuple) else Population(found)
-
-    return type(function.__name__, (Proposal,), {"sample": sample, "__doc__": function.__doc__})
+def weighted(function, rng, predicted, proposed, observation):
+    population = union(predicted, proposed)
+    return population.reweighted(function(population.particles, observation))
 
 
-def kernel(function):
-    """A rejuvenation ``function(rng, x, x_{t-1}, y)``; nothing moves if one of the last two is missing."""
+#: An update that adds ``function(x, y)`` to the log weights.
+likelihood = of(Update, update=weighted)
+update = of(Update, update=plainly)
+#: A proposal of ``function(rng, y, n)``: particles, or particles and log weights.
+proposal = of(
+    Proposal,
+    sample=lambda f, rng, y, n: Population(*found) if isinstance(found := f(rng, y, n), tuple) else Population(found),
+)
 
-    def move(self, rng, population, previous, observation):
-        if previous is None or observation is None:
-            return population
-        return population.moved(function(rng, population.particles, previous.particles, observation))
 
-    return type(function.__name__, (Rejuvenation,), {"move": move, "__doc__": function.__doc__})
+def moved_by(function, rng, population, previous, observation):
+    if previous is None or observation is None:
+        return population
+    return population.moved(function(rng, population.particles, previous.particles, observation))
+
+
+#: A rejuvenation ``function(rng, x, x_{t-1}, y)``; nothing moves if one of the last two is missing.
+kernel = of(Rejuvenation, move=moved_by)
+rejuvenation = of(Rejuvenation, move=plainly)
 
 
 # --- exact draws --------------------------------------------------------------------------------------------------
@@ -115,9 +116,9 @@ def exact_ar1(rng, n):
     return Population(previous), Population(optimal(previous, 0.7).sample(rng, n)), 0.7
 
 
-def exact_walk(rng, n):
+def exact_walk(rng, n, shape=()):
     """x_{t-1}, draws of x_t given them by the AR(1) model, y_t; the move does not use y_t."""
-    previous = rng.normal(0.2, 1.0, n)
+    previous = rng.normal(0.2, 1.0, (n, *shape))
     return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
 
 
@@ -128,8 +129,7 @@ def exact_moves(rng, n):
 
 def exact_plane(rng, n):
     """x_{t-1} in the plane, draws of x_t given them, y_t."""
-    previous = rng.normal(0.2, 1.0, (n, 2))
-    return Population(previous), Population(rng.normal(RHO * previous, SIGMA)), 0.7
+    return exact_walk(rng, n, (2,))
 
 
 def exact_density(rng, n):
@@ -146,7 +146,7 @@ def exact_posterior(rng, n):
 def exact_weights(rng, n):
     """Draws of p(x), the same with weights p(y | x), y."""
     prior = Population(rng.normal(0.0, SD0, n))
-    return prior, prior.reweighted(Normal(prior.particles, TAU).log_prob(0.7)), 0.7
+    return prior, prior.reweighted(log_g(prior.particles, 0.7)), 0.7
 
 
 def exact_evidence(rng, n):
@@ -173,14 +173,89 @@ def walk(x, noise):
     return RHO * x + SIGMA * noise
 
 
-@faulty("parents_are_valid", 'parents "previous"', None, of(Transition, "predict"))
-def DropsParticles(rng, population, observation):
-    return population.take(np.arange(len(population) // 2 + 1), None).labelled({})
+def step(rng, x, size=1.0):
+    """Moves by independent noise of a size."""
+    return walk(x, size * rng.standard_normal(len(x)))
 
 
-@faulty("parents_are_valid", "observation=None", None, move)
-def NeedsObservation(rng, x, y):
-    return x + float(y)
+def in_blocks(rng, x, size):
+    """One random number for every `size` particles."""
+    return np.repeat(rng.standard_normal(-(-len(x) // size)), size)[: len(x)]
+
+
+def first_is_special(rng, x, y):
+    noise = rng.standard_normal(len(x))
+    noise[0] *= 4
+    return x + noise
+
+
+def mirrored(rng, x, y):
+    """Antithetic pairs of the first and the last particle, if there are many."""
+    noise = rng.standard_normal(len(x))
+    if len(x) > 100:
+        noise[len(x) // 2 :] = -noise[: len(x) - len(x) // 2][::-1]
+    return walk(x, noise)
+
+
+def after_a_thousand(rng, x, y):
+    """Wider steps from the thousandth particle on."""
+    noise = rng.standard_normal(len(x))
+    noise[1000:] = noise[1000:] * 1.1
+    return walk(x, noise)
+
+
+def shared_by_axes(rng, x, y):
+    noise = rng.standard_normal(len(x))
+    return walk(x, noise if x.ndim == 1 else noise[:, None])
+
+
+plant(
+    move,
+    NeedsObservation=("parents_are_valid", "observation=None", lambda rng, x, y: x + float(y)),
+    FirstIsSpecial=(_ORDER, "moves differently", first_is_special),
+    OneNoise=(_ORDER, "the same noise", lambda rng, x, y: walk(x, rng.standard_normal())),
+    OneNoiseOfMany=(_MOVES, "is below", lambda rng, x, y: walk(x, rng.standard_normal()), exact_moves),
+    # Returns the moved particles in another order, without their weights.
+    Permutes=(_MOVES, "x_t - x_{t-1}", lambda rng, x, y: rng.permutation(step(rng, x)), exact_moves),
+    SharedByAxes=(_MOVES, "coordinate 0 of x_t + coordinate 1 of x_t", shared_by_axes, exact_plane),
+    SharedByPairs=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, in_blocks(rng, x, 2))),
+    Mirrored=(_MOVES, "mirrored positions", mirrored, exact_walk),
+    SharedByBlocks=(_MOVES, "of neighbours", lambda rng, x, y: walk(x, in_blocks(rng, x, 8)), exact_walk),
+    WideStep=(_MOVES, "and sd", lambda rng, x, y: step(rng, x, 1.05), exact_walk),
+    UniformNoise=(_MOVES, "is below", lambda rng, x, y: walk(x, rng.uniform(-(3**0.5), 3**0.5, len(x))), exact_walk),
+    CutNoise=(_MOVES, "is below", lambda rng, x, y: walk(x, rng.standard_normal(len(x)).clip(-2.8, 2.8)), exact_walk),
+    SmallDrift=(_MOVES, "is below", lambda rng, x, y: step(rng, x) + 0.02, exact_walk),
+    AfterAThousand=(_MOVES, "is below", after_a_thousand, exact_walk),
+)
+
+
+def noisy_if_heavy(rng, population, observation):
+    """The steps of heavy particles are larger; on average they have the right spread if the weights are equal."""
+    noise = np.sqrt(len(population) * population.weights) * rng.standard_normal(len(population))
+    return population.moved(walk(population.particles, noise))
+
+
+def permuted(rng, population, observation):
+    """The moved particles with their weights in another order."""
+    order = rng.permutation(len(population))
+    return Population(step(rng, population.particles)[order], population.log_weights[order])
+
+
+plant(
+    predict,
+    DropsParticles=(
+        "parents_are_valid",
+        'parents "previous"',
+        lambda rng, population, y: population.take(np.arange(len(population) // 2 + 1), None).labelled({}),
+    ),
+    NormalisesWeights=(
+        "scale_of_weights_is_irrelevant",
+        "do not add it",
+        lambda rng, population, y: replace(population, log_weights=np.log(population.weights)),
+    ),
+    PermutesAll=("weights_stay_with_their_particles", "another order", permuted),
+    NoisyIfHeavy=(_ORDER, "if the weights are others", noisy_if_heavy),
+)
 
 
 @faulty("does_not_change_input", "in place")
@@ -190,18 +265,6 @@ class MovesInPlace(Transition):
         particles = population.particles
         particles += 1
         return Population(particles, population.log_weights)
-
-
-@faulty(_ORDER, "moves differently", None, move)
-def FirstIsSpecial(rng, x, y):
-    step = rng.standard_normal(len(x))
-    step[0] *= 4
-    return x + step
-
-
-@faulty("scale_of_weights_is_irrelevant", "do not add it", None, of(Transition, "predict"))
-def NormalisesWeights(rng, population, observation):
-    return replace(population, log_weights=np.log(population.weights))
 
 
 @dataclass(frozen=True)
@@ -241,102 +304,17 @@ class WideWithoutObservation(Guided):
     def predict(self, rng, population, observation):
         if observation is not None:
             return super().predict(rng, population, observation)
-        return population.moved(Normal(RHO * population.particles, 1.2 * SIGMA).sample(rng, len(population)))
-
-
-@faulty(_MOVES, "is below", exact_moves)
-@faulty(_ORDER, "the same noise", None, move)
-def OneNoise(rng, x, y):
-    return walk(x, rng.standard_normal())
-
-
-@faulty(_MOVES, "x_t - x_{t-1}", exact_moves, move)
-def Permutes(rng, x, y):
-    """Returns the moved particles in another order, without their weights."""
-    return rng.permutation(walk(x, rng.standard_normal(len(x))))
-
-
-@faulty("weights_stay_with_their_particles", "another order", None, of(Transition, "predict"))
-def PermutesAll(rng, population, observation):
-    """Returns the moved particles with their weights in another order."""
-    order = rng.permutation(len(population))
-    return Population(
-        walk(population.particles, rng.standard_normal(len(order)))[order], population.log_weights[order]
-    )
-
-
-@faulty(_MOVES, "coordinate 0 of x_t + coordinate 1 of x_t", exact_plane, move)
-def shared_by_axes(rng, x, y):
-    noise = rng.standard_normal(len(x))
-    return walk(x, noise if x.ndim == 1 else noise[:, None])
-
-
-@faulty(_ORDER, "if the weights are others", None, of(Transition, "predict"))
-def NoisyIfHeavy(rng, population, observation):
-    """The steps of heavy particles are larger; on average they have the right spread if the weights are equal."""
-    noise = np.sqrt(len(population) * population.weights) * rng.standard_normal(len(population))
-    return population.moved(walk(population.particles, noise))
-
-
-@faulty(_ORDER, "do not move independently", None, move)
-def shared_by_pairs(rng, x, y):
-    return walk(x, np.repeat(rng.standard_normal(-(-len(x) // 2)), 2)[: len(x)])
-
-
-@faulty(_MOVES, "mirrored positions", exact_walk, move)
-def mirrored(rng, x, y):
-    """Antithetic pairs of the first and the last particle, if there are many."""
-    noise = rng.standard_normal(len(x))
-    if len(x) > 100:
-        noise[len(x) // 2 :] = -noise[: len(x) - len(x) // 2][::-1]
-    return walk(x, noise)
-
-
-@faulty(_MOVES, "of neighbours", exact_walk, move)
-def shared_by_blocks(rng, x, y):
-    """One random number for every eight particles."""
-    return walk(x, np.repeat(rng.standard_normal(-(-len(x) // 8)), 8)[: len(x)])
-
-
-def step(rng, x, size=1.0):
-    """Moves by independent noise of a size."""
-    return walk(x, size * rng.standard_normal(len(x)))
-
-
-add_faults(_MOVES, "and sd", exact_walk, move, wide_step=lambda rng, x, y: step(rng, x, 1.05))
-add_faults(
-    _MOVES,
-    "is below",
-    exact_walk,
-    move,
-    uniform_noise=lambda rng, x, y: walk(x, rng.uniform(-np.sqrt(3), np.sqrt(3), len(x))),
-    cut_noise=lambda rng, x, y: walk(x, np.clip(rng.standard_normal(len(x)), -2.8, 2.8)),
-    small_drift=lambda rng, x, y: step(rng, x) + 0.02,
-)
-
-
-@faulty(_MOVES, "is below", exact_walk, move)
-def after_a_thousand(rng, x, y):
-    """Wider steps from the thousandth particle on."""
-    noise = rng.standard_normal(len(x))
-    noise[1000:] = noise[1000:] * 1.1
-    return walk(x, noise)
+        return population.moved(step(rng, population.particles, 1.2))
 
 
 # --- densities of transitions -------------------------------------------------------------------------------------
 _DENSITY = "log_prob_is_the_density_of_its_moves"
-
-
-def density(function, sd=1.0):
-    """A random step of standard deviation `sd` with the log density ``function(previous, new)``."""
-
-    def predict(self, rng, population, observation):
-        return population.moved(population.particles + sd * rng.standard_normal(len(population)))
-
-    def log_prob(self, previous, new, observation):
-        return function(previous, new)
-
-    return type(function.__name__, (DensityTransition,), {"predict": predict, "log_prob": log_prob})
+#: A random step of standard deviation 1 with the log density ``function(previous, new)``.
+density = of(
+    DensityTransition,
+    predict=lambda f, rng, population, y: population.moved(rng.normal(population.particles)),
+    log_prob=lambda f, previous, new, y: f(previous, new),
+)
 
 
 @density
@@ -345,25 +323,18 @@ def CorrectDensity(previous, new):
     return -0.5 * (new - previous) ** 2
 
 
-@faulty("log_prob_is_of_each_move", "have shape ()", None, density)
-def OneDensity(previous, new):
-    """The density of all moves together."""
-    return -0.5 * np.sum((new - previous) ** 2)
-
-
-@faulty("log_prob_is_of_each_move", "three of six", None, density)
-def NormalisedDensity(previous, new):
+def normalised(previous, new):
     log_f = -0.5 * (new - previous) ** 2
     return log_f - np.logaddexp.reduce(log_f)
 
 
-add_faults(
-    _DENSITY,
-    "certain which is",
-    None,
+plant(
     density,
-    WiderDensity=lambda previous, new: Normal(previous, 1.1).log_prob(new),
-    DensityOfAnotherMove=lambda previous, new: Normal(RHO * previous, 1.0).log_prob(new),
+    # The density of all moves together.
+    OneDensity=("log_prob_is_of_each_move", "have shape ()", lambda x, new: -0.5 * np.sum((new - x) ** 2)),
+    NormalisedDensity=("log_prob_is_of_each_move", "three of six", normalised),
+    WiderDensity=(_DENSITY, "certain which is", lambda x, new: Normal(x, 1.1).log_prob(new)),
+    DensityOfAnotherMove=(_DENSITY, "certain which is", lambda x, new: Normal(RHO * x, 1.0).log_prob(new)),
 )
 
 
@@ -372,93 +343,80 @@ _POSTERIOR = "weights_are_those_of_the_posterior"
 _OTHERS = "weight_of_a_particle_does_not_depend_on_others"
 
 
-@faulty("takes_any_of_its_inputs", "proposed particles", None, of(Update, "update"))
-def NeedsPrediction(rng, predicted, proposed, observation):
-    return predicted.reweighted(np.zeros(len(predicted)))
-
-
-@faulty("takes_any_of_its_inputs", "99", None, of(Update, "update"))
-def StrangeParents(rng, predicted, proposed, observation):
-    population = predicted if predicted is not None else proposed
-    return replace(population, parents={"proposed": np.full(len(population), 99)})
-
-
-@likelihood
-def Posterior(x, y):
-    return Normal(x, TAU).log_prob(y)
-
-
-add_faults(
-    _POSTERIOR,
-    "is below",
-    exact_posterior,
-    likelihood,
-    Squared=lambda x, y: 2 * Normal(x, TAU).log_prob(y),
-    cut_tails=lambda x, y: np.where(np.abs(x - y) > 2.5 * TAU, -700.0, Normal(x, TAU).log_prob(y)),
-    flat_tails=lambda x, y: np.maximum(Normal(x, TAU).log_prob(y), -3.0),
-    tempered=lambda x, y: 0.95 * Normal(x, TAU).log_prob(y),
-    shifted=lambda x, y: Normal(x + 0.02, TAU).log_prob(y),
-    # Bounded at 3 nats below the best particle.
-    bounded_relative=lambda x, y: np.maximum(Normal(x, TAU).log_prob(y), Normal(x, TAU).log_prob(y).max() - 3),
-    cauchy=lambda x, y: -np.log1p(((x - y) / TAU) ** 2) - np.log(np.pi * TAU),
-)
-
-
-@faulty(_POSTERIOR, "is below", exact_posterior)
-@faulty(_POSTERIOR, "the log weight of a particle is", exact_weights, likelihood)
-def too_wide(x, y):
-    return Normal(x, 1.1 * TAU).log_prob(y)
-
-
-@faulty(_POSTERIOR, "2 times the exact ones", exact_weights)
-@faulty(_POSTERIOR, "constant factors", exact_evidence, likelihood)
-def twice(x, y):
-    return Normal(x, TAU).log_prob(y) + np.log(2)
-
-
-@faulty(_POSTERIOR, "constant factors", exact_weights, likelihood)
-def without_constant(x, y):
-    return -0.5 * ((x - y) / TAU) ** 2
-
-
 def log_g(x, y):
     return Normal(x, TAU).log_prob(y)
 
 
-add_faults(
-    _OTHERS,
-    "not normalised or ranked",
-    None,
+@likelihood
+def Posterior(x, y):
+    return log_g(x, y)
+
+
+plant(
     likelihood,
-    divided_by_mean=lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y)),
-    divided_by_largest=lambda x, y: log_g(x, y) - log_g(x, y).max(),
-    ranks=lambda x, y: np.log1p(np.argsort(np.argsort(log_g(x, y)))),
+    Squared=(_POSTERIOR, "is below", lambda x, y: 2 * log_g(x, y), exact_posterior),
+    CutTails=(
+        _POSTERIOR,
+        "is below",
+        lambda x, y: np.where(np.abs(x - y) > 2.5 * TAU, -700.0, log_g(x, y)),
+        exact_posterior,
+    ),
+    FlatTails=(_POSTERIOR, "is below", lambda x, y: np.maximum(log_g(x, y), -3.0), exact_posterior),
+    Tempered=(_POSTERIOR, "is below", lambda x, y: 0.95 * log_g(x, y), exact_posterior),
+    Shifted=(_POSTERIOR, "is below", lambda x, y: log_g(x + 0.02, y), exact_posterior),
+    Cauchy=(_POSTERIOR, "is below", lambda x, y: -np.log1p(((x - y) / TAU) ** 2), exact_posterior),
+    TooWide=(_POSTERIOR, "is below", lambda x, y: Normal(x, 1.1 * TAU).log_prob(y), exact_posterior),
+    TooWideByWeight=(_POSTERIOR, "of a particle is", lambda x, y: Normal(x, 1.1 * TAU).log_prob(y), exact_weights),
+    Twice=(_POSTERIOR, "constant factors", lambda x, y: log_g(x, y) + np.log(2), exact_evidence),
+    TwiceByWeight=(_POSTERIOR, "2 times the exact ones", lambda x, y: log_g(x, y) + np.log(2), exact_weights),
+    DividedByMean=(_OTHERS, "not normalised or ranked", lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y))),
+    Ranks=(_OTHERS, "not normalised or ranked", lambda x, y: np.log1p(np.argsort(np.argsort(log_g(x, y))))),
 )
 
 
-def changed(function):
-    """An update that weights by the likelihood and returns ``function(rng, weighted, predicted)``."""
-
-    def update(self, rng, predicted, proposed, observation):
-        return function(rng, Posterior().update(rng, predicted, proposed, observation), predicted)
-
-    return type(function.__name__, (Update,), {"update": update, "__doc__": function.__doc__})
+def strange_parents(rng, predicted, proposed, observation):
+    population = predicted if predicted is not None else proposed
+    return replace(population, parents={"proposed": np.full(len(population), 99)})
 
 
-@faulty("parents_belong_to_their_particles", "parent", None, changed)
-def PermutesUpdate(rng, out, predicted):
-    return Population(out.particles[::-1], out.log_weights[::-1], out.parents)
+plant(
+    update,
+    "takes_any_of_its_inputs",
+    NeedsPrediction=(
+        "proposed particles",
+        lambda rng, predicted, proposed, observation: predicted.reweighted(np.zeros(len(predicted))),
+    ),
+    StrangeParents=("99", strange_parents),
+)
+#: An update that weights by the likelihood and returns ``function(rng, weighted, predicted)``.
+changed = of(
+    Update,
+    update=lambda f, rng, predicted, proposed, observation: f(
+        rng, weighted(log_g, rng, predicted, proposed, observation), predicted
+    ),
+)
 
 
-@faulty("scale_of_weights_is_irrelevant", "do not add it", None, changed)
-def ForgetsOldWeights(rng, out, predicted):
+def forgets_old_weights(rng, out, predicted):
     return out if predicted is None or len(out) > len(predicted) else out.reweighted(-predicted.log_weights)
 
 
-@faulty(_POSTERIOR, "constant factors", exact_evidence, changed)
-def NoisyWeights(rng, out, predicted):
-    """Random factors of mean 1 would be correct; these have mean exp(0.02)."""
-    return out.reweighted(0.2 * rng.standard_normal(len(out)))
+plant(
+    changed,
+    PermutesUpdate=(
+        "parents_belong_to_their_particles",
+        "parent",
+        lambda rng, out, predicted: Population(out.particles[::-1], out.log_weights[::-1], out.parents),
+    ),
+    ForgetsOldWeights=("scale_of_weights_is_irrelevant", "do not add it", forgets_old_weights),
+    # Random factors of mean 1 would be correct; these have mean exp(0.02).
+    NoisyWeights=(
+        _POSTERIOR,
+        "constant factors",
+        lambda rng, out, predicted: out.reweighted(0.2 * rng.standard_normal(len(out))),
+        exact_evidence,
+    ),
+)
 
 
 @changed
@@ -471,80 +429,67 @@ def CorrectNoise(rng, out, predicted):
 _DRAWN = "draws_have_their_distribution"
 
 
-@faulty("gives_n_particles", "asked for 2 particles it returns 1", None, proposal)
-def OneTooFew(rng, y, n):
-    return rng.standard_normal(max(n - 1, 1))
-
-
-@faulty(_DRAWN, "coordinate 0 of x +", exact_prior_in_plane, proposal)
-def one_number_for_two_axes(rng, y, n):
-    return SD0 * np.broadcast_to(rng.standard_normal((n, 1)), (n, 2))
-
-
-@faulty(_DRAWN, "is below", exact_prior, proposal)
 def inverted_weights(rng, y, n):
     x = 1.5 * SD0 * rng.standard_normal(n)
     return x, Normal(0.0, 1.5 * SD0).log_prob(x) - Normal(0.0, SD0).log_prob(x)
 
 
-add_faults(
-    _DRAWN,
-    "is below",
-    exact_prior,
-    proposal,
-    narrow=lambda rng, y, n: 0.97 * SD0 * rng.standard_normal(n),
-    off_centre=lambda rng, y, n: 0.05 + SD0 * rng.standard_normal(n),
-    one_draw=lambda rng, y, n: np.full(n, SD0 * rng.standard_normal()),
-    cut_draws=lambda rng, y, n: SD0 * np.clip(rng.standard_normal(n), -2.9, 2.9),
-    guided_without_weights=lambda rng, y, n: np.asarray(optimal_initial(y).sample(rng, n)),
-)
-
-
-@faulty(_DRAWN, "times the variance", exact_prior, proposal)
-def pairs(rng, y, n):
-    return SD0 * np.repeat(rng.standard_normal(-(-n // 2)), 2)[:n]
-
-
-def _weighed(rng, y, n, factor):
+def weighed(rng, y, n, factor=1.0):
     q = Normal(0.0, 1.2 * SD0)
     x = q.sample(rng, n)
     return x, Normal(0.0, SD0).log_prob(x) - q.log_prob(x) + np.log(factor)
 
 
-@faulty(_DRAWN, "the mean weight is", exact_prior, proposal)
-def weights_of_mean_two(rng, y, n):
-    return _weighed(rng, y, n, 2.0)
-
-
-@proposal
-def correct_draws(rng, y, n):
-    return SD0 * rng.standard_normal(n)
-
-
-@proposal
-def correct_weighed(rng, y, n):
-    return _weighed(rng, y, n, 1.0)
-
-
-@proposal
-def correct_antithetic(rng, y, n):
+def antithetic(rng, y, n):
     """Less variance than independent draws, sorted."""
     half = rng.standard_normal(-(-n // 2))
     return SD0 * np.sort(rng.permutation(np.concatenate([half, -half]))[:n])
 
+
+plant(
+    proposal,
+    OneTooFew=(
+        "gives_n_particles",
+        "asked for 2 particles it returns 1",
+        lambda rng, y, n: rng.standard_normal(max(n - 1, 1)),
+    ),
+    OneNumberForTwoAxes=(
+        _DRAWN,
+        "coordinate 0 of x +",
+        lambda rng, y, n: SD0 * np.broadcast_to(rng.standard_normal((n, 1)), (n, 2)),
+        exact_prior_in_plane,
+    ),
+    InvertedWeights=(_DRAWN, "is below", inverted_weights, exact_prior),
+    Narrow=(_DRAWN, "is below", lambda rng, y, n: 0.97 * SD0 * rng.standard_normal(n), exact_prior),
+    OffCentre=(_DRAWN, "is below", lambda rng, y, n: 0.05 + SD0 * rng.standard_normal(n), exact_prior),
+    OneDraw=(_DRAWN, "is below", lambda rng, y, n: np.full(n, SD0 * rng.standard_normal()), exact_prior),
+    CutDraws=(_DRAWN, "is below", lambda rng, y, n: SD0 * rng.standard_normal(n).clip(-2.9, 2.9), exact_prior),
+    Unweighted=(_DRAWN, "is below", lambda rng, y, n: optimal_initial(y).sample(rng, n), exact_prior),
+    Pairs=(_DRAWN, "times the variance", lambda rng, y, n: SD0 * in_blocks(rng, range(n), 2), exact_prior),
+    WeightsOfMeanTwo=(_DRAWN, "the mean weight is", lambda rng, y, n: weighed(rng, y, n, 2.0), exact_prior),
+)
+correct_draws, correct_weighed, correct_antithetic = map(
+    proposal, (lambda rng, y, n: SD0 * rng.standard_normal(n), weighed, antithetic)
+)
 
 # --- rejuvenations ------------------------------------------------------------------------------------------------
 _KEPT = "keeps_the_distribution"
 _NUMBER = "keeps_number_and_weights"
 
 
-def _metropolis(rng, x, previous, y, step, temperature=1.0):
-    """A Metropolis step for p(x_t | x_{t-1}, y_t), at a temperature."""
+def _metropolis(rng, x, previous, y, shift=0.0, temperature=1.0):
+    """A Metropolis step for p(x_t | x_{t-1}, y_t), at a temperature; one with a shift is not symmetric."""
 
     def log_p(v):
-        return (Normal(RHO * previous, SIGMA).log_prob(v) + Normal(v, TAU).log_prob(y)) / temperature
+        return (Normal(RHO * previous, SIGMA).log_prob(v) + log_g(v, y)) / temperature
 
-    return np.where(np.log1p(-rng.random(len(x))) < log_p(x + step) - log_p(x), x + step, x)
+    new = x + 0.5 * rng.standard_normal(len(x)) + shift
+    return np.where(np.log1p(-rng.random(len(x))) < log_p(new) - log_p(x), new, x)
+
+
+def pairs_of_steps(rng, x, previous, y):
+    p = optimal(previous, y)
+    return np.asarray(p.mean) + float(np.asarray(p.sd).flat[0]) * in_blocks(rng, x, 2)
 
 
 @kernel
@@ -557,90 +502,54 @@ def gibbs(rng, x, previous, y):
     return optimal(previous, y).sample(rng, len(x))
 
 
-@kernel
-def correct_kernel(rng, x, previous, y):
-    return _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)))
-
-
-add_faults(
-    _KEPT,
-    "no longer exact",
-    None,
+correct_kernel = kernel(_metropolis)
+plant(
     kernel,
-    hot=lambda rng, x, previous, y: _metropolis(
-        rng, x, previous, y, 0.5 * rng.standard_normal(len(x)), temperature=1.1
+    _KEPT,
+    Hot=("no longer exact", lambda rng, x, previous, y: _metropolis(rng, x, previous, y, temperature=1.1)),
+    Asymmetric=("no longer exact", lambda rng, x, previous, y: _metropolis(rng, x, previous, y, 0.1)),
+    ForgetsTheObservation=("no longer exact", lambda rng, x, previous, y: step(rng, previous)),
+    SwapsNeighbours=("no longer exact", lambda rng, x, previous, y: rng.permutation(x)),
+    PairsOfSteps=("of neighbours", pairs_of_steps),
+    # Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong.
+    ForgetsTheParent=(
+        "x_t - x_{t-1}",
+        lambda rng, x, previous, y: optimal(rng.normal(0.2, 1.0, len(x)), y).sample(rng, len(x)),
     ),
-    asymmetric=lambda rng, x, previous, y: _metropolis(rng, x, previous, y, 0.5 * rng.standard_normal(len(x)) + 0.1),
-    forgets_the_observation=lambda rng, x, previous, y: walk(previous, rng.standard_normal(len(x))),
-    swaps_neighbours=lambda rng, x, previous, y: rng.permutation(x),
+)
+plant(
+    rejuvenation,
+    _NUMBER,
+    WeighsMoves=("changes log weights", lambda rng, p, previous, y: p.reweighted(rng.standard_normal(len(p)))),
+    NeedsAPast=("previous=None", lambda rng, p, previous, y: p.moved(p.particles + 0 * previous.particles)),
+    LosesOne=("2 particles became 1", lambda rng, p, previous, y: p.take(np.arange(max(1, len(p) - 1)))),
 )
 
 
-@faulty(_KEPT, "of neighbours", None, kernel)
-def pairs_of_steps(rng, x, previous, y):
-    step = np.repeat(rng.standard_normal(-(-len(x) // 2)), 2)[: len(x)]
-    return np.asarray(optimal(previous, y).mean) + float(np.asarray(optimal(0.0, y).sd)) * step
-
-
-@faulty(_KEPT, "x_t - x_{t-1}", None, kernel)
-def ForgetsTheParent(rng, x, previous, y):
-    """Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong."""
-    return optimal(rng.normal(0.2, 1.0, len(x)), y).sample(rng, len(x))
-
-
-@faulty(_NUMBER, "changes log weights", None, of(Rejuvenation, "move"))
-def WeighsMoves(rng, population, previous, observation):
-    return population.reweighted(rng.standard_normal(len(population)))
-
-
-@faulty(_NUMBER, "previous=None", None, of(Rejuvenation, "move"))
-def NeedsAPast(rng, population, previous, observation):
-    return population.moved(population.particles + 0 * previous.particles)
-
-
-@faulty(_NUMBER, "2 particles became 1", None, of(Rejuvenation, "move"))
-def LosesOne(rng, population, previous, observation):
-    return population.take(np.arange(max(1, len(population) - 1)))
-
-
-# --- triggers and sizes -------------------------------------------------------------------------------------------
-add_methods(
-    Trigger,
-    "wants",
-    AbsoluteWeight=(
-        "scale_of_weights_is_irrelevant",
-        "change its answer",
-        lambda population, t: population.log_weights.max() < 0,
-    ),
-    MaybeTrigger=("answers", "True or False", lambda population, t: population.ess),
-)
-add_methods(Size, "choose", HalfSize=("answers", "at least 1", lambda population: len(population) // 2))
-
-
-# --- similarities and equivalences --------------------------------------------------------------------------------
+# --- triggers, sizes, similarities, equivalences, lookaheads, evidence --------------------------------------------
 def distances(particles):
     return np.abs(particles[:, None] - particles[None, :])
 
 
-add_methods(
-    Similarity,
-    "matrix",
+plant(
+    of(Trigger, wants=plainly),
+    AbsoluteWeight=("scale_of_weights_is_irrelevant", "change its answer", lambda p, t: p.log_weights.max() < 0),
+    MaybeTrigger=("answers", "True or False", lambda p, t: p.ess),
+)
+plant(of(Size, choose=plainly), HalfSize=("answers", "at least 1", lambda population: len(population) // 2))
+plant(
+    of(Similarity, matrix=plainly),
     Distance=("similarities_are_shares", "to itself", distances),
     RelativeSimilarity=(_ORDER, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
     OneSided=("similarities_are_shares", "similarity of particles", lambda x: np.tril(np.ones((len(x), len(x))))),
 )
-add_methods(
-    Equivalence,
-    "classes",
+plant(
+    of(Equivalence, classes=plainly),
     CountsFromOne=("classes_are_numbered", "classes are", lambda particles: np.arange(1, len(particles) + 1)),
     AllDifferent=(_ORDER, "if there are copies", lambda particles: np.arange(len(particles))),
 )
-
-
-# --- lookaheads ---------------------------------------------------------------------------------------------------
-add_methods(
-    Lookahead,
-    "log_priority",
+plant(
+    of(Lookahead, log_priority=plainly),
     LooksAtWeights=("ignores_weights", "change the priorities", lambda p, y: p.log_weights + p.particles),
     RulesOut=("scores_are_finite", "-inf", lambda p, y: np.where(p.particles > 1, -np.inf, 0.0)),
     OneForAll=("scores_are_finite", "shape (1,)", lambda p, y: np.zeros(1)),
@@ -648,43 +557,38 @@ add_methods(
 )
 
 
+def by_identity(hypotheses, clip):
+    """Compares hypotheses by identity, not by content."""
+    born = {id(h.objects): k for k, h in reversed(list(enumerate(hypotheses)))}
+    return np.array([float(born[id(h.objects)]) for h in hypotheses])
+
+
+plant(
+    of(Evidence, log_score=plainly),
+    "copies_score_the_same",
+    HighNamesWin=("other numbers", lambda hypotheses, clip: np.array([float(h.labels.max()) for h in hypotheses])),
+    ByIdentity=("its copy", by_identity),
+)
+
 # --- codecs -------------------------------------------------------------------------------------------------------
 _DECODED = "decoded_particles_are_equal"
-
-
-def encodes(function):
-    """A codec that stores ``{"x": function(particles)}`` and returns it as double precision."""
-
-    def encode(self, particles):
-        return {"x": function(particles)}
-
-    def decode(self, arrays):
-        return arrays["x"].astype(np.float64)
-
-    return type(function.__name__, (Codec,), {"encode": encode, "decode": decode})
-
-
-add_faults(
-    _DECODED,
-    "not the same",
-    None,
+#: A codec that stores ``{"x": function(particles)}`` and returns it as double precision.
+encodes = of(
+    Codec,
+    encode=lambda f, particles: {"x": f(particles)},
+    decode=lambda f, arrays: arrays["x"].astype(np.float64),
+)
+plant(
     encodes,
-    SinglePrecision=lambda particles: particles.astype(np.float32),
-    Sorts=lambda particles: np.sort(particles),
+    _DECODED,
+    SinglePrecision=("not the same", lambda particles: particles.astype(np.float32)),
+    Sorts=("not the same", lambda particles: np.sort(particles)),
+    Pickles=("Python objects", lambda particles: np.array(list(particles), dtype=object)),
+    Lists=("a list as", lambda particles: particles.tolist()),
 )
 
 
-@faulty(_DECODED, "Python objects", None, encodes)
-def Pickles(particles):
-    return np.array(list(particles), dtype=object)
-
-
-@faulty(_DECODED, "a list as", None, encodes)
-def Lists(particles):
-    return particles.tolist()
-
-
-@faulty("decoded_particles_are_equal", "list index out of range")
+@faulty(_DECODED, "list index out of range")
 @dataclass(frozen=True)
 class Keeps(Codec):
     """Decodes what it has stored in itself, which a new process has not."""
@@ -699,22 +603,6 @@ class Keeps(Codec):
         return self.kept[-1]
 
 
-# --- evidence -----------------------------------------------------------------------------------------------------
-_COPIES = "copies_score_the_same"
-add_methods(
-    Evidence,
-    "log_score",
-    HighNamesWin=(_COPIES, "other numbers", lambda h, clip: np.array([float(one.labels.max()) for one in h])),
-)
-
-
-@faulty(_COPIES, "its copy", None, of(Evidence, "log_score"))
-def ByIdentity(hypotheses, clip):
-    """Compares hypotheses by identity, not by content."""
-    born = {id(h.objects): k for k, h in reversed(list(enumerate(hypotheses)))}
-    return np.array([float(born[id(h.objects)]) for h in hypotheses])
-
-
 #: Correct components and their exact draws.
 CORRECT = [
     (CorrectDensity(), exact_density),
@@ -727,8 +615,5 @@ CORRECT = [
     (correct_antithetic(), exact_prior),
     *((component(), exact_ar1) for component in (correct_kernel, gibbs, nothing)),
 ]
-#: Updates that draw: their weights, or the particles that they keep, are random.
-CORRECT_RANDOM = [
-    (CorrectNoise(), exact_weights),
-    (CorrectNoise(), exact_evidence),
-]
+#: Updates whose weights are random.
+CORRECT_RANDOM = [(CorrectNoise(), exact_weights), (CorrectNoise(), exact_evidence)]
