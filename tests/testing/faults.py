@@ -1,52 +1,28 @@
-"""Resamplers with one fault each, and correct ones.
-
-`FAULTS` holds ``class: (a property that it breaks, words of the message)``.
-"""
+"""Resamplers with one fault each, and correct ones."""
 
 from __future__ import annotations
 
 import copy
 import random
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, log_mean_exp, normalise
+from tests.testing import Faults, of
 
-FAULTS: dict[type, tuple[str, str]] = {}
-
-
-def selecting(function, **attributes):
-    """A resampler class of ``function(rng, log_weights, n)``, which returns ancestors, or also log weights."""
-
-    def select(self, rng, log_weights, n):
-        found = function(rng, log_weights, n)
-        return found if isinstance(found, tuple) else (found, None)
-
-    body = {"select": select, "__doc__": function.__doc__, **attributes}
-    return dataclass(frozen=True)(type(function.__name__, (WeightResampler,), body))
+FAULTS = Faults()
+faulty, plant = FAULTS.faulty, FAULTS.plant
 
 
-def faulty(broken, words, **attributes):
-    """Add a class, or one of `selecting`, to the list."""
-
-    def add(fault: Any) -> Any:
-        cls = fault if isinstance(fault, type) else selecting(fault, **attributes)
-        FAULTS[cls] = (broken, words)
-        return cls
-
-    return add
+def selected(function, rng, log_weights, n):
+    found = function(rng, log_weights, n)
+    return found if isinstance(found, tuple) else (found, None)
 
 
-def add_faults(add, **functions):
-    """Add the classes of functions whose messages have the same words."""
-    for name, function in functions.items():
-        function.__name__ = name
-        add(function)
-
-
-biased = faulty("carried_weight", "copies are biased")
+#: A resampler of ``function(rng, log_weights, n)``, which returns ancestors, or also log weights.
+selecting = of(WeightResampler, select=selected)
 
 
 def systematic(rng, weights, n):
@@ -64,15 +40,6 @@ def by_weight(rng, lw, n):
 def multinomial(rng, weights, n):
     """Another correct scheme, with the largest variance."""
     return np.searchsorted(np.cumsum(weights)[:-1], rng.random(n) * weights.sum(), side="right")
-
-
-def weighing(broken, words, select=systematic, **changes):
-    """Add schemes that select by changed weights, ``change(W, n)`` of the normalised ones."""
-
-    def by(change):
-        return lambda rng, lw, n: select(rng, change(normalise(lw), n), n)
-
-    add_faults(faulty(broken, words), **{name: by(change) for name, change in changes.items()})
 
 
 # --- correct schemes ----------------------------------------------------------------------------------------------
@@ -150,11 +117,12 @@ def SizeChanging(rng, lw, n):
 
 CORRECT = (MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
 
+_CARRIED, _NUMBER, _ZERO = "carried_weight", "gives_n_particles", "zero_weights_are_never_chosen"
+_SCALE, _PARENTS = "scale_of_weights_is_irrelevant", "keeps_parents"
+
+
 # --- wrong numbers of copies --------------------------------------------------------------------------------------
-
-
-@biased
-def BiasedResidual(rng, lw, n):
+def biased_residual(rng, lw, n):
     """The remainder is drawn from W - copies instead of n W - copies: light particles are selected too rarely."""
     W = normalise(lw)
     copies = np.floor(n * W)
@@ -163,81 +131,30 @@ def BiasedResidual(rng, lw, n):
     return np.concatenate([np.repeat(np.arange(len(W)), copies.astype(int)), drawn])
 
 
-add_faults(
-    faulty("gives_n_particles", "asked to make"),
-    IgnoresN=lambda rng, lw, n: systematic(rng, normalise(lw), len(lw)),
-    # Returns fewer than n without saying so.
-    NoDuplicates=lambda rng, lw, n: np.unique(by_weight(rng, lw, n)),
-)
-
-
-@faulty("zero_weights_are_never_chosen", "weight 0")
-def PicksZeroWeights(rng, lw, n):
-    """Gives the remainder to the last particle, for any weight."""
+def rest_to_the_last(rng, lw, n):
     copies = np.floor(n * normalise(lw)).astype(int)
     copies[-1] += n - copies.sum()
     return np.repeat(np.arange(len(lw)), copies)
 
 
-@faulty("zero_weights_are_never_chosen", "gives 0, of weights (0, 0, 1, 2, 3) it selects particle 0, weight 0")
-def ZeroAtTheEdge(rng, lw, n):
+def zero_at_the_edge(rng, lw, n):
     """Picks a leading weight of zero where the uniform is exactly 0."""
     points = (np.arange(n) + rng.random()) / n
     return np.searchsorted(np.cumsum(normalise(lw)), points, side="left")
 
 
-@biased
-def FirstAlwaysStays(rng, lw, n):
-    """Always selects the first particle with weight."""
+def first_always_stays(rng, lw, n):
     drawn = systematic(rng, normalise(lw), max(n - 1, 1))
     return np.concatenate([[np.flatnonzero(lw > -np.inf)[0]], drawn])[:n]
 
 
-# Counts particles from 1; and the same inside the range.
-add_faults(faulty("gives_n_particles", "expected 0 to"), OffByOne=lambda rng, lw, n: by_weight(rng, lw, n) + 1)
-add_faults(
-    faulty("carried_weight", "off by one"),
-    OffByOneClipped=lambda rng, lw, n: (by_weight(rng, lw, n) + 1) % len(lw),
-)
-add_faults(
-    faulty("carried_weight", "n = m must be resampled"),
-    KeepsAll=lambda rng, lw, n: np.arange(n) if n == len(lw) else by_weight(rng, lw, n),
-)
-add_faults(
-    faulty("carried_weight", "5 particles to 1"),
-    single_is_heaviest=lambda rng, lw, n: np.array([np.argmax(lw)]) if n == 1 else by_weight(rng, lw, n),
-)
-add_faults(
-    faulty("many_particles", "too few bits"),
-    sixteen_bits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int),
-)
-add_faults(
-    faulty("gives_n_particles", "float64, expected integers"),
-    as_floats=lambda rng, lw, n: by_weight(rng, lw, n).astype(float),
-)
-add_faults(
-    faulty("gives_n_particles", "asked to make", exact_size=False),
-    MoreThanAsked=lambda rng, lw, n: by_weight(rng, lw, n + 1),
-)
-add_faults(
-    faulty("repeats_with_the_same_generator", "draws = False", draws=False),
-    CallsItDrawless=lambda rng, lw, n: by_weight(rng, lw, n),
-)
-add_faults(
-    faulty("depends_on_the_generator", "ignores `rng`"),
-    SeedIgnored=lambda rng, lw, n: by_weight(np.random.default_rng(0), lw, n),
-)
-
-
-@faulty("carried_weight", "copies are biased")
-def TiesToTheFirst(rng, lw, n):
+def ties_to_the_first(rng, lw, n):
     """Finds particles by their weight."""
     _, first, index = np.unique(lw, return_index=True, return_inverse=True)
     return first[index[by_weight(rng, lw, n)]]
 
 
-@faulty("carried_weight", "copies are biased")
-def OnePosition(rng, lw, n):
+def one_position(rng, lw, n):
     """The first position always goes to the heaviest particle, if n = m."""
     ancestors = by_weight(rng, lw, n)
     if n == len(lw) > 1:
@@ -245,8 +162,7 @@ def OnePosition(rng, lw, n):
     return ancestors
 
 
-@faulty("carried_weight", "copies are biased")
-def Halves(rng, lw, n):
+def halves(rng, lw, n):
     """The halves of a population are resampled apart, if n = m is even."""
     weights, half = normalise(lw), n // 2
     if n != len(weights) or n % 2 or min(weights[:half].sum(), weights[half:].sum()) == 0:
@@ -254,10 +170,6 @@ def Halves(rng, lw, n):
     return np.concatenate([systematic(rng, weights[:half], half), half + systematic(rng, weights[half:], half)])
 
 
-# --- faults at some sizes -----------------------------------------------------------------------------------------
-
-
-@biased
 def odd_is_special(rng, lw, n):
     found = by_weight(rng, lw, n)
     if n % 2 and n > 1:
@@ -265,7 +177,6 @@ def odd_is_special(rng, lw, n):
     return found
 
 
-@biased
 def more_than_there_are(rng, lw, n):
     """If n > m every particle is kept once, and the rest is drawn."""
     weights, m = normalise(lw), len(lw)
@@ -274,103 +185,151 @@ def more_than_there_are(rng, lw, n):
     return np.concatenate([np.arange(m), systematic(rng, weights, n - m)])
 
 
-add_faults(
-    faulty("carried_weight", "300 particles to 300"),
-    eight_bits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
-)
-
-
-# --- faults at some weights ---------------------------------------------------------------------------------------
-
-
-@faulty("carried_weight", "particles to 3")
 def winner_takes_all(rng, lw, n):
     weights = normalise(lw)
     return np.full(n, np.argmax(weights)) if weights.max() > 0.9 else systematic(rng, weights, n)
 
 
-weighing("carried_weight", "heaviest particle gets -11 %", at_most_half=lambda W, n: np.minimum(W, 0.5))
-weighing(
-    "carried_weight", "copies are biased", floor_of_weights=lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0)
+_CACHE: dict = {}
+
+
+def module_cache(rng, lw, n):
+    """Cached by the sizes, beside the class."""
+    return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
+
+
+plant(
+    selecting,
+    BiasedResidual=(_CARRIED, "copies are biased", biased_residual),
+    IgnoresN=(_NUMBER, "asked to make", lambda rng, lw, n: by_weight(rng, lw, len(lw))),
+    NoDuplicates=(_NUMBER, "asked to make", lambda rng, lw, n: np.unique(by_weight(rng, lw, n))),
+    PicksZeroWeights=(_ZERO, "weight 0", rest_to_the_last),
+    ZeroAtTheEdge=(_ZERO, "gives 0, of weights (0, 0, 1, 2, 3) it selects particle 0, weight 0", zero_at_the_edge),
+    FirstAlwaysStays=(_CARRIED, "copies are biased", first_always_stays),
+    # Counts particles from 1; and the same inside the range.
+    OffByOne=(_NUMBER, "expected 0 to", lambda rng, lw, n: by_weight(rng, lw, n) + 1),
+    OffByOneClipped=(_CARRIED, "off by one", lambda rng, lw, n: (by_weight(rng, lw, n) + 1) % len(lw)),
+    KeepsAll=(
+        _CARRIED,
+        "n = m must be resampled",
+        lambda rng, lw, n: np.arange(n) if n == len(lw) else by_weight(rng, lw, n),
+    ),
+    SingleIsHeaviest=(
+        _CARRIED,
+        "5 particles to 1",
+        lambda rng, lw, n: np.array([np.argmax(lw)]) if n == 1 else by_weight(rng, lw, n),
+    ),
+    EightBits=(
+        _CARRIED,
+        "300 particles to 300",
+        lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
+    ),
+    SixteenBits=(
+        "many_particles",
+        "too few bits",
+        lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int),
+    ),
+    AsFloats=(_NUMBER, "float64, expected integers", lambda rng, lw, n: by_weight(rng, lw, n).astype(float)),
+    TiesToTheFirst=(_CARRIED, "copies are biased", ties_to_the_first),
+    OnePosition=(_CARRIED, "copies are biased", one_position),
+    Halves=(_CARRIED, "copies are biased", halves),
+    OddIsSpecial=(_CARRIED, "copies are biased", odd_is_special),
+    MoreThanThereAre=(_CARRIED, "copies are biased", more_than_there_are),
+    WinnerTakesAll=(_CARRIED, "particles to 3", winner_takes_all),
+    ModuleCache=(_CARRIED, "copies are biased", module_cache),
 )
-# Particles below a thousandth of the largest weight are dropped, if n = m.
-weighing(
-    "carried_weight", "copies are biased", DropsLight=lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W)
+plant(
+    of(WeightResampler, {"exact_size": False}, select=selected),
+    MoreThanAsked=(_NUMBER, "asked to make", lambda rng, lw, n: by_weight(rng, lw, n + 1)),
 )
-# A power of the weights, if n = m, or if there are more than a hundred.
-weighing("carried_weight", "copies are biased", Flattens=lambda W, n: W ** (0.9 if n == len(W) else 1.0))
-weighing("carried_weight", "125 particles to 5", sharpens_many=lambda W, n: W ** (1.1 if len(W) > 100 else 1.0))
-# If there are more than twenty times as many as are selected, the light ones are left out.
-weighing(
-    "carried_weight",
-    "100 particles to 2",
-    heaviest_of_many=lambda W, n: np.where(np.sort(W)[-20 * n] <= W, W, 0.0) if len(W) > 20 * n else W,
+#: Schemes that select by changed weights, ``function(W, n)`` of the normalised ones.
+weighing = of(WeightResampler, select=lambda f, rng, lw, n: (systematic(rng, f(normalise(lw), n), n), None))
+plant(
+    weighing,
+    AtMostHalf=(_CARRIED, "heaviest particle gets -11 %", lambda W, n: np.minimum(W, 0.5)),
+    FloorOfWeights=(_CARRIED, "copies are biased", lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0)),
+    # Particles below a thousandth of the largest weight are dropped, if n = m.
+    DropsLight=(_CARRIED, "copies are biased", lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W)),
+    # A power of the weights, if n = m, or if there are more than a hundred.
+    Flattens=(_CARRIED, "copies are biased", lambda W, n: W ** (0.9 if n == len(W) else 1.0)),
+    SharpensMany=(_CARRIED, "125 particles to 5", lambda W, n: W ** (1.1 if len(W) > 100 else 1.0)),
+    # If there are more than twenty times as many as are selected, the light ones are left out.
+    HeaviestOfMany=(
+        _CARRIED,
+        "100 particles to 2",
+        lambda W, n: np.where(np.sort(W)[-20 * n] <= W, W, 0.0) if len(W) > 20 * n else W,
+    ),
+    # Sorts by weight and forgets to sort back.
+    OrderMatters=(_CARRIED, "are the particles sorted, and not the ancestors?", lambda W, n: np.sort(W)[::-1]),
+    # Cumulates in single precision: small weights are lost.
+    SinglePrecisionSum=("many_particles", "single precision", lambda W, n: W.astype(np.float32)),
 )
-# Sorts by weight and forgets to sort back.
-weighing(
-    "carried_weight",
-    "are the particles sorted, and not the ancestors?",
-    OrderMatters=lambda W, n: np.sort(W)[::-1],
-)
-# Cumulates in single precision: small weights are lost.
-weighing("many_particles", "single precision", SinglePrecisionSum=lambda W, n: W.astype(np.float32))
 # Independent draws hide a small bias best: the largest weight is 1 % too large, or 5 % if it is above 0.6.
-weighing(
-    "largest_weight",
-    "heaviest particle gets +",
-    multinomial,
-    OnePercent=lambda W, n: np.where(W.max() == W, 1.01, 1.0) * W,
-)
-weighing(
-    "carried_weight",
-    "heaviest particle gets +",
-    multinomial,
-    heavy_gains=lambda W, n: np.where(W > 0.6, 1.05, 1.0) * W,
+plant(
+    of(WeightResampler, select=lambda f, rng, lw, n: (multinomial(rng, f(normalise(lw)), n), None)),
+    OnePercent=("largest_weight", "heaviest particle gets +", lambda W: np.where(W.max() == W, 1.01, 1.0) * W),
+    HeavyGains=(_CARRIED, "heaviest particle gets +", lambda W: np.where(W > 0.6, 1.05, 1.0) * W),
 )
 
 
-@faulty("scale_of_weights_is_irrelevant", "log weights")
-def dropped_by_absolute_weight(rng, lw, n):
-    return systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n)
-
-
-@faulty("scale_of_weights_is_irrelevant", "overflow")
-def SinglePrecisionOverflow(rng, lw, n):
+# --- scale, generators and state ----------------------------------------------------------------------------------
+def single_precision_overflow(rng, lw, n):
     """exp in single precision overflows at 88."""
     weights = np.exp(lw.astype(np.float32))
     return systematic(rng, weights / weights.sum(), n)
 
 
-@faulty("does_not_use_global_generators", "numpy's global generator")
-def global_if_more(rng, lw, n):
-    return by_weight(np.random if n > len(lw) else rng, lw, n)
-
-
-@faulty("does_not_use_global_generators", "Python's global generator")
 def python_generator(rng, lw, n):
     found = by_weight(rng, lw, n)
     random.shuffle(found)
     return found
 
 
-_other_generator = faulty("repeats_with_the_same_generator", "does not come from `rng`")
-
-
-add_faults(
-    _other_generator,
-    # A new generator of unknown seed at each call.
-    OwnGenerator=lambda rng, lw, n: systematic(np.random.default_rng(), normalise(lw), n),
-    module_generator=lambda rng, lw, n: systematic(_OWN, normalise(lw), n),
-)
+def in_place_if_equal(rng, lw, n):
+    if n == len(lw):
+        lw -= lw.max()
+    return by_weight(rng, lw, n)
 
 
 _OWN = np.random.default_rng(5)
-
-
-@faulty("depends_on_the_generator", "does not advance")
-def copies_the_generator(rng, lw, n):
-    """Draws from a copy of the generator, which is not advanced."""
-    return systematic(copy.deepcopy(rng), normalise(lw), n)
+_GLOBAL, _REPEATS = "does_not_use_global_generators", "repeats_with_the_same_generator"
+plant(
+    selecting,
+    DroppedByAbsoluteWeight=(
+        _SCALE,
+        "log weights",
+        lambda rng, lw, n: systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n),
+    ),
+    SinglePrecisionOverflow=(_SCALE, "overflow", single_precision_overflow),
+    SinglePrecisionOutput=(
+        _SCALE,
+        "do not add it",
+        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, log_mean_exp(lw)).astype(np.float32)),
+    ),
+    GlobalIfMore=(
+        _GLOBAL,
+        "numpy's global generator",
+        lambda rng, lw, n: by_weight(np.random if n > len(lw) else rng, lw, n),
+    ),
+    PythonGenerator=(_GLOBAL, "Python's global generator", python_generator),
+    OwnGenerator=(_REPEATS, "come from `rng`", lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n)),
+    ModuleGenerator=(_REPEATS, "come from `rng`", lambda rng, lw, n: by_weight(_OWN, lw, n)),
+    SeedIgnored=(
+        "depends_on_the_generator",
+        "ignores `rng`",
+        lambda rng, lw, n: by_weight(np.random.default_rng(0), lw, n),
+    ),
+    CopiesTheGenerator=(
+        "depends_on_the_generator",
+        "does not advance",
+        lambda rng, lw, n: by_weight(copy.deepcopy(rng), lw, n),
+    ),
+    InPlaceIfEqual=("does_not_change_input", "in place", in_place_if_equal),
+)
+plant(
+    of(WeightResampler, {"draws": False}, select=selected),
+    CallsItDrawless=(_REPEATS, "draws = False", lambda rng, lw, n: by_weight(rng, lw, n)),
+)
 
 
 @faulty("keeps_no_state", "keeps state")
@@ -385,84 +344,58 @@ class FirstCallCached(WeightResampler):
         return systematic(rng, weights, n), None
 
 
-_CACHE: dict = {}
-
-
-@biased
-def module_cache(rng, lw, n):
-    """Cached by the sizes, beside the class."""
-    return systematic(rng, _CACHE.setdefault((len(lw), n), normalise(lw)), n)
-
-
-@faulty("does_not_change_input", "in place")
-def in_place_if_equal(rng, lw, n):
-    if n == len(lw):
-        lw -= lw.max()
-    return by_weight(rng, lw, n)
-
-
-# --- output -------------------------------------------------------------------------------------------------------
-
-
-@faulty("carried_weight", "output weights are wrong")
-def OldWeightsKept(rng, lw, n):
+# --- output, particles and parents --------------------------------------------------------------------------------
+def old_weights_kept(rng, lw, n):
     """Selects by weight and keeps the weight, so the weight counts twice."""
     ancestors = by_weight(rng, lw, n)
     return ancestors, lw[ancestors]
 
 
-add_faults(
-    faulty("carried_weight", "mean weight after selection"),
+plant(
+    selecting,
+    _CARRIED,
+    OldWeightsKept=("output weights are wrong", old_weights_kept),
     # Equal weights, but not those that keep the evidence.
-    WeightsForgotten=lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, -np.log(n))),
+    WeightsForgotten=(
+        "mean weight after selection",
+        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, -np.log(n))),
+    ),
+    # The evidence is the mean of the positive weights.
+    MeanOfPositive=(
+        "by the number of all particles",
+        lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, log_mean_exp(lw[lw > -np.inf]))),
+    ),
 )
 
 
-@faulty("carried_weight", "by the number of all particles")
-def MeanOfPositive(rng, lw, n):
-    """The evidence is the mean of the positive weights."""
-    return by_weight(rng, lw, n), np.full(n, log_mean_exp(lw[lw > -np.inf]))
+def correctly_chosen(function, rng, population, n):
+    ancestors = rng.permutation(systematic(rng, population.weights, n))
+    return function(population.select(ancestors, np.full(n, population.log_mean_weight)), rng)
 
 
-@faulty("scale_of_weights_is_irrelevant", "do not add it")
-def single_precision_output(rng, lw, n):
-    return by_weight(rng, lw, n), np.full(n, log_mean_exp(lw)).astype(np.float32)
-
-
-# --- particles and parents ----------------------------------------------------------------------------------------
-
-
-def changing(broken, words):
-    """Add a resampler whose correct selection a function ``(chosen, population, rng, n)`` changes."""
-
-    def add(function):
-        def resample(self, rng, population, n):
-            ancestors = rng.permutation(systematic(rng, population.weights, n))
-            chosen = population.select(ancestors, np.full(n, population.log_mean_weight))
-            return function(chosen, population, rng, n)
-
-        cls = type(function.__name__, (Resampler,), {"resample": resample})
-        FAULTS[cls] = (broken, words)
-
-    return add
-
-
-@changing("gives_n_particles", 'no parents "ancestor"')
-def ForgetsAncestors(chosen, population, rng, n):
-    return Population(chosen.particles, chosen.log_weights)
-
-
-@changing("keeps_parents", '"proposed"')
-def LosesProposed(chosen, population, rng, n):
+def without_proposed(chosen, rng):
     return chosen.labelled({k: v for k, v in chosen.parents.items() if k != "proposed"})
 
 
-@changing("keeps_parents", "not those of the ancestors")
-def MovesSelected(chosen, population, rng, n):
-    return chosen.moved(chosen.particles + 0.01 * rng.standard_normal(n))
-
-
-@changing("keeps_parents", "not those of the ancestors")
-def SortsAncestors(chosen, population, rng, n):
-    """The ancestors are sorted after the particles were taken."""
-    return chosen.with_ancestors(np.sort(chosen.parents["ancestor"]))
+#: Resamplers whose correct selection ``function(chosen, rng)`` changes.
+plant(
+    of(Resampler, resample=correctly_chosen),
+    ForgetsAncestors=(
+        _NUMBER,
+        'no parents "ancestor"',
+        lambda chosen, rng: Population(chosen.particles, chosen.log_weights),
+    ),
+    LosesProposed=(_PARENTS, '"proposed"', without_proposed),
+    MovesSelected=(
+        _PARENTS,
+        "not those of the ancestors",
+        lambda chosen, rng: chosen.moved(chosen.particles + 0.01 * rng.standard_normal(len(chosen))),
+    ),
+    # The ancestors are sorted after the particles were taken.
+    SortsAncestors=(
+        _PARENTS,
+        "not those of the ancestors",
+        lambda chosen, rng: chosen.with_ancestors(np.sort(chosen.parents["ancestor"])),
+    ),
+)
+BiasedResidual = FAULTS[0][0]

@@ -1,7 +1,4 @@
-"""Components other than resamplers with one fault each, and correct ones.
-
-`FAULTS` is a list of (class, a property that it breaks, words of the message, a function that draws exactly or None).
-"""
+"""Components other than resamplers with one fault each, and correct ones."""
 
 from __future__ import annotations
 
@@ -28,51 +25,12 @@ from mstfilter.smc import (
     union,
 )
 from tests.smc.models import RHO, SD0, SIGMA, TAU, optimal, optimal_initial
+from tests.testing import Faults, of, plainly
 
-FAULTS: list = []
-
-
-def faulty(broken, words, exact=None):
-    """Add a class to the list."""
-
-    def add(cls):
-        FAULTS.append((cls, broken, words, exact))
-        return cls
-
-    return add
-
-
-def plant(make, *common, **faults):
-    """Add the classes that `make` gives of functions: ``name=(broken property, words, function, exact draws)``.
-
-    `common` are values that all faults begin with.
-    """
-    for name, values in faults.items():
-        broken, words, function, *exact = (*common, *(values if isinstance(values, tuple) else (values,)))
-        function.__name__ = name
-        faulty(broken, words, *exact)(make(function))
-
+FAULTS = Faults()
+faulty, plant = FAULTS.faulty, FAULTS.plant
 
 # --- components of functions --------------------------------------------------------------------------------------
-
-
-def of(interface, **methods):
-    """A function that makes a class of an interface: ``method=function(of its argument, *arguments)``."""
-
-    def make(function):
-        def bound(method):
-            return lambda self, *args, **named: method(function, *args, **named)
-
-        called = {name: bound(method) for name, method in methods.items()}
-        return type(function.__name__, (interface,), {**called, "__doc__": function.__doc__})
-
-    return make
-
-
-def plainly(function, *args, **named):
-    return function(*args, **named)
-
-
 #: A transition that replaces the particles by ``function(rng, x, y)``.
 move = of(
     Transition,
