@@ -40,8 +40,8 @@ def test_graph_against_plain_code(a, b):
     assert dict(zip(map(tuple, graph.edges.tolist()), graph.intersection.tolist(), strict=True)) == want
 
 
-def test_the_conflict_graph_of_a_crossover_is_a_networkx_graph(monkeypatch):
-    """Components come from networkx, structures draw on its graph, and users can inspect it."""
+def test_the_conflict_graph_as_a_networkx_graph():
+    """Users can inspect it."""
     a, b = np.zeros((2, 6, 1, 1), np.uint16)
     a[[0, 1, 3, 5], 0, 0] = 7, 7, 8, 9
     b[[1, 2, 3, 4], 0, 0] = 3, 3, 4, 4
@@ -51,19 +51,7 @@ def test_the_conflict_graph_of_a_crossover_is_a_networkx_graph(monkeypatch):
     assert links.nodes[0] == {"side": 0, "label": 7, "size": 2}
     assert links.edges[0, 1] == {"intersection": 1}
     assert [list(links[v]) for v in links] == [[1], [0], [3], [2], []]
-    components, given = [], []
-    found = nx.connected_components
-    monkeypatch.setattr(nx, "connected_components", lambda g: components.append(g) or found(g))
-
-    class Recorded(RandomOrder):
-        def draw(self, rng, graph, component):
-            given.append((graph, component))
-            return super().draw(rng, graph, component)
-
-    Crossover(structure=Recorded()).resolve(np.random.default_rng(0), graph)
-    assert len(components) == 1 and nx.utils.graphs_equal(components[0], links)
-    assert all(g is components[0] for g, _ in given)
-    assert [c for _, c in given] == [[0, 1], [2, 3]] == graph.components()
+    assert graph.components() == [[0, 1], [2, 3]]
 
 
 def path_graph(n, edges, sizes=None, common=None):

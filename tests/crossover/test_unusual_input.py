@@ -187,19 +187,6 @@ def test_free_space_of_unusual_grids():
     assert refined.n_objects == round(quality * MAX_LABEL) < MAX_LABEL
 
 
-def test_an_update_of_parents_without_objects():
-    """If a parent is empty, all candidates can be built and weighted."""
-    nothing, something = on(0 * LABELS, GRID), on(LABELS, GRID, 1)
-    for predicted, proposed in ((nothing, something), (something, nothing), (nothing, nothing)):
-        fused = CrossoverUpdate(eta=2).update(
-            np.random.default_rng(0), Population((predicted,)), Population((proposed,)), CLIP
-        )
-        assert np.isfinite(fused.log_weights).all()
-        wanted = something if something in (predicted, proposed) else nothing
-        for child in fused.realised().particles:
-            np.testing.assert_array_equal(child.labels, wanted.labels)
-
-
 @pytest.mark.parametrize("wrong", ["predicted", "proposed"])
 def test_an_update_of_hypotheses_on_another_grid(wrong):
     """Grids of the same shape with another origin raise an error as well."""

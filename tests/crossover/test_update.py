@@ -218,7 +218,7 @@ def test_the_authors_real_particles(shared_data):
     np.testing.assert_array_equal(kept.log_weights, fused.log_weights[kept.parents["ancestor"]])
 
 
-@pytest.mark.parametrize(("n", "n_proposed"), [(2, 4), (3, 10), (5, 5), (5, 50), (10, 20)])
+@pytest.mark.parametrize(("n", "n_proposed"), [(2, 4), (5, 5), (10, 20)])
 def test_systematic_resampling_reaches_many_parents(n, n_proposed):
     """With equal weights, no stride through the candidates meets one prediction again and again.
 

@@ -120,8 +120,6 @@ def test_each_object_shows_in_its_own_mask():
     ("tree", "value"),
     [
         (UcmTree(), SceneCutObjectness()),
-        (UcmTree(), SceneCutObjectness(background_weight=1.0)),
-        (UcmTree(), MergeLogOdds()),
         (LearnedTree(), MergeLogOdds()),
     ],
 )

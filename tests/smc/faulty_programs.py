@@ -568,13 +568,6 @@ def vectors_with_covariances_of_particles(previous, y):
     observe("y", MultivariateNormal(v, (0.5 + s)[:, None, None] * np.eye(2)), y)
 
 
-@correct()
-def a_matrix_product(previous, y):
-    A = np.array([[1.0, 0.1], [0.0, 0.9]])
-    v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"] @ A.T, 0.5))
-    observe("y", Normal(v[:, 0], 0.5), y)
-
-
 WEIGHTS = np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32) / 8
 
 
@@ -584,17 +577,6 @@ def a_network_in_single_precision(previous, y):
     h = np.tanh(v.astype(np.float32) @ WEIGHTS) @ WEIGHTS
     observe("y", Normal(10.0 + h[:, 0], 0.05), 10.0 + y)
     return {"features": h}
-
-
-@correct()
-def a_switch(previous, y):
-    x = switch(
-        "s",
-        [0.7, 0.3],
-        [lambda v: sample("x", Normal(0.9 * v, 0.3)), lambda v: sample("x", Normal(v + 1.0, 1.0))],
-        np.zeros(200) if previous is None else previous["x"],
-    )
-    seen(x, y)
 
 
 @correct()
@@ -686,24 +668,6 @@ def a_value_that_marks_absence(previous, y):
     seen(x, y)
     last = np.full(len(x), np.nan) if previous is None else previous["last"]
     return {"last": np.where(x > 0, x, last)}
-
-
-@correct()
-def logarithms_of_the_valid_only(previous, y):
-    x = walk(previous)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        z = np.where(x > 0, np.log(x), 0.0)
-    seen(z, y)
-    return {"z": z}
-
-
-@correct()
-def a_fast_path(previous, y):
-    x = walk(previous)
-    far = x > 1.0
-    if far.any():
-        x = np.where(far, 2.0 - x, x)
-    seen(x, y)
 
 
 @correct()

@@ -193,7 +193,7 @@ def test_no_particles_wanted_is_an_error(scheme):
 
 
 @pytest.mark.parametrize("u", [0.0, np.nextafter(1.0, 0.0)])
-@pytest.mark.parametrize(("m", "n"), [(1, 1), (7, 7), (100_000, 100_000), (100_000, 30_000)])
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (7, 7), (100_000, 30_000)])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @each_plain
 def test_extreme_uniforms_and_many_particles(scheme, u, m, n, kind):
