@@ -1,8 +1,8 @@
 """Schemes that see the particles, or make no duplicates, leave the evidence of a filter unbiased.
 
-The contract tests the copies of all schemes. Here, the mean of L_hat / L is within 4 standard errors of 1 (false alarm
-6e-5 a case), and the standard error is below 0.8 %: a bias of 3.5 % would be seen. The numbers of particles and seeds
-keep the standard error at least five of its own standard deviations below that limit (false alarm 3e-7 a case).
+The contract tests the copies of all schemes. Here, the mean of L_hat / L is within 4 standard errors of 1 (false
+alarm 6e-5 a case), and the standard error is below 0.8 %: a bias of 3.5 % would be seen. The numbers of particles and
+seeds keep the standard error at least five of its own standard deviations below that limit (false alarm 3e-7 a case).
 """
 
 from __future__ import annotations
