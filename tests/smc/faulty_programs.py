@@ -702,6 +702,15 @@ def a_number_of_particles_in_the_closure(previous, y):
     return {"age": age}
 
 
+CALLS: list = []
+
+
+@correct()
+def a_log_of_calls(previous, y):
+    CALLS.append(y)
+    seen(walk(previous), y)
+
+
 @correct(n=30)
 @per_particle
 def immutable_use_of_containers(previous, y):
@@ -712,6 +721,30 @@ def immutable_use_of_containers(previous, y):
     track = np.append(np.zeros(1) if previous is None else previous["track"], x)
     seen(np.mean(items) + 0.1 * len(cells) + 0.1 * len(at) + track[0], y)
     return {"items": items, "cells": cells, "at": at, "track": track, "grid": Map([1])}
+
+
+@correct(n=30)
+@per_particle
+def copies_of_containers(previous, y):
+    x = walk(previous)
+    items, at = ([[]], {}) if previous is None else (deepcopy(previous["items"]), deepcopy(previous["at"]))
+    items[0].append(float(x))
+    at[len(at)] = [float(x)]
+    seen(np.mean(items[0]) + 0.1 * len(at), y)
+    return {"items": items, "at": at}
+
+
+SCALES: dict = {}
+
+
+@correct(n=30)
+@per_particle
+def a_cache_of_all_particles(previous, y):
+    x = walk(previous)
+    k = round(float(x))
+    if k not in SCALES:
+        SCALES[k] = 1.0 + abs(k)
+    observe("y", Normal(x, SCALES[k]), y)
 
 
 @correct(n=30)
@@ -728,6 +761,13 @@ def sites_that_come_and_go(previous, y):
 def moves_of_one_particle(previous, y):
     s = sample("s", Gamma(2.0))
     seen(sample("x", Normal(0.0, s)), y)
+
+
+@correct()
+def residuals_of_particles(previous, y):
+    x = walk(previous)
+    observe("residual", Normal(0.0, 0.5), y - x)
+    observe("factor", Normal(x, 3.0), 0.0)
 
 
 @correct()

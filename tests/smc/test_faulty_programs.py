@@ -60,4 +60,4 @@ def test_a_guide_far_narrower_than_the_posterior_warns():
 def test_few_faults_run_without_an_error():
     for filter, ys, _ in INHERENT.values():
         filter.run(ys, 0)
-    assert len(FAULTY) >= 60 and len(CORRECT) >= 30 and len(INHERENT) <= 5
+    assert len(FAULTY) >= 60 and len(CORRECT) >= 20 and len(INHERENT) <= 5

@@ -36,11 +36,16 @@ from mstfilter.smc import (
 )
 from tests.smc.models import (
     AR1,
+    EMIT,
+    MOVES,
     RHO,
     SD0,
     SIGMA,
+    START,
+    SYMBOLS,
     TAU,
     ar1_observations,
+    forward,
     kalman_ar1,
     mean_ratio,
     optimal,
@@ -118,6 +123,7 @@ def test_a_program_that_is_run_particle_by_particle():
     cov = np.array([[1.0, RHO], [RHO, RHO**2 + SIGMA**2]]) + 4.0 * np.eye(2)
     exact_mild = float(stats.multivariate_normal(np.zeros(2), cov).logpdf(YS[:2]))
     for make in (
+        lambda p, guide: p.bootstrap(60),
         lambda p, guide: p.guided(guide, 30),
         lambda p, guide: p.auxiliary(60, power=0.5),
         lambda p, guide: p.resample_move(40, steps=1),
@@ -208,6 +214,16 @@ def test_switch_agrees_with_enumeration(kind):
         np.testing.assert_array_equal(p["absolute"], np.abs(p["x"]))
         shares.append(population.weights @ (p["regime"] == 0))
     assert abs(np.mean(shares) - calm) < 5 * np.std(shares, ddof=1) / np.sqrt(60) + 0.003
+
+
+def test_a_hidden_chain_as_a_program():
+    def chain(previous, y):
+        k = sample("k", Categorical(START if previous is None else MOVES[previous["k"]]))
+        observe("y", Categorical(EMIT[k]), y)
+
+    mean, standard, _ = mean_ratio(Program(chain).resample_move(1000), SYMBOLS, forward()[1], range(180))
+    assert abs(mean - 1) < 4 * standard
+    assert standard < 0.008
 
 
 @per_particle
