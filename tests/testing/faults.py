@@ -267,7 +267,7 @@ plant(
 # Independent draws hide a small bias best: the largest weight is 1 % too large, or 5 % if it is above 0.6.
 plant(
     of(WeightResampler, select=lambda f, rng, lw, n: (multinomial(rng, f(normalise(lw)), n), None)),
-    OnePercent=("largest_weight", "heaviest particle gets +", lambda W: np.where(W.max() == W, 1.01, 1.0) * W),
+    OnePercent=(_CARRIED, "heaviest particle gets +", lambda W: np.where(W.max() == W, 1.01, 1.0) * W),
     HeavyGains=(_CARRIED, "heaviest particle gets +", lambda W: np.where(W > 0.6, 1.05, 1.0) * W),
 )
 

@@ -19,8 +19,6 @@ from mstfilter.smc import (
     FearnheadClifford,
     Gaussian,
     Population,
-    Residual,
-    Shuffled,
     Sorted,
     Tempered,
     TransformResampler,
@@ -70,14 +68,10 @@ def test_the_global_generators_are_restored():
 OURS = {
     **{name: REGISTRY.build("resampler", name) for name in smc.__components__["resampler"]},
     "mean partition": Sorted(order="mean_partition"),
-    "residual, stratified": Residual("stratified"),
-    "residual, systematic": Residual("systematic"),
     "tempered optimal": Tempered(FearnheadClifford(), 0.0),
     "clusters, optimal inside": ClusterStratified(Gaussian(0.5), 0.3, FearnheadClifford()),
     "clusters, tempered inside": ClusterStratified(Gaussian(0.5), 0.3, Tempered()),
     "tempered, sorted": Tempered(Sorted(), 0.3),
-    "shuffled, sorted": Shuffled(Sorted()),
-    "coalesced residual": Coalesced(Residual()),
 }
 
 

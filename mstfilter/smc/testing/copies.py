@@ -69,11 +69,11 @@ CASES = (
     Case(tuple(np.linspace(1.0, 3.0, 100).tolist()), 2),
     Case((1.0,), 2, 10),
     Case(_mixed(300, 0.3), 300, 500),  # more particles than 8 bits count
+    # The fraction n W of the heaviest particle is not an integer. 1 % of its weight is nine standard errors of
+    # multinomial copies.
+    Case(_mixed(8, 0.4985), 2001, 1700),
+    Case(_mixed(2000, 0.49983), 2000, 500),
 )
-#: The fraction n W of the heaviest particle is not an integer. 1 % of its weight is nine standard errors of
-#: multinomial copies.
-HEAVY_CASES = (Case(_mixed(8, 0.4985), 2001, 1700),)
-HEAVY_CASES_OF_WEIGHTS = (*HEAVY_CASES, Case(_mixed(2000, 0.49983), 2000, 500))
 #: A case with a deviation of this many standard errors gets more calls, up to so many times as many as at first.
 _SUSPICIOUS = 4.0
 MOST_CALLS = 16

@@ -94,11 +94,11 @@ class TransitionContract(ScaleContract, ExactContract):
         self, before: Population, after: Population, other: Population, fresh: Population, likelihood: list[Any]
     ) -> None:
         """Compare moves and the change of their weights with exact ones; `likelihood` weights both."""
-        change, exact_lw = after.log_weights - before.log_weights, fresh.log_weights - other.log_weights
-        log_g = sum(log_likelihood(after.particles) for log_likelihood in likelihood)
-        exact_lw = exact_lw + sum(log_likelihood(fresh.particles) for log_likelihood in likelihood)
-        found, exact, lw = _columns(before, after), _columns(other, fresh), log_g + change
-        self.compare_weighted(found, lw, exact, exact_lw)
+        lw, exact_lw = (
+            new.log_weights - old.log_weights + sum(log_g(new.particles) for log_g in likelihood)
+            for old, new in ((before, after), (other, fresh))
+        )
+        self.compare_weighted(_columns(before, after), lw, _columns(other, fresh), exact_lw)
         check_mean_weight(np.exp(lw), np.exp(exact_lw))
 
     @statistical
