@@ -61,13 +61,12 @@ class ObservedVoxels:
 
     free: np.ndarray
     hit: np.ndarray
-    hidden: np.ndarray
     unsure: np.ndarray
 
 
 def observe(frame: Frame, grid: VoxelGrid, voxels: float, sigmas: float, table: float) -> ObservedVoxels:
     """Evaluates the definition with a pinhole camera, voxel by voxel."""
-    found = ObservedVoxels(*(np.zeros(grid.shape, bool) for _ in range(4)))
+    found = ObservedVoxels(*(np.zeros(grid.shape, bool) for _ in range(3)))
     for view in (frame, *frame.views):
         _mark_hits(view, grid, found)
     for index in np.ndindex(*grid.shape):
@@ -78,7 +77,6 @@ def observe(frame: Frame, grid: VoxelGrid, voxels: float, sigmas: float, table: 
         answers = [_one(view, centre, grid.voxel_size, voxels, sigmas) for view in (frame, *frame.views)]
         found.unsure[index] |= "unsure" in answers
         found.free[index] = "free" in answers and not found.hit[index]
-        found.hidden[index] = all(a in ("behind", "unknown") for a in answers) and not found.hit[index]
     return found
 
 
@@ -114,7 +112,7 @@ def _one(view: Frame, centre, size: float, voxels: float, sigmas: float) -> str:
     margin = voxels * size + sigmas * SIGMA * d * d
     if abs(abs(z - d) - margin) < 1e-5:
         return "unsure"
-    return "free" if z < d - margin else "behind" if z > d + margin else "surface"
+    return "free" if z < d - margin else "not free"
 
 
 def shelf(voxel: float):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mstfilter.scene import Clip, Frame, scene_cache
+from mstfilter.scene import Clip, Frame
 from mstfilter.tracking.flow import DenseFlow
 from tests.tracking.scenes import Box, Scene, at, iou, slide
 
@@ -96,13 +96,3 @@ def test_a_change_of_exposure_is_not_a_change_of_the_scene():
     tracks = DenseFlow().track(Clip((clip.before, after), clip.grid))
     both = clip.before.valid & after.valid
     assert tracks.unchanged[both].mean() > 0.98
-
-
-def test_the_result_is_equal_after_the_cache_is_cleared(textured):
-    _, clip = textured
-    first = DenseFlow().track(clip)
-    scene_cache.clear()
-    again = DenseFlow().track(clip)
-    assert first is not again
-    np.testing.assert_array_equal(first.source, again.source)
-    np.testing.assert_array_equal(first.end, again.end)

@@ -99,12 +99,6 @@ def test_without_video_no_object_moves(textured):
     assert IdentityTransition().predict(np.random.default_rng(0), population(h), clip).particles[0] is h
 
 
-def test_an_empty_hypothesis_stays_empty(textured):
-    scene, clip = textured
-    empty = Hypothesis.from_labels(np.zeros(scene.grid.shape, np.uint16), scene.grid)
-    assert predict(clip, empty).particles[0].n_objects == 0
-
-
 def test_an_occluded_object_does_not_move():
     """Box 2 is hidden behind box 1 all the time."""
     poses = [[at(0, -0.05, 0.09), at(0.0, 0.06, 0.02)]] * 2
