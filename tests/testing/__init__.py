@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mstfilter.smc.testing.contract import restore_global_state
 from mstfilter.testing import contract_of
 
 
@@ -14,11 +13,7 @@ def run_property(component, name, exact=None):
     if exact is not None:
         methods["exact"] = staticmethod(exact)
     contract = type("Contract", (contract_of(type(component)),), methods)()
-    contract.setup_method()
-    try:
-        getattr(contract, f"test_{name}")()
-    finally:
-        restore_global_state(contract._global_state)
+    getattr(contract, f"test_{name}")()
 
 
 class Faults(list):

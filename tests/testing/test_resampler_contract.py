@@ -59,12 +59,6 @@ def test_no_planted_fault_is_lost():
     assert len(FAULTS) == 50
 
 
-def test_the_global_generators_are_restored():
-    before = np.random.get_state()[1].copy()  # noqa: NPY002
-    run_contract(next(cls for cls, *_ in FAULTS if cls.__name__ == "GlobalIfMore")())
-    np.testing.assert_array_equal(before, np.random.get_state()[1])  # noqa: NPY002
-
-
 OURS = {
     **{name: REGISTRY.build("resampler", name) for name in smc.__components__["resampler"]},
     "mean partition": Sorted(order="mean_partition"),

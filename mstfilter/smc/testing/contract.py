@@ -105,23 +105,17 @@ class Contract:
         """A component that has not been used: a copy of what `make` returns, if it can be copied."""
         return copied(self.make())
 
-    def setup_method(self) -> None:
-        self._global_state = global_state()
-
-    def teardown_method(self) -> None:
-        """After every test, report and undo draws from global generators."""
-        before, after = self._global_state, global_state()
-        restore_global_state(before)
-        assert same(before[0], after[0]), "it draws from numpy's global generator (np.random.*): draw from `rng`"
-        assert before[1] == after[1], "it draws from Python's global generator (random.*): draw from `rng`"
-
     @prerequisite
     def test_does_not_use_global_generators(self) -> None:
         """It does not use the global generators of numpy and Python."""
         for inputs in self.variants():
+            of_numpy, of_python = np.random.get_state(), random.getstate()  # noqa: NPY002
             with skips_errors():
                 self.call(self.make(), seeded(7), inputs)
-        self.teardown_method()
+            unused = same(of_numpy, np.random.get_state())  # noqa: NPY002
+            assert unused, "it draws from numpy's global generator (np.random.*): draw from `rng`"
+            unused = of_python == random.getstate()
+            assert unused, "it draws from Python's global generator (random.*): draw from `rng`"
 
     @prerequisite
     def test_does_not_change_input(self) -> None:
@@ -250,7 +244,8 @@ def check_properties(
         if stopped:
             failure, skipped = None, "not tested: first fix what is broken above"
         else:
-            failure, skipped, stopped = _outcome(tests(), name)
+            failure, skipped = _outcome(getattr(tests(), name))
+            stopped = failure is not None and getattr(test, "prerequisite", False)
         if failure is not None and any(result.failure == failure for result in results):
             failure, skipped = None, "same failure as above"
         statement = (inspect.getdoc(test) or name).split("\n")[0]
@@ -270,24 +265,17 @@ def _test_names(tests: type) -> list[str]:
     return list(names)
 
 
-def _outcome(contract: Contract, name: str) -> tuple[str | None, str | None, bool]:
-    """Failure and reason of a skip of a test, and whether the tests after it rely on it."""
-    failure = skipped = None
-    test = getattr(contract, name)
-    contract.setup_method()
+def _outcome(test: Callable[[], None]) -> tuple[str | None, str | None]:
+    """Failure and reason of a skip of a test."""
     try:
         test()
     except SkipTest as reason:
-        skipped = str(reason)
+        return None, str(reason)
     except AssertionError as error:
-        failure = str(error)
+        return str(error), None
     except Exception as error:
-        failure = describe_error(error)
-    try:
-        contract.teardown_method()
-    except AssertionError as error:  # a fault that every test looks for replaces the outcome of the test
-        return str(error), None, True
-    return failure, skipped, failure is not None and getattr(test, "prerequisite", False)
+        return describe_error(error), None
+    return None, None
 
 
 @contextmanager
@@ -363,14 +351,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _plain(inner) for name, inner in value.items()}
     return value
-
-
-def global_state() -> tuple[Any, Any]:
-    """States of the global generators of numpy and Python."""
-    return np.random.get_state(), random.getstate()  # noqa: NPY002
-
-
-def restore_global_state(state: tuple[Any, Any]) -> None:
-    """Set the global generators to states that `global_state` returned."""
-    np.random.set_state(state[0])  # noqa: NPY002
-    random.setstate(state[1])
