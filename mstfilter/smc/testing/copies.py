@@ -1,8 +1,8 @@
-"""What particles carry after a resampling: test cases, their statistics, and likely faults.
+"""Weight of particles after a resampling: test cases, their statistics, and likely faults.
 
-A `Case` is a list of weights and a number of particles to select. A `Sample` collects over many calls what each
-particle and each group of particles carries, in units of the total weight. `fault_message` compares its mean with the
-weights and names the likely fault.
+A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many calls, the weight
+that each particle and each group of particles carries, in units of the total weight. `fault_message` compares the
+mean with the expected weights and names the likely fault.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mstfilter.smc.testing.contract import FALSE_ALARM
 
 @dataclass(frozen=True)
 class Case:
-    """Weights, number of particles to select, and number of calls at first."""
+    """Weights, number of particles to select, and first number of calls."""
 
     weights: tuple[float, ...]
     n: int
@@ -28,10 +28,10 @@ class Case:
 
 
 def _mixed(m: int, heavy: float) -> tuple[float, ...]:
-    """(m,) weights: a heavy one, zeros, ties and light ones, more mass in the second half.
+    """(m,) weights: one heavy weight, zeros, ties and light weights, with more mass in the second half.
 
-    The first of the second half has the fraction `heavy` of the weight. An eighth of the others is zero, and a
-    quarter has 5e-4 of the heaviest weight or less.
+    The first weight of the second half is the fraction `heavy` of the total. An eighth of the others is zero, and a
+    quarter is at most 5e-4 of the heaviest weight.
     """
     kind = np.arange(m) % 8
     weights = np.select(
@@ -82,13 +82,13 @@ _STAKES = 0.9 * 0.5 ** np.arange(10)
 
 
 class Sample:
-    """What particles and groups of particles of a case carry, over many calls.
+    """The weight that particles and groups of particles of a case carry, over many calls.
 
-    The mean of each is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
-    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to
-    1 / mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality its largest value
+    Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
+    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
+    mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, its largest value
     over any number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no
-    variance, so a scheme that gives very many copies in rare calls passes. Calls may be added where the result is not
+    variance. So a scheme that gives very many copies in rare calls passes. Calls may be added if the result is not
     clear.
     """
 
@@ -100,7 +100,7 @@ class Sample:
         self._rows: list[np.ndarray] = []
 
     def add(self, ancestors: np.ndarray, weights: np.ndarray) -> None:
-        """Add a call: its ancestors, and the output weights in units of the old mean."""
+        """Add a call with its ancestors and its output weights in units of the old mean."""
         n = len(weights)
         total = float(weights.sum()) / n
         self._rows.append(np.bincount(ancestors, weights, minlength=len(self.case.weights)) / n)
@@ -127,8 +127,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expectation of each particle and group.
 
-        It exceeds log(2 / p) with probability at most p. The result is 0 where the mean is less than four standard
-        errors away; 16 copies in all calls together allow for particles that are hardly ever selected.
+        It exceeds log(2 / p) with probability at most p. The result is 0 if the mean is less than four standard
+        errors away. 16 copies are added to all calls, for particles that are rarely selected.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
@@ -152,7 +152,7 @@ def quantile(n_tails: int) -> float:
 
 @lru_cache(maxsize=64)
 def groups_of(case: Case) -> np.ndarray:
-    """(k, m) masks as floats: all particles, the first half, the light ones, the particles of each common weight."""
+    """(k, m) masks as floats: all particles, the first half, the light ones, and those of each common weight."""
     w = np.asarray(case.weights)
     values, counts = np.unique(w, return_counts=True)
     masks = [np.ones(len(w), bool), np.arange(len(w)) < len(w) // 2, (w > 0) & (w < 1e-3 * w.max())]
@@ -160,7 +160,7 @@ def groups_of(case: Case) -> np.ndarray:
 
 
 def fault_message(sample: Sample, column: int) -> str:
-    """How the particle or group that deviates most violates its expectation."""
+    """How the particle or group with the largest deviation violates its expectation."""
     case, expected, mean = sample.case, sample.expected, sample.carried.mean(axis=0)
     m, n = len(case.weights), case.n
     got, want = n * mean, n * expected

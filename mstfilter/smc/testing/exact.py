@@ -16,7 +16,7 @@ from mstfilter.smc.testing.copies import quantile
 
 
 class PopulationContract(Contract):
-    """What contracts share of components that return a population."""
+    """Common parts of contracts of components that return a population."""
 
     returns = Population
 
@@ -36,20 +36,21 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 class ExactContract(PopulationContract):
     """Properties of components with exact draws to compare with.
 
-    Define a method ``exact(self, rng, n)`` (or a function ``exact(rng, n)`` beside the component). It returns a
-    population of `n` particles before the call, a population of exact draws, or with exact weights, after it, and the
-    observation. A fourth item ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides: it makes
-    the weights f / q of a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. It returns three
+    items. The first is a population of `n` particles before the call. The second is a population of exact draws, or
+    with exact weights, after the call. The third is the observation. An optional fourth item
+    ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides. It makes the weights f / q of a guided
+    move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
 
-    The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 of them the tests find a
-    standard deviation that is 3 % off, and a shift by 3 % of it. They also find a cut of the tails that holds 0.1 %
-    of the probability and a correlation of 0.02 between particles.
+    The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 rows, the tests detect a
+    standard deviation that is wrong by 3 %, and a shift by 3 % of it. They also detect missing tails with 0.1 % of
+    the probability, and a correlation of 0.02 between particles.
     """
 
     exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None
 
     def exact_case(self, seed: int, n: int) -> tuple[Any, ...]:
-        """Exact draws; skips the test if there are none."""
+        """Exact draws. Skips the test if there are none."""
         if self.exact is None:
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
         return self.exact(seeded(seed), n)
@@ -61,12 +62,13 @@ class ExactContract(PopulationContract):
         return _DRAWS[process_time() - start < _FAST]
 
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
-        """Compare the weighted distributions of rows: of each column, and of the sums of pairs of columns.
+        """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.
 
-        Probabilities of intervals are compared. The sums find columns that share a random number.
+        Probabilities of intervals are compared. The sums detect columns that share a random number.
 
-        The difference of two weighted means is normal up to errors that a twentieth of the level allows for. A tail
-        is compared if its probability is that of 50 of the largest weights, so that no rare weight is decisive.
+        The difference of two weighted means is normal, up to errors that a twentieth of the level allows for. A tail
+        is compared if its probability is at least that of 50 of the largest weights, so that no rare weight is
+        decisive.
         """
         samples = []
         for log_weights in (lw, exact_lw):
@@ -118,7 +120,7 @@ class ExactContract(PopulationContract):
     moves = False
 
     def columns(self, j: int, n_columns: int) -> str:
-        """What column `j` is."""
+        """Description of column `j`."""
         if not self.moves:
             return f"coordinate {j} of x"
         half = n_columns // 2
@@ -126,14 +128,14 @@ class ExactContract(PopulationContract):
 
 
 def _pairs(d: int) -> list[tuple[int, int]]:
-    """At most 20 pairs of d columns, neighbours first."""
+    """At most 20 pairs of d columns, with neighbours first."""
     return sorted(combinations(range(min(d, 40)), 2), key=lambda pair: pair[1] - pair[0])[:20]
 
 
 def _with_sums(
     found: np.ndarray, exact: np.ndarray, w: np.ndarray, pairs: list[tuple[int, int]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two samples with the sums of pairs of columns as further columns, each over its spread in the exact one."""
+    """Two samples with sums of pairs of columns as additional columns, each divided by its exact spread."""
     scale = [_sd(column, w) or 1.0 for column in exact.T]
     first, second = (
         np.column_stack([x, *(x[:, j] / scale[j] + x[:, k] / scale[k] for j, k in pairs)]) for x in (found, exact)

@@ -35,7 +35,7 @@ class TransitionContract(ScaleContract, ExactContract):
     """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
 
     One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
-    them, and the observation. For a guided move it also returns log p(y_t | x_t), a function of x_t. If the
+    these rows, and the observation. For a guided move it also returns log p(y_t | x_t), as a function of x_t. If the
     transition weights by the observation, the population of x_t has these weights.
     """
 
@@ -165,9 +165,9 @@ class DensityTransitionContract(TransitionContract):
     def test_log_prob_is_the_density_of_its_moves(self) -> None:
         """Moves have the distribution of `log_prob`, up to a constant factor of the density.
 
-        Of a move from a or b, each as likely, p = f(x' | a) / (f(x' | a) + f(x' | b)) is the probability that it is
-        from a. With p of the particle that the move is from, (1 - p) log(p / (1 - p)) has mean 0.
-        Pairs are particles that are some positions apart in the order of their first coordinate.
+        Suppose that a move from a and a move from b are equally likely. Then p = f(x' | a) / (f(x' | a) + f(x' | b))
+        is the probability that the move is from a. For p of the true origin, (1 - p) log(p / (1 - p)) has mean 0.
+        Pairs are particles some positions apart in the order of their first coordinate.
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
@@ -200,7 +200,7 @@ class ProposalContract(ExactContract):
     """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
-    particles, and the observation. For the initial proposal these are draws of p(x_0). A third item
+    particles, and the observation. For the initial proposal these are draws of p(x_0). An optional third item
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
     """
 
@@ -246,10 +246,10 @@ class ProposalContract(ExactContract):
 class UpdateContract(ScaleContract, ExactContract):
     """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of
-    p(x | y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one,
-    with their constant factor, which is part of the evidence. With exact draws the factor is free, unless a fourth
-    item of `exact` is log p(y), a number.
+    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of p(x |
+    y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one, with
+    their constant factor, which is part of the evidence. For exact draws the factor is arbitrary, unless a fourth
+    item of `exact` is the number log p(y).
     """
 
     weighted = "predicted"
@@ -341,7 +341,8 @@ class RejuvenationContract(ExactContract):
     """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
-    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given them and y_t, and y_t.
+    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and y_t, and
+    y_t.
     """
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
