@@ -162,7 +162,6 @@ def install_hint(library: str) -> str:
 _PACKAGES = {
     "cv2": "opencv-python-headless",
     "pytest": "'mstfilter[check]'",
-    "h5py": "'mstfilter[h5py]'",
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "dask.distributed": "'mstfilter[dask]'",

@@ -247,7 +247,6 @@ KINDS = {
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
     "bop": Kind(_layout("bop"), _reader("bop")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),
-    "dsr": Kind(_layout("dsr"), _reader("dsr")),
     "bag": Kind(_bag("bag"), _read_bag),
     "db3": Kind(_bag("db3"), _read_bag),
     "mcap": Kind(_bag("mcap"), _read_bag),

@@ -42,11 +42,10 @@ def pairs(path):
 
 
 CASES = {
-    "pairs": (pairs, ["--frames", "v4,v0"], (0, 1)),
+    "pairs": (pairs, ["-o", "frames=v4,v0"], (0, 1)),
     "tum": (lambda p: layouts.write_tum(p), ["-o", K], layouts.PAUSES),
     "redwood": (lambda p: layouts.write_redwood(p), ["-o", "fps=10"], layouts.PAUSES),
     "bop": (lambda p: layouts.write_bop(p), [], (0, 1, 2)),
-    "dsr": (lambda p: layouts.write_dsr(p), [], (0, 1, 2)),
     "bag": (lambda p: write_bag(p, "bag", scene_messages(True)), ["--pauses", "0,9"], (0, 9)),
     "mcap": (lambda p: write_bag(p, "mcap", scene_messages(False)), ["--pauses", "0s,1.6s"], (0, 16)),
 }

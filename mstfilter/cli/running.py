@@ -42,7 +42,6 @@ def run(
     format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
-    frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
     compare: Annotated[
         bool, typer.Option("--compare", help="Also run the filter without past and on single frames, for the report.")
@@ -67,7 +66,7 @@ def run(
         check_run_folder(out, replace)
     else:
         check_output(Path("runs"), folder=True, empty=False)
-    source = read_source(recording, format, option, pauses, frames)
+    source = read_source(recording, format, option, pauses)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
     _execute_all(source, configs, folder, seed, replace)
@@ -207,13 +206,12 @@ def convert(
     format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
-    frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
 ) -> None:
     """Convert data of another format to a recording folder; a stopped or failed conversion leaves no folder."""
     from mstfilter.formats import save_recording
 
     check_output(out, folder=True)
-    recording = read_source(source, format, option, pauses, frames)
+    recording = read_source(source, format, option, pauses)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
     try:
         with progress_bar("convert") as advance:

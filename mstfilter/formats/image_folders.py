@@ -97,6 +97,7 @@ class PairedImages(RecordingFormat):
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_STILL = "remove the file if the camera stands still"
 _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json", "camera_info.yaml")
 
 
@@ -117,21 +118,12 @@ class Redwood(VideoFormat):
     ----------
     depth_scale : float
         Metres per unit of integer depth. Default: from the file of intrinsics, else 0.001.
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3. Default: from the file of intrinsics, else none.
     fps : float
         Frames per second, if names are no time stamps. Default: from the file of intrinsics, else 30.
-    tolerance_s : float
-        Largest difference of the time stamps of a colour and a depth image of one frame.
-    moving : bool
-        Use the trajectory, if there is one.
     """
 
     depth_scale: float = 0.0
-    distortion: tuple[float, ...] = ()
     fps: float = 0.0
-    tolerance_s: float = 0.02
-    moving: bool = True
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -144,7 +136,7 @@ class Redwood(VideoFormat):
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         colour, depth = _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
-        logs = sorted(path.glob("*.log")) if self.moving else []
+        logs = sorted(path.glob("*.log"))
         if len(logs) > 1:
             raise InputError(
                 f"{path} has {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "remove all but one"
@@ -304,13 +296,13 @@ def _four(K: Any) -> tuple[float, ...]:
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:
     """Camera-to-world poses of a .log file, one per frame."""
-    with reading(path, "a trajectory", "or ignore it: moving=false"):
+    with reading(path, "a trajectory", _STILL):
         lines = read_text(path, "a trajectory").splitlines()
         rows = [[float(v) for v in line.split()] for line in lines if line.strip()]
     if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
         raise InputError(
             f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
-            "or ignore it: moving=false",
+            _STILL,
         )
     return [rigid_from_matrix(np.array(rows[5 * k + 1 : 5 * k + 5]), f"{path}: pose of frame {k}") for k in range(n)]
 
@@ -322,22 +314,10 @@ class Tum(VideoFormat):
     Lines of rgb.txt and depth.txt are ``timestamp filename``, those of groundtruth.txt
     ``timestamp tx ty tz qx qy qz qw``. Depth is in units of 1/5000 m. Format: Sturm et al. 2012.
 
-    Further parameters: `VideoFormat`.
-
-    Parameters
-    ----------
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3.
-    tolerance_s : float
-        Largest difference of the time stamps of a colour and a depth image of one frame.
-    moving : bool
-        Use groundtruth.txt, if it exists.
+    Parameters: `VideoFormat`.
     """
 
     depth_scale: float = 0.0002
-    distortion: tuple[float, ...] = ()
-    tolerance_s: float = 0.02
-    moving: bool = True
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -366,7 +346,7 @@ class Tum(VideoFormat):
             self.K,
             path,
             self.depth_scale,
-            motion=_motion(truth, times) if self.moving and truth.is_file() else None,
+            motion=_motion(truth, times) if truth.is_file() else None,
             distortion=self.distortion,
         )
         return self.recording_of(video)
@@ -401,12 +381,13 @@ def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
         stamps = rows[:, 0]
         poses = RigidTransform.from_components(rows[:, 1:4], Rotation.from_quat(rows[:, 4:8]))
     except (ValueError, IndexError) as error:
-        raise InputError(f"{path} does not hold poses: {error}", "or ignore it: moving=false") from error
+        raise InputError(f"{path} does not hold poses: {error}", _STILL) from error
     nearest = [int(np.abs(stamps - t).argmin()) for t in times]
     difference = max(abs(stamps[k] - t) for k, t in zip(nearest, times, strict=True))
     if difference > 0.1:
         raise InputError(
             f"{path}: the nearest pose is {difference:.2f} s from an image, expected at most 0.1 s",
-            "check that it belongs to this recording, or ignore it: moving=false",
+            "check that it belongs to this recording",
+            _STILL,
         )
     return [poses[k] for k in nearest]

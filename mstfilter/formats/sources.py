@@ -58,7 +58,7 @@ def open_recording(
 
 
 def pause_rule(text: str) -> PauseRule:
-    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
+    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s"."""
     rule: PauseRule = _REGISTRY.build("pauses", pauses_from_text(text))
     return rule
 

@@ -236,6 +236,10 @@ class VideoFormat(RecordingFormat):
         fx, fy, cx, cy in pixels. Default: from the files.
     depth_scale : float
         Metres per unit of 16-bit depth.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2, k3 of both images. Default: from the files, else none.
+    tolerance_s : float
+        Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float
         Part of the video that is used, in seconds after its first frame.
     pauses : PauseRule
@@ -246,6 +250,8 @@ class VideoFormat(RecordingFormat):
 
     K: tuple[float, ...] = ()
     depth_scale: float = 0.001
+    distortion: tuple[float, ...] = ()
+    tolerance_s: float = 0.02
     start_s: float = 0.0
     stop_s: float = math.inf
     pauses: PauseRule = field(default_factory=Still)

@@ -20,7 +20,6 @@ WRITERS = {
     "tum": layouts.write_tum,
     "bop": layouts.write_bop,
     "redwood": layouts.write_redwood,
-    "dsr": layouts.write_dsr,
     "recording": write,
 }
 
@@ -40,7 +39,7 @@ def test_unknown_and_ambiguous(tmp_path):
     for name in ("notes", "data.bin"):
         with pytest.raises(InputError, match="has no known format") as caught:
             open_recording(tmp_path / name)
-        assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
+        assert "tum, bop, redwood, bag" in caught.value.hints[0]
     path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")
     for part in ("rgb.txt", "depth.txt"):
         (path / part).write_text("0 a.png\n")
@@ -55,12 +54,12 @@ def test_unknown_and_ambiguous(tmp_path):
 
 def test_options_as_text():
     assert format_settings(
-        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,007,8", "moving=false"]
+        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,007,8", "objects=false"]
     ) == {
         "K": [525, 525, 319.5, 239.5],
         "world": {"workspace": [-1, -1, 0, 1, 1, 0.5]},
         "frames": ["a", "007", 8],
-        "moving": False,
+        "objects": False,
     }
 
 
