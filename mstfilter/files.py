@@ -377,21 +377,18 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def weights_file(given: str, name: str, where: str, sha256: str = "") -> tuple[str, str]:
+def weights_file(given: str, name: str, where: str) -> tuple[str, str]:
     """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
 
-    Raises InputError if it is not given, does not exist, or has another hash than `sha256`; `where` is an address for
-    the hint. The hash of an unchanged file is computed once.
+    Raises InputError if it is not given or does not exist; `where` is an address for the hint. The hash of an
+    unchanged file is computed once.
     """
     path = Path(given)
     if not given or not path.is_file():
         problem = f"do not exist: {path}" if given else "are not given"
         raise InputError(f"the weights of {name} {problem}", f"set the field to the path of a file, see {where}")
     status = path.stat()
-    digest = _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
-    if sha256 and digest != sha256.lower():
-        raise InputError(f"weights {path} have the hash {digest}, expected {sha256}", "download the file again")
-    return str(path.resolve()), digest
+    return str(path.resolve()), _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
 
 
 @functools.lru_cache(maxsize=8)

@@ -65,9 +65,9 @@ def safe_name(name: str) -> str:
 
 def read_source(path: Path, format: str, options: list[str] | None, pauses: str) -> Any:
     """Open a recording of any format."""
-    from mstfilter.formats import open_recording
-
     from rich.console import Console
+
+    from mstfilter.formats import open_recording
 
     with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
         return open_recording(path, format, options or (), pauses)

@@ -15,7 +15,6 @@ The same masks can be boundaries of a segmentation tree:
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,12 +24,11 @@ import numpy as np
 
 from mstfilter.completion import Completer, Extrude
 from mstfilter.errors import InputError
-from mstfilter.fields import Share
+from mstfilter.fields import bound_to
 from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.segmentation import (
-    BoundaryModel,
     ClipBoundary,
     CutSampler,
     ExactCuts,
@@ -70,12 +68,12 @@ class MaskProposal(Proposal, UsesFiles):
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses."""
         for clip in recording.clips():
-            read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
+            read_masks(self.folder, clip.index, clip.after.depth.shape)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """`n` hypotheses about the scene at the end of the clip, with equal weights."""
         frame, grid = observation.after, observation.grid
-        masks = read_masks(self.folder, observation.index, frame.depth.shape, frame.rgb)
+        masks = read_masks(self.folder, observation.index, frame.depth.shape)
         chosen: list[list[int]] = [[] for _ in range(n)]
         pixels: dict[int, np.ndarray] = {}
         alternatives = {}
@@ -135,18 +133,12 @@ class MaskBoundary(ClipBoundary, UsesFiles):
     ----------
     folder : str
         The folder of masks.
-    weight : float
-        Factor of the probability, 0 to 1.
     objects : ObjectRule
         Decides which masks are objects, as in `MaskProposal`.
-    other : BoundaryModel, optional
-        A second model; the result is the maximum of both.
     """
 
     folder: str = ""
-    weight: Share = 1.0
     objects: ObjectRule = field(default_factory=ObjectRule)
-    other: BoundaryModel | None = None
 
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses."""
@@ -154,12 +146,7 @@ class MaskBoundary(ClipBoundary, UsesFiles):
 
     def at(self, clip: Clip) -> MaskBoundary:
         """The model with the masks of the pause that the clip ends at."""
-        bound = copy.copy(self)
-        masks = read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
-        other = self.other.at(clip) if isinstance(self.other, ClipBoundary) else self.other
-        for name, value in (("_masks", masks), ("other", other)):
-            object.__setattr__(bound, name, value)  # components are frozen
-        return bound
+        return bound_to(self, _masks=read_masks(self.folder, clip.index, clip.after.depth.shape))
 
     @property
     def bound_key(self) -> bytes:
@@ -172,10 +159,7 @@ class MaskBoundary(ClipBoundary, UsesFiles):
         masks: PauseMasks | None = self.__dict__.get("_masks")
         if masks is None:
             raise InputError("MaskBoundary does not know the pause of a frame", "call MaskBoundary.at(clip) first")
-        edge = self.weight * border_probability(masks.regions, frame, self.objects)
-        if self.other is not None:
-            edge = np.maximum(edge, self.other.boundary(frame))
-        return edge.astype(np.float32)
+        return border_probability(masks.regions, frame, self.objects).astype(np.float32)
 
 
 def border_probability(regions: Iterable[MaskRegion], frame: Frame, objects: ObjectRule) -> np.ndarray:
@@ -225,4 +209,4 @@ def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGen
         found = generator.generate(clip.after.rgb.copy())
         masks = np.array([one["segmentation"] for one in found], dtype=bool).reshape(-1, *clip.after.depth.shape)
         scores = np.clip([one.get("predicted_iou", 1.0) for one in found], 0, None)
-        write_masks(folder, clip.index, [nested_masks(masks, scores, share)], rgb=clip.after.rgb)
+        write_masks(folder, clip.index, [nested_masks(masks, scores, share)])

@@ -51,14 +51,11 @@ class PackageTracker(MaskTracker, UsesFiles):
         Device of torch.
     step : int
         Every `step`-th frame is used, and the last one.
-    sha256 : str
-        Expected hash of the file; empty: not compared.
     """
 
     checkpoint: str = ""
     device: str = "cpu"
     step: PositiveInt = 1
-    sha256: str = ""
 
     def check_files(self, recording: Recording) -> None:
         """Load the checkpoint."""
@@ -80,7 +77,7 @@ class Sam2Tracker(PackageTracker):
     config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
 
     def loaded(self) -> Any:
-        file = weights_file(self.checkpoint, "SAM 2", _SAM2, self.sha256)
+        file = weights_file(self.checkpoint, "SAM 2", _SAM2)
         with loading("sam2", file[0]):
             return _load_sam2(self.config, *file, self.device)
 
@@ -126,7 +123,7 @@ class CutieTracker(PackageTracker):
     """
 
     def loaded(self) -> tuple[Any, Any]:
-        file = weights_file(self.checkpoint, "Cutie", _CUTIE, self.sha256)
+        file = weights_file(self.checkpoint, "Cutie", _CUTIE)
         with loading("cutie", file[0]):
             return _load_cutie(*file, self.device)
 

@@ -262,9 +262,6 @@ def test_the_recipe_writes_the_masks_of_a_generator(tmp_path):
     write_automatic_masks(str(tmp_path), [CLIP], Generator())
     population = MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), CLIP, 50)
     assert {h.n_objects for h in population.particles} >= {2, 3}
-    other = clip_of(np.roll(SCENE, 3, axis=0), width=160)
-    with pytest.raises(InputError, match="made from another image"):
-        MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), other, 1)
 
 
 def encode_rle(mask: np.ndarray) -> tuple[list[int], str]:
@@ -424,7 +421,7 @@ def test_the_memory_of_a_file_is_bounded(tmp_path, monkeypatch):
         for path in tmp_path.iterdir():
             path.unlink()
         write(tmp_path)
-        with pytest.raises(InputError, match="has 11 masks, at most 10 of this size|at most 192000 are read"):
+        with pytest.raises(InputError, match="list of at most 10 masks|at most 192000 are read"):
             read_masks(tmp_path, 0, SHAPE)
 
 
