@@ -125,7 +125,9 @@ def test_wrong_arguments(tmp_path, monkeypatch, capsys, arguments, message):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", [("run", "none", "--out"), ("simulate", "demo"), ("convert", "none")])
+@pytest.mark.parametrize(
+    "command", [("run", "none", "--out"), ("simulate", "demo"), ("demo", "--out"), ("convert", "none")]
+)
 def test_a_folder_with_files_is_left_alone(tmp_path, capsys, command):
     (tmp_path / "thesis.tex").write_text("x")
     code, _, err = call(*command, tmp_path, capsys=capsys)

@@ -196,29 +196,10 @@ def test_the_cache_is_swept(tmp_path):
 # What is removed on request
 
 
-def test_a_demo_replaces_demos_only(recording, tmp_path, capsys):
-    """Entries with the names of a demo are not enough: each of them must be what a demo writes."""
-    out = tmp_path / "out"
-    shutil.copytree(recording.path, out / "recording")
-    before = content(tmp_path)
-    assert "not of a demo: recording" in call("demo", "--out", out, capsys=capsys)[2]
-    run(recording, out / "run")
-    with_run = content(tmp_path)
-    code, _, err = call("demo", "--out", out, capsys=capsys)
-    assert code == 2 and "not of a demo: recording" in err
-    (out / "run" / "notes.txt").write_text("x")
-    assert "not of a demo: run/notes.txt" in call("demo", "--out", out, capsys=capsys)[2]
-    assert before.items() <= content(tmp_path).items() and with_run.items() <= content(tmp_path).items()
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "report.html").write_text("my thesis")
-    assert call("demo", "--out", tmp_path / "mine", capsys=capsys)[0] == 2
-    assert (tmp_path / "mine" / "report.html").read_text() == "my thesis"
-
-
 def test_a_run_is_replaced_after_the_first_step_only(recording, tmp_path):
     kept = content(run(recording, tmp_path / "run").path)
 
-    def interrupt(progress):
+    def interrupt(done, total):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

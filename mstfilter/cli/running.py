@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -23,11 +22,10 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, check_output, locked, other_files, write_csv
+from mstfilter.files import atomic_folder, check_output, locked, write_csv
 from mstfilter.report.progress import progress_bar
 
 _DEMO = "occlusion"  # the family of the demo
-_SIMULATOR = "mstfilter.simulation"  # the generator in the manifest of a simulated recording
 
 
 @app.command()
@@ -83,9 +81,7 @@ def run(
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path, typer.Option(help="Folder for recording, run and report; an earlier demo there is replaced.")
-    ] = Path("demo"),
+    out: Annotated[Path, typer.Option(help="New folder for recording, run and report.")] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
     """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
@@ -94,9 +90,8 @@ def demo(
     from mstfilter.report import read_numbers, write_report
     from mstfilter.runs import RunFolder, compared_configs
 
-    check_output(out, folder=True, empty=False)
-    with locked(out), atomic_folder(out, "replace") as work:
-        _check_earlier_demo(out)
+    check_output(out, folder=True)
+    with locked(out), atomic_folder(out) as work:
         _simulate(_DEMO, work / "recording", seed)
         recording, config = open_recording(work / "recording"), load_config("mst")
         _execute_all(recording, {"": config} | compared_configs(config), work / "run", 0)
@@ -106,23 +101,6 @@ def demo(
     for name, file in (("recording", "recording"), ("run", "run"), ("report", "report.html")):
         print(f"{name:<12}{out / file}")
     print_summary(numbers)
-
-
-def _check_earlier_demo(out: Path) -> None:
-    """Raise InputError unless a folder is missing, empty, or of a demo and contains nothing else."""
-    from mstfilter.formats import RECORDING_FILES, open_recording
-    from mstfilter.runs import RUN_FILES
-
-    own = re.compile(rf"recording/({RECORDING_FILES.pattern})|run/({RUN_FILES.pattern})|report\.html")
-    others = other_files(out, own)
-    if not others and out.exists() and any(out.iterdir()):
-        source = open_recording(out / "recording", "recording").manifest
-        if source.get("generator") != _SIMULATOR or dict(source.get("family", {})).get("name") != _DEMO:
-            others.append("recording")
-    if others:
-        raise InputError(
-            f"{out} holds something that is not of a demo: {others[0]}", "choose another folder with --out"
-        )
 
 
 @app.command("simulate")
@@ -294,7 +272,7 @@ def _execute_all(
                 seed,
                 replace=replace and not name,
                 allow_files=True,
-                progress=lambda p, advance=advance: advance(p.done, p.total),  # type: ignore[misc]
+                progress=advance,
             )
 
 

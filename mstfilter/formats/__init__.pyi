@@ -1,7 +1,6 @@
 from mstfilter.formats.bag import Bag as Bag
 from mstfilter.formats.bop import Bop as Bop
 from mstfilter.formats.folder import (
-    RECORDING_FILES as RECORDING_FILES,
     RecordingFolder as RecordingFolder,
     RecordingWriter as RecordingWriter,
     save_recording as save_recording,

@@ -25,7 +25,6 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mstfilter.errors import InputError, naming
-from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
+from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat, check_images
 from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
@@ -60,9 +59,6 @@ from mstfilter.scene import (
 )
 
 VERSION = 1  #: Version of the layout
-RECORDING_FILES = re.compile(  #: paths in a recording folder
-    rf"(manifest|camera|poses)\.json|voxels\.npz|{SUMS}|(rgb|depth|instance|robot)/\d{{6}}\.png"
-)
 _Model = TypeVar("_Model", bound=BaseModel)
 
 

@@ -105,8 +105,8 @@ def test_a_run_with_oracles_resumes(recording, tmp_path):
     config = load_config("mst", ALL)
     filter_recording(recording, config, tmp_path / "a", seed=1)
 
-    def stop(progress):
-        if progress.done == 2:
+    def stop(done, total):
+        if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
