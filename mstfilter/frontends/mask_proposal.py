@@ -1,4 +1,4 @@
-"""Hypotheses and boundary maps from instance masks that another program made.
+"""Hypotheses from instance masks that another program made.
 
 >>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
@@ -6,11 +6,6 @@
 `mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region,
 drawn by its weight and independently of the other regions, and a cut of the tree of its masks. Combinations are not
 enumerated: the work is that of the alternatives that are drawn, and each distinct mask is completed once.
-
-The same masks can be boundaries of a segmentation tree:
-
->>> overrides = "proposal.boundary=mask_folder", "proposal.boundary.folder=masks", "proposal.tree=ucm"
->>> filter = mstfilter.preset("mst", *overrides)
 """
 
 from __future__ import annotations
@@ -23,13 +18,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.errors import InputError
-from mstfilter.fields import bound_to
-from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
+from mstfilter.frontends.mask_files import read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
-from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
+from mstfilter.scene import Clip, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.segmentation import (
-    ClipBoundary,
     CutSampler,
     ExactCuts,
     ObjectRule,
@@ -119,78 +111,6 @@ def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np
 def _number(content: bytes) -> int:
     """A number of 62 bits that names a content in random streams."""
     return int.from_bytes(content_key(content)[:8], "big") >> 2
-
-
-@dataclass(frozen=True)
-class MaskBoundary(ClipBoundary, UsesFiles):
-    """The probability that a segmentation drawn from a folder of masks has a border at a pixel.
-
-    The law is that of `MaskProposal` with `ExactCuts` at temperature 1. Borders are borders of masks, so they do not
-    have the statistics of image gradients. Combine the model with the tree ``ucm``, not with ``learned``, whose
-    weights were fitted to `ColourDepthBoundary`.
-
-    Parameters
-    ----------
-    folder : str
-        The folder of masks.
-    objects : ObjectRule
-        Decides which masks are objects, as in `MaskProposal`.
-    """
-
-    folder: str = ""
-    objects: ObjectRule = field(default_factory=ObjectRule)
-
-    def check_files(self, recording: Recording) -> None:
-        """Read the masks of all pauses."""
-        MaskProposal(self.folder).check_files(recording)
-
-    def at(self, clip: Clip) -> MaskBoundary:
-        """The model with the masks of the pause that the clip ends at."""
-        return bound_to(self, _masks=read_masks(self.folder, clip.index, clip.after.depth.shape))
-
-    @property
-    def bound_key(self) -> bytes:
-        """Key of the masks; empty before `at`."""
-        masks = self.__dict__.get("_masks")
-        return b"" if masks is None else masks.key
-
-    def boundary(self, frame: Frame) -> np.ndarray:
-        """(H, W) float32; raises InputError before `at`."""
-        masks: PauseMasks | None = self.__dict__.get("_masks")
-        if masks is None:
-            raise InputError("MaskBoundary does not know the pause of a frame", "call MaskBoundary.at(clip) first")
-        return border_probability(masks.regions, frame, self.objects).astype(np.float32)
-
-
-def border_probability(regions: Iterable[MaskRegion], frame: Frame, objects: ObjectRule) -> np.ndarray:
-    """(H, W) probability of a border between a pixel and one of its four neighbours, the largest of the four."""
-    shape = frame.depth.shape
-    joined = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
-    for region in regions:
-        apart = np.zeros_like(joined[0]), np.zeros_like(joined[1])
-        for weight, tree, stop in zip(region.weights, region.trees, region.stops, strict=True):
-            stop = _stops_at_objects(tree, stop, objects.segments(tree, frame).is_object)
-            below, position = _split_probability(tree, stop), tree.leaf_position[tree.leaves]
-            for p, a, b in ((apart[0], position[:, :-1], position[:, 1:]), (apart[1], position[:-1], position[1:])):
-                pairs = a != b
-                low, high = np.minimum(a[pairs], b[pairs]), np.maximum(a[pairs], b[pairs])
-                p[pairs] += weight * below[tree.lowest_common(low, high)]
-        for total, p in zip(joined, apart, strict=True):
-            total *= 1 - p
-    out = np.zeros(shape)
-    across, down = 1 - joined[0], 1 - joined[1]
-    for part, p in ((out[:, 1:], across), (out[:, :-1], across), (out[1:], down), (out[:-1], down)):
-        np.maximum(part, p, out=part)
-    return out
-
-
-def _split_probability(tree: Tree, stop: np.ndarray) -> np.ndarray:
-    """(N,) probability that a walk goes below the node, if it stops with probabilities `stop` (N,)."""
-    below = np.ones(tree.n_nodes)
-    for node in range(tree.n_nodes - 1, -1, -1):
-        above = 1.0 if node == tree.root else below[tree.parent[node]]
-        below[node] = above * (1 - stop[node])
-    return below
 
 
 class MaskGenerator(Protocol):

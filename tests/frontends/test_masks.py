@@ -1,4 +1,4 @@
-"""Folders of instance masks: the law of the samples, the work, the boundary map, and files that cannot be used."""
+"""Folders of instance masks: the law of the samples, the work, and files that cannot be used."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ from scipy.stats import chisquare
 from mstfilter.completion import Extrude
 from mstfilter.errors import InputError
 from mstfilter.frontends import (
-    MaskBoundary,
     MaskProposal,
-    border_probability,
     mask_tree,
     nested_masks,
     node_values,
@@ -31,7 +29,7 @@ from mstfilter.frontends import (
 from mstfilter.frontends.mask_files import decode_rle
 from mstfilter.presets import preset
 from mstfilter.scene import render, scene_cache, write_image
-from mstfilter.segmentation import ExactCuts, ObjectRule, OptimalCut, TreeCutProposal, UcmTree
+from mstfilter.segmentation import ExactCuts, ObjectRule
 from mstfilter.smc.testing import ProposalContract
 from mstfilter.testing import scene_example
 from mstfilter.testing.scenes import _labels
@@ -102,40 +100,6 @@ def test_regions_alternatives_and_levels_are_sampled_with_their_law(tmp_path):
     assert chisquare(counts, 4000 * np.array(list(expected.values()))).pvalue > 1e-6
 
 
-def test_the_boundary_is_the_probability_of_a_border(tmp_path):
-    """At the cuts through the three boxes, the probabilities of a split; 1 around the boxes."""
-    law(tmp_path)
-    masks = read_masks(tmp_path / "masks", 0, SHAPE)
-    p = border_probability(masks.regions, CLIP.after, ObjectRule())
-    for box, axis, split in ((BOX[0], 1, 0.25), (BOX[1], 0, 0.4), (BOX[2], 1, 0.8 / 1.3)):
-        one, other = halves(box, axis)
-        shift = np.roll(other, -1, axis)
-        border = one & shift
-        away = np.zeros(SHAPE, bool)  # pixels whose four neighbours are in the box
-        away[1:-1, 1:-1] = box[:-2, 1:-1] & box[2:, 1:-1] & box[1:-1, :-2] & box[1:-1, 2:]
-        assert (border & away).sum() > 5
-        np.testing.assert_allclose(p[border & away], split, atol=1e-6)
-        assert (p[box & ~away] == 1).all()
-        inside = away & ~border & ~np.roll(border, 1, axis)
-        assert (p[inside] == 0).all()
-    model = MaskBoundary(str(tmp_path / "masks")).at(CLIP)
-    np.testing.assert_allclose(model.boundary(CLIP.after), p, atol=1e-6)
-    with pytest.raises(InputError, match="does not know the pause"):
-        MaskBoundary(str(tmp_path / "masks")).boundary(CLIP.after)
-
-
-def test_boundaries_of_masks_give_a_tree_with_the_masks_as_cut(tmp_path):
-    write_masks(tmp_path, 0, [SHOWN])
-    proposal = TreeCutProposal(boundary=MaskBoundary(str(tmp_path)), tree=UcmTree(), sampler=OptimalCut())
-    (hypothesis,) = proposal.sample(np.random.default_rng(0), CLIP, 1).particles
-    assert hypothesis.n_objects == 3
-    other = tmp_path / "other"
-    write_masks(other, 0, [BOX[0].astype(int)])
-    changed = TreeCutProposal(boundary=MaskBoundary(str(other)), tree=UcmTree(), sampler=OptimalCut())
-    keys = {p.of_clip(CLIP).tree_of(CLIP.after)[0].key for p in (proposal, changed)}
-    assert len(keys) == 2  # the cache tells the folders apart by their content
-
-
 @dataclass(frozen=True)
 class Counting(Extrude):
     """Counts the masks that are completed."""
@@ -196,17 +160,12 @@ def test_a_mask_of_the_table_hides_no_objects(tmp_path):
     write_masks(tmp_path, 0, [(stack(whole, BOX[0], BOX[1], left, right), [1.0, 0.5, 0.5, 0.5, 0.5])])
     population = MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), CLIP, 60)
     assert {h.n_objects for h in population.particles} == {2, 3}
-    p = border_probability(read_masks(tmp_path, 0, SHAPE).regions, CLIP.after, ObjectRule())
-    rim = BOX[1] & ~np.roll(BOX[1], 1, axis=1)
-    np.testing.assert_allclose(p[rim], 1, atol=1e-6)
 
 
 def test_no_masks_give_no_objects(tmp_path):
     write_masks(tmp_path, 0, [np.zeros(SHAPE, int), np.zeros((0, *SHAPE), bool)])
     (hypothesis,) = MaskProposal(str(tmp_path)).sample(np.random.default_rng(0), CLIP, 1).particles
     assert hypothesis.n_objects == 0
-    regions = read_masks(tmp_path, 0, SHAPE).regions
-    assert (border_probability(regions, CLIP.after, ObjectRule()) == 0).all()
 
 
 def test_three_levels_of_nested_masks():
