@@ -31,7 +31,7 @@ from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
-from mstfilter.scene import Recording, decode_image
+from mstfilter.scene import decode_image
 
 MAX_CHUNK = 2**28  #: Largest chunk of a bag when it is unpacked, in bytes
 
@@ -308,7 +308,7 @@ class Bag(VideoFormat):
             return path.suffix in (".bag", ".mcap", ".db3")
         return (path / "metadata.yaml").is_file()
 
-    def open(self, path: Path) -> Recording:
+    def video(self, path: Path) -> Video:
         bag = BagFile(path)
         kinds = ((_IMAGE, False), (_COMPRESSED, True))
         streams = [_stream(bag, name, n, packed) for kind, packed in kinds for name, n in bag.topics(kind).items()]
@@ -332,7 +332,7 @@ class Bag(VideoFormat):
             message, where = bag.message(depth.name, entries[1][k]), f"depth message {k} of {depth.name}"
             return depth_image(message, depth.compressed, self.depth_scale, where)
 
-        video = Video(
+        return Video(
             path.resolve().stem,
             tuple(stamps[0][i] for i, _ in pairs),
             read_rgb,
@@ -342,7 +342,6 @@ class Bag(VideoFormat):
             self.depth_scale if depth.encoding != "32FC1" else 0.00025,
             distortion=distortion,
         )
-        return self.recording_of(video)
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
         found = [s for s in streams if s.encoding in _DEPTH]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, object_numbers
 from mstfilter.reading import read_json
-from mstfilter.scene import PauseRule, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix
+from mstfilter.scene import PauseRule, Recording, read_labels, rigid_from_matrix
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,6 @@ class Bop(RecordingFormat):
     ----------
     images : tuple of int
         Numbers of the images to use, in order. Default: all.
-    fps : float
-        Images per second; the layout stores no times.
     pauses : PauseRule
         The rule that finds the pauses.
     world : KnownWorld
@@ -42,7 +41,6 @@ class Bop(RecordingFormat):
     """
 
     images: tuple[int, ...] = ()
-    fps: float = 1.0
     pauses: PauseRule = field(default_factory=EveryNth)
     world: KnownWorld = field(default_factory=KnownWorld)
 
@@ -59,25 +57,20 @@ class Bop(RecordingFormat):
                 f"{path}: image {absent[0] if absent else ''} is not in scene_camera.json, which has {len(cameras)}"
             )
         first = cameras[chosen[0]]
-        for k in chosen:
-            if cameras[k]["cam_K"] != first["cam_K"]:
+        for k, name in itertools.product(chosen, ("cam_K", "depth_scale")):
+            if cameras[k][name] != first[name]:
                 raise InputError(
-                    f"{path / 'scene_camera.json'}: cam_K of image {k} differs from that of image {chosen[0]}",
+                    f"{path / 'scene_camera.json'}: {name} of image {k} differs from that of image {chosen[0]}",
                     "choose images of one camera: images=0,1,2",
                 )
         K = first["cam_K"]
-        colour = [_image(path, ("rgb", "gray"), k) for k in chosen]
-        depth = [_image(path, ("depth",), k) for k in chosen]
-        scales = [cameras[k]["depth_scale"] / 1000 for k in chosen]
-
-        return Video(
+        return Video.of_files(
             f"{path.resolve().parent.name}-{path.resolve().name}",
-            tuple(i / self.fps for i in range(len(chosen))),
-            lambda index: read_rgb(colour[index]),
-            lambda index: read_depth(depth[index], scales[index]),
+            tuple(float(i) for i in range(len(chosen))),
+            [(_image(path, ("rgb", "gray"), k), _image(path, ("depth",), k)) for k in chosen],
             (K[0], K[4], K[2], K[5]),
             path,
-            scales[0],
+            first["depth_scale"] / 1000,
             motion=_motion(cameras, chosen),
             read_instance=lambda index: _instances(path, chosen[index]),
         ).recording(self.pauses, self.world)

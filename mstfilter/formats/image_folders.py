@@ -21,7 +21,7 @@ from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
 from mstfilter.reading import read_json, read_text
-from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
+from mstfilter.scene import Frame, Recording, read_labels, rigid_from_matrix, table_residual
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,9 @@ class PairedImages(RecordingFormat):
             raise InputError(
                 f"no frame {missing[0]!r} in {path}", f"there are {len(present)}: {', '.join(present[:8])}, ..."
             )
-        video = Video(
-            chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}",
-            tuple(float(k) for k in range(len(chosen))),
-            lambda index: read_rgb(path / f"{chosen[index]}_rgb.png"),
-            lambda index: read_depth(path / f"{chosen[index]}_depth.png", scale),
-            K,
-            path,
-            scale,
-        )
+        pairs = [(path / f"{name}_rgb.png", path / f"{name}_depth.png") for name in chosen]
+        title = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
+        video = Video.of_files(title, tuple(float(k) for k in range(len(chosen))), pairs, K, path, scale)
         made = video.recording(EveryNth(), KnownWorld())
 
         def instance(index: int) -> np.ndarray | None:
@@ -132,7 +126,7 @@ class Redwood(VideoFormat):
         folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
         return any((path / name).is_dir() for name in folders)
 
-    def open(self, path: Path) -> Recording:
+    def video(self, path: Path) -> Video:
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         colour, depth = _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
@@ -145,11 +139,10 @@ class Redwood(VideoFormat):
         K = self.K or _stored_matrix(path, file, stored)
         scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
         fps = self.fps or _stored(file, stored, "fps", 30)
-        video = Video(
+        video = Video.of_files(
             path.resolve().name,
             stamps or tuple(k / fps for k in range(len(pairs))),
-            lambda index: read_rgb(pairs[index][0]),
-            lambda index: read_depth(pairs[index][1], scale),
+            pairs,
             K,
             path,
             scale,
@@ -162,7 +155,7 @@ class Redwood(VideoFormat):
                     f"{file} is for images of another {name}: the images have {n}",
                     "scale the intrinsics, or give them: K=fx,fy,cx,cy",
                 )
-        return self.recording_of(video)
+        return video
 
 
 def _is_recording(path: Path) -> bool:
@@ -323,7 +316,7 @@ class Tum(VideoFormat):
     def detects(cls, path: Path) -> bool:
         return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
-    def open(self, path: Path) -> Recording:
+    def video(self, path: Path) -> Video:
         colour, depth = (_table(path / name, 2) for name in ("rgb.txt", "depth.txt"))
         if not self.K:
             raise InputError(
@@ -338,18 +331,16 @@ class Tum(VideoFormat):
 
         times = tuple(stamps[0][i] for i, _ in pairs)
         truth = path / "groundtruth.txt"
-        video = Video(
+        return Video.of_files(
             path.resolve().name,
             times,
-            lambda index: read_rgb(path / colour[pairs[index][0]][1]),
-            lambda index: read_depth(path / depth[pairs[index][1]][1], self.depth_scale),
+            [(path / colour[i][1], path / depth[j][1]) for i, j in pairs],
             self.K,
             path,
             self.depth_scale,
             motion=_motion(truth, times) if truth.is_file() else None,
             distortion=self.distortion,
         )
-        return self.recording_of(video)
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:
