@@ -107,34 +107,6 @@ def test_a_lock_is_released_and_leaves_no_files(tmp_path):
         pass
 
 
-def test_two_commands_started_together(recording, tmp_path, capsys):
-    """One folder, two seeds: it holds one of the two runs, and the other command has ended with one error."""
-    out = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-m",
-        "mstfilter",
-        "run",
-        recording.path,
-        "--preset",
-        "floor_components",
-        "--no-report",
-    ]
-    both = [
-        subprocess.Popen(
-            [*command, "--out", out, "--seed", str(seed)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-        )
-        for seed in (1, 2)
-    ]
-    errors = [process.communicate(timeout=300)[1].decode() for process in both]
-    assert sorted(process.returncode for process in both) == [0, 2], errors
-    kept = int(both[1].returncode == 0)
-    assert errors[1 - kept].count("error:") == 1
-    whole = run(recording, tmp_path / "whole", 1 + kept)
-    assert content(out) == content(whole.path)
-    assert names(tmp_path) == ["run", "whole"]
-
-
 def test_a_writer_in_the_same_process_is_another_writer(recording, tmp_path):
     with RecordingWriter(tmp_path / "a", recording.frames[0].camera) as writer:
         with pytest.raises(InputError, match="another process"):

@@ -92,8 +92,9 @@ def test_commands_run(here, command, capsys):
         words += ["--no-report", "n=2"]
     if words[0] in ("quality", "report"):
         call("run", words[1].replace("run", "table"), "--out", words[1], "--no-report", "n=2", capsys=capsys)
-    code, _, err = call(*words, capsys=capsys)
+    code, out, err = call(*words, capsys=capsys)
     assert code == 0, err
+    assert words[0] != "convert" or re.search(r"pauses +\d+ of \d+ frames: ", out)
     made = {"convert": f"{words[2]}/manifest.json", "view": words[-1], "report": "meshes"} if len(words) > 2 else {}
     assert (here / made.get(words[0], ".")).exists()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -149,34 +148,3 @@ def test_blocks_are_means():
     blocks = grey_blocks(image)
     assert blocks.shape == (24, 81)
     np.testing.assert_allclose(blocks[3, 5], image[6:8, 10:12].mean(), rtol=1e-6)
-
-
-def test_still_intervals_of_a_simulated_recording():
-    """Pushes with sensor noise, each pause held for a second: exactly the pauses are found.
-
-    The truth is the simulator's: a frame belongs to a pause if it was drawn from the world at rest.
-    """
-    from mstfilter.simulation import SimulatedScene, advance_push, finish_push, scene_family
-
-    family = replace(scene_family("demo"), n_actions=2, supersample=False)
-    scene = SimulatedScene(family, seed=3)
-    images, pause_of = [], []
-
-    def see(pause):
-        images.append(scene.frame_images(len(images))["rgb"])
-        pause_of.append(pause)
-
-    fps = 6.0
-    for action in range(family.n_actions + 1):
-        for _ in range(7):
-            see(action)
-        if action == family.n_actions:
-            break
-        push = scene.choose_push(action)
-        for step in range(int(push.seconds * fps)):
-            advance_push(scene.world, push, step / fps, (step + 1) / fps)
-            see(None)
-        advance_push(scene.world, push, int(push.seconds * fps) / fps, push.seconds)
-        finish_push(scene.world)
-    found = Still(hold_s=0.8).find(times_of(images, fps), lambda k: images[k])
-    assert [pause_of[k] for k in found] == list(range(family.n_actions + 1))

@@ -101,22 +101,6 @@ def test_a_frame_of_another_recording_is_an_error(recording, tmp_path):
         bind_truth(TrueBoundary(), recording).boundary(other.frames[0])
 
 
-def test_a_run_with_oracles_resumes(recording, tmp_path):
-    config = load_config("mst", ALL)
-    filter_recording(recording, config, tmp_path / "a", seed=1)
-
-    def stop(done, total):
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        filter_recording(recording, config, tmp_path / "b", seed=1, progress=stop)
-    filter_recording(recording, config, tmp_path / "b", seed=1)
-    for t in range(3):
-        name = f"pauses/{t:03d}/state.npz"
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
 # Streams
 
 
@@ -306,20 +290,6 @@ def test_choice_and_selection_prefer_true_quality(recording):
     chosen = LargestWeights().resample(RNG, population.reweighted(score), 2)
     order = np.argsort(-score, kind="stable")
     assert chosen.parents["ancestor"].tolist() == order[:2].tolist()
-
-
-def test_choice_by_true_quality_is_not_worse(recording):
-    config = load_config("mst", ['update.evidence=["true_quality"]', "update.n_candidates=50"])
-    filter = bind_truth(build_filter(config), recording)
-    plain = build_filter(load_config("mst"))
-    quality = {}
-    for name, one in (("plain", plain), ("oracle", filter)):
-        state = one.start(0)
-        for clip in recording.clips():
-            state, _ = one.step(state, clip)
-        true = recording.truth(2)
-        quality[name] = np.mean([weighted_coverage(h.labels, true) for h in state.population.particles])
-    assert quality["oracle"] >= quality["plain"]
 
 
 def test_oracles_are_frozen_dataclasses():
