@@ -17,7 +17,6 @@ import csv
 import errno
 import functools
 import hashlib
-import json
 import math
 import numbers
 import os
@@ -259,12 +258,6 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise InputError(f"not {kind}: {path} is missing", *hints) from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
-    except RecursionError as error:
-        raise InputError(f"{path} cannot be read: its values are nested too deep", *hints) from error
-    except MemoryError as error:
-        raise InputError(f"{path} cannot be read: memory ran out", *hints) from error
     except _UNREADABLE as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
 
@@ -272,7 +265,7 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
 _UNREADABLE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
+    *(MemoryError, SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
 )
 
 

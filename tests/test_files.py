@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -227,25 +226,6 @@ def test_a_stopped_run_drops_damaged_pauses(recording, tmp_path):
     with pytest.warns(InputWarning, match=r"pause 0 is damaged: SHA256SUMS is missing"):
         run(recording, path)
     assert content(path) == whole
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [("seed", "seed 2, expected 1"), ("t", "step 2, expected 3"), ("run", "hash of run.json")],
-)
-def test_a_state_of_another_run_is_refused(recording, tmp_path, change, message):
-    path = run(recording, tmp_path / "run").path
-    run(recording, tmp_path / "other", 2)
-    if change == "run":
-        description = json.loads((path / "run.json").read_text())
-        (path / "run.json").write_text(json.dumps({**description, "description": "changed"}))
-    else:
-        source = tmp_path / "other" / "pauses" / "002" if change == "seed" else path / "pauses" / "001"
-        shutil.copytree(source, path / "pauses" / "002", dirs_exist_ok=True)
-    before = content(path)
-    with pytest.raises(InputError, match=message):
-        run(recording, path)
-    assert content(path) == before
 
 
 def test_check_names_damaged_files(recording, tmp_path, capsys):

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any
 
 import typer
@@ -212,8 +213,6 @@ def quality(
     option: Options = None,
 ) -> None:
     """Score the hypotheses of a run and trivial baselines against the ground truth."""
-    from statistics import fmean
-
     if csv is not None:
         check_output(csv)
     from mstfilter.runs import RunFolder
@@ -227,23 +226,28 @@ def quality(
         write_csv(csv, [asdict(row) for row in rows], float_format=".6f")
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")
     print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
+    forms = list(dict.fromkeys(row.form for row in rows))
     for row in rows:
-        print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + "".join(f"{getattr(row, name):>12.3f}" for name in names))
-    for form in dict.fromkeys(row.form for row in rows):
-        these = [row for row in rows if row.form == form]
-        print(f"{'all':<7}{form:<9}{'':>4}" + "".join(f"{fmean(getattr(r, n) for r in these):>12.3f}" for n in names))
+        print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + _numbers([row], names, 12))
+    for form in forms:
+        print(f"{'all':<7}{form:<9}{'':>4}" + _numbers([row for row in rows if row.form == form], names, 12))
     if rows[0].brier == rows[0].brier:
         print("\nthe weighted set, asked whether two voxels belong to one object (lower is better)")
         scores = ("log_loss", "base_rate", "brier", "calibration_error", "energy")
-        these = [row for row in rows if row.form == rows[0].form]
+        these = [row for row in rows if row.form == forms[0]]
         print(f"{'pause':<7}" + "".join(f"{name:>19}" for name in scores))
         for row in these:
-            print(f"{row.pause:<7}" + "".join(f"{getattr(row, name):>19.3f}" for name in scores))
-        print(f"{'all':<7}" + "".join(f"{fmean(getattr(r, n) for r in these):>19.3f}" for n in scores))
+            print(f"{row.pause:<7}" + _numbers([row], scores, 19))
+        print(f"{'all':<7}" + _numbers(these, scores, 19))
         print("base_rate is the log loss of a forecast that knows only how often the answer is yes. The scores are")
         print("those of the forecasts as they come: only studies have other scenes to recalibrate them on.")
     if rows[0].where == "image":
         print("scored in the image: hypotheses are projected, hidden parts do not count")
+
+
+def _numbers(rows: Sequence[Any], names: Sequence[str], width: int) -> str:
+    """The mean of each column over rows, as cells of a table."""
+    return "".join(f"{fmean(getattr(row, name) for row in rows):>{width}.3f}" for name in names)
 
 
 def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) -> None:

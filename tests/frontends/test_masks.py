@@ -336,7 +336,7 @@ HOSTILE = {
     "text scores": (npz(masks=stack(BOX[0]), scores=np.array(["a"])), "expected numbers"),
     "colour png": (image("000000.png", np.zeros((*SHAPE, 3), np.uint8)), "expected one channel"),
     "broken png": (text("000000.png", "PNG"), "cannot be decoded"),
-    "broken json": (text("000000.json", '[{"segmentation":'), "not valid JSON"),
+    "broken json": (text("000000.json", '[{"segmentation":'), "cannot be read: Expecting value"),
     "json number": (text("000000.json", 3), "not a list"),
     "polygon": (text("000000.json", [{"segmentation": [[1, 2, 3, 4]]}]), "no segmentation with size and counts"),
     "short runs": (runs([5]), "sum to 5"),
