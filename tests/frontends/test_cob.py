@@ -323,10 +323,8 @@ def test_presets_name_the_components_without_importing_torch():
 FEW = {"a": [np.ones((2, 3, 1, 1)), np.zeros(2)], "b": [np.ones(5)]}
 HOSTILE = {
     "truncated": (encode(FEW)[:-30], "is not a complete Caffe model"),
-    "cut in a number": (encode(FEW) + b"\xff", "is not a complete Caffe model"),
     "pickle": (pickle.dumps(print), "is not a complete Caffe model"),
     "empty": (b"", "has no layer with weights"),
-    "text": (b"layer { name: 'conv1' }", "is not a complete Caffe model"),
     "huge length": (varint(100 << 3 | 2) + varint(2**62), "is not a complete Caffe model"),
     "twice": (encode({"a": [np.ones(1)]}) * 2, "two layers are named 'a'"),
     "shape and data": (

@@ -301,33 +301,23 @@ def test_checkpoints_that_cannot_be_used_are_one_clear_error(checkpoint, tensors
         def __reduce__(self):
             return (Path.touch, (tmp_path / "executed",))
 
-    def tensors_without(name):
-        return {k: v for k, v in tensors.items() if k != name}
-
-    few = {"a": torch.zeros(1)}
-    cases = {
-        "cannot be read": [
-            lambda: path.write_bytes(checkpoint.read_bytes()[:100_000]),
-            lambda: path.write_bytes(b""),
-            lambda: path.write_bytes(b"no checkpoint"),
-            lambda: torch.save({"state_dict": few, "x": Payload()}, path),
-        ],
-        "is no dictionary of tensors": [lambda: torch.save([1, 2], path), lambda: torch.save({"a": 1}, path)],
-        "tensors, the first is 'features.features.conv1.weight'": [lambda: torch.save(few, path)],
-        "lacks 1 of": [lambda: torch.save(tensors_without("refine_model.post2.bias"), path)],
-        "expected (64,)": [lambda: torch.save({**tensors, "features.features.bn1.bias": torch.zeros(3)}, path)],
-        "not finite": [
-            lambda: torch.save({**tensors, "features.features.bn1.bias": torch.full((64,), torch.nan)}, path)
-        ],
-    }
-    for message, writers in cases.items():
-        for write in writers:
-            write()
-            with pytest.raises(InputError) as caught:
-                SiamMaskTracker(str(path)).track(clip, masks[:1])
-            assert message in caught.value.message
-            assert str(path) in caught.value.message
-            assert "\n" not in caught.value.message
+    few, lacking = {"a": torch.zeros(1)}, {k: v for k, v in tensors.items() if k != "refine_model.post2.bias"}
+    bias = "features.features.bn1.bias"
+    cases = (
+        (checkpoint.read_bytes()[:100_000], "cannot be read"),
+        ({"state_dict": few, "x": Payload()}, "cannot be read"),
+        ([1, 2], "is no dictionary of tensors"),
+        (few, "tensors, the first is 'features.features.conv1.weight'"),
+        (lacking, "lacks 1 of"),
+        ({**tensors, bias: torch.zeros(3)}, "expected (64,)"),
+        ({**tensors, bias: torch.full((64,), torch.nan)}, "not finite"),
+    )
+    for content, message in cases:
+        path.write_bytes(content) if isinstance(content, bytes) else torch.save(content, path)
+        with pytest.raises(InputError) as caught:
+            SiamMaskTracker(str(path)).track(clip, masks[:1])
+        assert message in caught.value.message and str(path) in caught.value.message
+        assert "\n" not in caught.value.message
     assert not (tmp_path / "executed").exists()
 
 
