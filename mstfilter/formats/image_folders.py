@@ -102,7 +102,7 @@ class Redwood(VideoFormat):
     Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix``, column by column. ``camera_info.yaml`` is a message or a calibration file of ROS.
-    Images are paired by the first number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
+    Images are paired by the last number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
     16 bits, or float in metres (.npy, .tif). A trajectory ``.log`` of a moving camera has five lines per frame: three
     numbers, then a 4 x 4 camera-to-world matrix. Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
 
@@ -172,27 +172,25 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     if not files:
         raise InputError(f"{folder} has no image", f"expected {', '.join(suffixes)}")
-    for position in (0, -1):
-        numbers = {file: _number(file, position) for file in files}
-        if len(set(numbers.values())) == len(files):
-            return sorted(files, key=numbers.__getitem__)
-    raise InputError(
-        f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
-        "name them 000000, 000001, ..., or by time in seconds",
-    )
+    if len({_number(file) for file in files}) < len(files):
+        raise InputError(
+            f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
+            "name them 000000, 000001, ..., or by time in seconds",
+        )
+    return sorted(files, key=_number)
 
 
-def _number(file: Path, position: int) -> Decimal:
-    """The first (0) or the last (-1) number in a name; -1 if there is none."""
+def _number(file: Path) -> Decimal:
+    """The last number in a name; -1 if there is none."""
     found = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return Decimal(found[position] if found else -1)
+    return Decimal(found[-1] if found else -1)
 
 
 def _paired(
     path: Path, colour: list[Path], depth: list[Path], tolerance_s: float
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
     """Pairs of files, and the time of each in seconds; no times if names are frame numbers."""
-    numbers = [[_number(file, 0) for file in files] for files in (colour, depth)]
+    numbers = [[_number(file) for file in files] for files in (colour, depth)]
     seconds = [[_seconds(number) for number in side] for side in numbers]
     if all(value is not None for side in seconds for value in side):
         stamps = [[float(value - seconds[0][0]) for value in side] for side in seconds]  # type: ignore[operator]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats.image_folders import PairedImages
+from mstfilter.formats.image_folders import PairedImages, Redwood
 from mstfilter.formats.sources import detect_format, format_settings, open_recording
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import render, write_image
@@ -53,14 +53,10 @@ def test_unknown_and_ambiguous(tmp_path):
 
 
 def test_options_as_text():
-    assert format_settings(
-        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,007,8", "objects=false"]
-    ) == {
-        "K": [525, 525, 319.5, 239.5],
-        "world": {"workspace": [-1, -1, 0, 1, 1, 0.5]},
-        "frames": ["a", "007", 8],
-        "objects": False,
-    }
+    fields = format_settings(["K=525,525,319.5,.5", "world.workspace=-1,-1,0,1,1,.5", "start_s=2"])
+    reader = REGISTRY.make(Redwood, fields)
+    assert (reader.K, reader.world.workspace, reader.start_s) == ((525, 525, 319.5, 0.5), (-1, -1, 0, 1, 1, 0.5), 2)
+    assert REGISTRY.make(PairedImages, format_settings(["frames=a,007,8"])).frames == ("a", "007", "8")
 
 
 def test_a_single_number_is_a_list_of_one():
