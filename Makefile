@@ -7,6 +7,7 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test lint docs dist clean
 
 demo: $(STAMP)
+	rm -rf demo
 	$(BIN)/mstfilter demo --out demo
 
 test: $(STAMP) lint

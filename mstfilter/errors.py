@@ -67,10 +67,10 @@ def naming(where: str) -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """The message of an exception; of a KeyError, which has the name alone, that the name is missing."""
+    """The message of an exception, or its name; of a KeyError, which has the name alone, that the name is missing."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
 
 
 def printable(text: str) -> str:
@@ -162,7 +162,6 @@ def install_hint(library: str) -> str:
 _PACKAGES = {
     "cv2": "opencv-python-headless",
     "pytest": "'mstfilter[check]'",
-    "h5py": "'mstfilter[h5py]'",
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "dask.distributed": "'mstfilter[dask]'",

@@ -20,13 +20,14 @@ A ``__post_init__`` for conditions on several fields is called after these check
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import types
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from mstfilter.errors import check_choice, check_component, check_integer, check_number
 
@@ -110,3 +111,14 @@ def _check_of_number(kind: type, bounds: Bounds) -> _Check:
         return lambda name, value: check_integer(name, value, *hints, at_least=least, at_most=most)
     limits = {name: getattr(bounds, name) for name in ("above", "at_least", "at_most", "below", "unit")}
     return lambda name, value: check_number(name, value, *hints, **limits)
+
+
+_Component = TypeVar("_Component")
+
+
+def bound_to(component: _Component, **attributes: Any) -> _Component:
+    """A copy of a frozen component with further attributes, such as the files of a pause; they are no fields."""
+    bound = copy.copy(component)
+    for name, value in attributes.items():
+        object.__setattr__(bound, name, value)
+    return bound

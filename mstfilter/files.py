@@ -17,7 +17,6 @@ import csv
 import errno
 import functools
 import hashlib
-import json
 import math
 import numbers
 import os
@@ -259,12 +258,6 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise InputError(f"not {kind}: {path} is missing", *hints) from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path} is not valid JSON: {error}", *hints) from error
-    except RecursionError as error:
-        raise InputError(f"{path} cannot be read: its values are nested too deep", *hints) from error
-    except MemoryError as error:
-        raise InputError(f"{path} cannot be read: memory ran out", *hints) from error
     except _UNREADABLE as error:
         raise InputError(f"{path} cannot be read: {reason(error)}", *hints) from error
 
@@ -272,7 +265,7 @@ def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
 _UNREADABLE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
+    *(MemoryError, SystemError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile),
 )
 
 
@@ -321,23 +314,12 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     made_in = existing.parent if existing.is_file() else existing
     for name in [place.name for place in places[: places.index(existing)]] or [existing.name]:
         try:
-            _try_to_write(made_in, _temporary(made_in / name, "partial"))
+            trial = _temporary(made_in / name, "partial")
+            trial.touch()
+            trial.unlink()
         except OSError as error:
             problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
             raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
-
-
-def _try_to_write(folder: Path, temporary: Path) -> None:
-    """Make a file in a folder and remove it, without a name where that is possible: a kill then leaves nothing."""
-    if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
-        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
-    try:
-        os.close(os.open(folder, os.O_WRONLY | os.O_TMPFILE))
-    except (AttributeError, OSError) as error:
-        if getattr(error, "errno", None) not in (None, errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT):
-            raise
-        temporary.touch()
-        temporary.unlink()
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -377,21 +359,18 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def weights_file(given: str, name: str, where: str, sha256: str = "") -> tuple[str, str]:
+def weights_file(given: str, name: str, where: str) -> tuple[str, str]:
     """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
 
-    Raises InputError if it is not given, does not exist, or has another hash than `sha256`; `where` is an address for
-    the hint. The hash of an unchanged file is computed once.
+    Raises InputError if it is not given or does not exist; `where` is an address for the hint. The hash of an
+    unchanged file is computed once.
     """
     path = Path(given)
     if not given or not path.is_file():
         problem = f"do not exist: {path}" if given else "are not given"
         raise InputError(f"the weights of {name} {problem}", f"set the field to the path of a file, see {where}")
     status = path.stat()
-    digest = _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
-    if sha256 and digest != sha256.lower():
-        raise InputError(f"weights {path} have the hash {digest}, expected {sha256}", "download the file again")
-    return str(path.resolve()), digest
+    return str(path.resolve()), _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
 
 
 @functools.lru_cache(maxsize=8)

@@ -178,7 +178,7 @@ class Registry:
         """
         prefix = f"{where}: " if where else ""
         if inspect.isabstract(cls):
-            raise self._abstract_error(prefix, cls)
+            raise _abstract_error(prefix, cls)
         if not dataclasses.is_dataclass(cls):
             raise InputError(
                 f"{prefix}{cls.__name__} is no dataclass", "write @dataclass(frozen=True) above the class"
@@ -210,22 +210,6 @@ class Registry:
             raise InputError(f"{prefix}{error.message}", *error.hints) from error
         except TypeError as error:
             raise InputError(f"{prefix}{cls.__name__} cannot be made: {error}") from error
-
-    def _abstract_error(self, prefix: str, cls: type) -> InputError:
-        """The error for a class without all methods of its interface: which ones, and a base class that fits."""
-        missing = sorted(getattr(cls, "__abstractmethods__", ()))
-        written = {name for name, value in vars(cls).items() if inspect.isfunction(value) and name[0] != "_"}
-        origin = next(base.__name__ for base in reversed(cls.__mro__) if missing[0] in vars(base))
-        roots = [*cls.__mro__[1:], *map(self.interface, self.kinds)]
-        hint = f"define {missing[0]} as {origin}.{missing[0]} describes it"
-        for close in difflib.get_close_matches(missing[0], written, n=1):
-            hint = f"rename {close} to {missing[0]}"
-        for other in (other for root in roots for other in _with_abstract_subclasses(root)):
-            methods: frozenset[str] = getattr(other, "__abstractmethods__", frozenset())
-            if methods <= written:
-                hint = f"inherit {other.__name__}, which asks for {' and '.join(sorted(methods))}"
-                break
-        return InputError(f"{prefix}{cls.__name__} has no method {', '.join(missing)}, which {origin} asks for", hint)
 
     def _value(self, hint: Any, value: Any, current: Any, path: str, allow_files: bool) -> Any:
         """The value of a field with annotation `hint`; `current` is its default or its value in `base`."""
@@ -324,13 +308,14 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
-def _with_abstract_subclasses(cls: type) -> Iterator[type]:
-    """An abstract class, and the abstract classes of the package that inherit it."""
-    if inspect.isabstract(cls) and cls.__module__.startswith("mstfilter."):
-        yield cls
-        subclasses: list[type] = cls.__subclasses__()
-        for other in subclasses:
-            yield from _with_abstract_subclasses(other)
+def _abstract_error(prefix: str, cls: type) -> InputError:
+    """The error for a class without all methods of its interface."""
+    missing = sorted(getattr(cls, "__abstractmethods__", ()))
+    origin = next(base.__name__ for base in reversed(cls.__mro__) if missing[0] in vars(base))
+    hint = f"define {missing[0]} as {origin}.{missing[0]} describes it"
+    for close in difflib.get_close_matches(missing[0], vars(cls), n=1):
+        hint = f"rename {close} to {missing[0]}"
+    return InputError(f"{prefix}{cls.__name__} has no method {', '.join(missing)}, which {origin} asks for", hint)
 
 
 def _location(package: str, cls: str) -> str:

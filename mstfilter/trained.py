@@ -11,6 +11,7 @@ belong together is not opened. Weights are stored in half precision. Nothing is 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,10 +133,5 @@ def _toml(values: Mapping[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_value(one) for one in value) + "]"
-    return repr(float(value)) if isinstance(value, (float, np.floating)) else str(int(value))
+    """A value in TOML, whose strings, numbers, booleans and lists have the syntax of JSON."""
+    return json.dumps(value, ensure_ascii=False, default=lambda number: number.item())

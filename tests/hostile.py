@@ -35,7 +35,7 @@ from mstfilter.reading import read_bytes
 from mstfilter.report import run_page, write_report, write_study_report
 from mstfilter.runs import RunFolder
 from mstfilter.scene import DiskCache, write_image
-from mstfilter.scoring import NO_COUNTS, read_truth
+from mstfilter.scoring import NO_COUNTS
 from mstfilter.smc import Key, Population, State, load_state, save_state
 from mstfilter.study import StudyFolder, check_arm_names, load_study
 from mstfilter.trained import open_model, write_model
@@ -84,16 +84,6 @@ def _bag(kind: str) -> Callable[[Path], Any]:
 def _read_bag(path: Path) -> None:
     found = sorted(path.glob("it*"))
     _reader("bag", "pauses=every")(found[0] if found else path / "it.bag")
-
-
-def _write_pairs(path: Path) -> None:
-    path.mkdir()
-    (path / "info.json").write_text(json.dumps({"K": CAMERA.K.tolist(), "depth_scale_m": 0.001}), encoding="utf-8")
-    for name, shift in (("a1", 0), ("a2", 2)):
-        rgb, depth, _ = table_scene(shift)
-        write_image(path / f"{name}_rgb.png", rgb)
-        write_image(path / f"{name}_depth.png", (depth * 1000).astype(np.uint16))
-        write_image(path / f"{name}_label.png", (depth < 0.5).astype(np.uint8))
 
 
 def _write_run(path: Path) -> None:
@@ -193,18 +183,6 @@ def _read_shapes(path: Path) -> None:
             place_shape(file, read_bytes(file, "a shape"), np.eye(4), GRID)
 
 
-def _write_volumes(path: Path) -> None:
-    path.mkdir()
-    labels = np.zeros((2, *GRID.shape), np.uint16)
-    labels[:, 5:9, 5:9, :4] = 1
-    frames = {"frame": np.array([0, 2]), "origin": GRID.origin, "voxel_size": GRID.voxel_size}
-    np.savez_compressed(path / "voxels.npz", labels=labels, **frames)
-
-
-def _read_volumes(path: Path) -> None:
-    read_truth(path / "voxels.npz")
-
-
 def _write_checkpoint(path: Path) -> None:
     path.mkdir()
     save_state(path / "state.npz", State(1, Population({"x": np.zeros((4, 2))}, np.zeros(4), {}), Key(0), True))
@@ -240,16 +218,12 @@ KINDS = {
     "weights": Kind(_write_weights, _read_weights),
     "masks": Kind(_write_masks, _read_masks),
     "shapes": Kind(_write_shapes, _read_shapes),
-    "volumes": Kind(_write_volumes, _read_volumes),
     "checkpoint": Kind(_write_checkpoint, _read_checkpoint),
     "cache": Kind(_write_cache, _read_cache),
-    "pairs": Kind(_write_pairs, _reader("pairs")),
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
     "bop": Kind(_layout("bop"), _reader("bop")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),
-    "dsr": Kind(_layout("dsr"), _reader("dsr")),
     "bag": Kind(_bag("bag"), _read_bag),
-    "db3": Kind(_bag("db3"), _read_bag),
     "mcap": Kind(_bag("mcap"), _read_bag),
 }
 

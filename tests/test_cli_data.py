@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import VoxelGrid
 from mstfilter.scoring import ask
 from tests.formats import layouts
-from tests.formats.bags import COLOUR, DEPTH, Messages, scene_messages, write as write_bag
+from tests.formats.bags import scene_messages, write as write_bag
 from tests.scene.scenes import CAMERA, table_scene
 from tests.scene.test_recording import write
 from tests.test_cli import call
@@ -30,60 +29,6 @@ def clear_error(err):
     assert "Traceback" not in err
 
 
-def pairs(path):
-    """The first and the last frame of a recording, as pairs of images."""
-    source = write(path.with_name("source"))
-    path.mkdir()
-    for index in (0, 4):
-        for part in ("rgb", "depth"):
-            shutil.copy(source / part / f"{index:06d}.png", path / f"v{index}_{part}.png")
-    (path / "info.json").write_text('{"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}')
-    return path
-
-
-CASES = {
-    "pairs": (pairs, ["--frames", "v4,v0"], (0, 1)),
-    "tum": (lambda p: layouts.write_tum(p), ["-o", K], layouts.PAUSES),
-    "redwood": (lambda p: layouts.write_redwood(p), ["-o", "fps=10"], layouts.PAUSES),
-    "bop": (lambda p: layouts.write_bop(p), [], (0, 1, 2)),
-    "dsr": (lambda p: layouts.write_dsr(p), [], (0, 1, 2)),
-    "bag": (lambda p: write_bag(p, "bag", scene_messages(True)), ["--pauses", "0,9"], (0, 9)),
-    "mcap": (lambda p: write_bag(p, "mcap", scene_messages(False)), ["--pauses", "0s,1.6s"], (0, 16)),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_convert(tmp_path, capsys, name):
-    make, options, pauses = CASES[name]
-    path = make(tmp_path / "data")
-    code, out, err = call("convert", path, tmp_path / "out", *options, capsys=capsys)
-    assert code == 0, err
-    assert "error" not in err
-    assert f"pauses      {len(pauses)} of" in out
-    recording = open_recording(tmp_path / "out")
-    recording.check()
-    assert recording.pauses == pauses
-    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
-
-
-def truncated(path):
-    target = write_bag(path, "bag", scene_messages(True))
-    target.write_bytes(target.read_bytes()[:20000])
-    return target
-
-
-def uneven(path):
-    layouts.write_redwood(path)
-    next((path / "depth").iterdir()).unlink()
-    return path
-
-
-def unnamed(path):
-    layouts.write_redwood(path)
-    (path / "intrinsic.json").unlink()
-    return path
-
-
 def late_fault(path):
     """Only the last image is broken: most is written before that is seen."""
     layouts.write_redwood(path)
@@ -92,35 +37,9 @@ def late_fault(path):
     return path
 
 
-def small_depth(path):
-    make, messages = Messages(True), scene_messages(True, (0, 1), depth=None)
-    images = [(DEPTH, t, make.image(t, np.full((60, 80), 700, np.uint16), "16UC1")) for _, t, _ in messages]
-    return write_bag(path, "bag", messages + images)
-
-
-def photos(path):
-    path.mkdir()
-    (path / "IMG_1.JPG").write_bytes(b"x")
-    return path
-
-
-def bag(**more):
-    return lambda path: write_bag(path, "bag", scene_messages(True, (0, 1), **more))
-
-
 ERRORS = {
-    "truncated bag": (truncated, [], "bag cannot be read"),
-    "mismatched numbers of images": (uneven, [], "17 colour images and 16 depth images"),
     "missing intrinsics": (layouts.write_tum, [], "intrinsics are missing"),
-    "intrinsics lost": (unnamed, [], "intrinsics are missing"),
-    "table 1 km away": (layouts.write_redwood, ["-o", "depth_scale=1.25"], "expected between 0.05 and 30 m"),
-    "table 1 mm away": (layouts.write_redwood, ["-o", "depth_scale=1.25e-6"], "expected between 0.05 and 30 m"),
-    "colour alone": (photos, [], "holds colour images only"),
     "wrong format": (layouts.write_redwood, ["--format", "tum"], "not a TUM folder"),
-    "wrong topic": (bag(), ["-o", "colour=/rgb"], "no image topic '/rgb'"),
-    "sizes differ": (small_depth, [], "differ in size"),
-    "unregistered depth": (bag(frame="depth_frame"), [], "not registered"),
-    "no depth at all": (bag(depth=None), [], "no depth topic"),
     "no pause": (layouts.write_redwood, [], "no pause found"),  # at 30 fps nothing holds still for half a second
     "broken at the end": (late_fault, ["-o", "fps=10"], "image is truncated"),
     "unknown option": (layouts.write_redwood, ["-o", "scale=2"], "no field 'scale'"),
@@ -138,17 +57,6 @@ def test_errors_leave_no_files(tmp_path, capsys, command, fault):
     clear_error(err)
     assert message in err
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_topics_are_listed(tmp_path, capsys):
-    messages = scene_messages(True, (0, 1))
-    again = [("/left" + topic, t, m) for topic, t, m in messages if topic == COLOUR]
-    path = write_bag(tmp_path / "two", "bag", messages + again)
-    code, _, err = call("convert", path, tmp_path / "out", capsys=capsys)
-    assert code == 2
-    clear_error(err)
-    assert f"/left{COLOUR} (2 x rgb8, 160 x 120" in err
-    assert "choose one: colour=TOPIC" in err
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -107,34 +106,6 @@ def test_a_lock_is_released_and_leaves_no_files(tmp_path):
         pass
 
 
-def test_two_commands_started_together(recording, tmp_path, capsys):
-    """One folder, two seeds: it holds one of the two runs, and the other command has ended with one error."""
-    out = tmp_path / "run"
-    command = [
-        sys.executable,
-        "-m",
-        "mstfilter",
-        "run",
-        recording.path,
-        "--preset",
-        "floor_components",
-        "--no-report",
-    ]
-    both = [
-        subprocess.Popen(
-            [*command, "--out", out, "--seed", str(seed)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-        )
-        for seed in (1, 2)
-    ]
-    errors = [process.communicate(timeout=300)[1].decode() for process in both]
-    assert sorted(process.returncode for process in both) == [0, 2], errors
-    kept = int(both[1].returncode == 0)
-    assert errors[1 - kept].count("error:") == 1
-    whole = run(recording, tmp_path / "whole", 1 + kept)
-    assert content(out) == content(whole.path)
-    assert names(tmp_path) == ["run", "whole"]
-
-
 def test_a_writer_in_the_same_process_is_another_writer(recording, tmp_path):
     with RecordingWriter(tmp_path / "a", recording.frames[0].camera) as writer:
         with pytest.raises(InputError, match="another process"):
@@ -196,29 +167,10 @@ def test_the_cache_is_swept(tmp_path):
 # What is removed on request
 
 
-def test_a_demo_replaces_demos_only(recording, tmp_path, capsys):
-    """Entries with the names of a demo are not enough: each of them must be what a demo writes."""
-    out = tmp_path / "out"
-    shutil.copytree(recording.path, out / "recording")
-    before = content(tmp_path)
-    assert "not of a demo: recording" in call("demo", "--out", out, capsys=capsys)[2]
-    run(recording, out / "run")
-    with_run = content(tmp_path)
-    code, _, err = call("demo", "--out", out, capsys=capsys)
-    assert code == 2 and "not of a demo: recording" in err
-    (out / "run" / "notes.txt").write_text("x")
-    assert "not of a demo: run/notes.txt" in call("demo", "--out", out, capsys=capsys)[2]
-    assert before.items() <= content(tmp_path).items() and with_run.items() <= content(tmp_path).items()
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "report.html").write_text("my thesis")
-    assert call("demo", "--out", tmp_path / "mine", capsys=capsys)[0] == 2
-    assert (tmp_path / "mine" / "report.html").read_text() == "my thesis"
-
-
 def test_a_run_is_replaced_after_the_first_step_only(recording, tmp_path):
     kept = content(run(recording, tmp_path / "run").path)
 
-    def interrupt(progress):
+    def interrupt(done, total):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -274,25 +226,6 @@ def test_a_stopped_run_drops_damaged_pauses(recording, tmp_path):
     with pytest.warns(InputWarning, match=r"pause 0 is damaged: SHA256SUMS is missing"):
         run(recording, path)
     assert content(path) == whole
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [("seed", "seed 2, expected 1"), ("t", "step 2, expected 3"), ("run", "hash of run.json")],
-)
-def test_a_state_of_another_run_is_refused(recording, tmp_path, change, message):
-    path = run(recording, tmp_path / "run").path
-    run(recording, tmp_path / "other", 2)
-    if change == "run":
-        description = json.loads((path / "run.json").read_text())
-        (path / "run.json").write_text(json.dumps({**description, "description": "changed"}))
-    else:
-        source = tmp_path / "other" / "pauses" / "002" if change == "seed" else path / "pauses" / "001"
-        shutil.copytree(source, path / "pauses" / "002", dirs_exist_ok=True)
-    before = content(path)
-    with pytest.raises(InputError, match=message):
-        run(recording, path)
-    assert content(path) == before
 
 
 def test_check_names_damaged_files(recording, tmp_path, capsys):

@@ -47,8 +47,6 @@ class CobBoundary(BoundaryModel, UsesFiles):
         Input of the model. HHA is computed from depth (`hha`).
     scale : {"fine", "coarse", "mean"}
         Which output is the boundary map.
-    sha256 : str
-        Expected hash of the file; empty: not compared.
     table_height : float
         Height of the table above the ground in metres, for HHA.
     """
@@ -56,7 +54,6 @@ class CobBoundary(BoundaryModel, UsesFiles):
     weights: str = ""
     input: Literal["rgb", "rgbhha"] = "rgb"
     scale: Literal["fine", "coarse", "mean"] = "fine"
-    sha256: str = ""
     table_height: Annotated[float, Bounds(at_least=0, unit="number of metres")] = 0.7
 
     @property
@@ -100,7 +97,7 @@ class CobBoundary(BoundaryModel, UsesFiles):
         return maps[0], maps[1], decode_orientation(maps[2:])
 
     def _network(self) -> Any:
-        path, digest = weights_file(self.weights, *_SOURCE, self.sha256)
+        path, digest = weights_file(self.weights, *_SOURCE)
         return _load(digest, path, self.input)
 
 

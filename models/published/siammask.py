@@ -49,8 +49,6 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
         `threshold` and of these are those of the configuration for DAVIS; for VOT they are 0.3, 0.04, 0.42 and 0.25.
     step : int
         Every `step`-th frame is used, and the last one; 3 in the authors' program of MST.
-    sha256 : str
-        Expected hash of the file; empty: not compared.
     """
 
     weights: str = ""
@@ -59,7 +57,6 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
     window: Share = 0.4
     rate: Share = 1.0
     step: PositiveInt = 1
-    sha256: str = ""
 
     def check_files(self, recording: Recording) -> None:
         """Load the weights."""
@@ -82,7 +79,7 @@ class SiamMaskTracker(MaskTracker, UsesFiles):
 
     def _network(self) -> tuple[Any, str]:
         where = "https://github.com/foolwood/SiamMask"
-        path, digest = weights_file(self.weights, "SiamMask", where, self.sha256)
+        path, digest = weights_file(self.weights, "SiamMask", where)
         return _load(path, digest), digest
 
 

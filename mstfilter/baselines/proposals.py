@@ -22,6 +22,9 @@ from mstfilter.scoring import connected_components, one_blob
 from mstfilter.segmentation import ObjectRule, TreeCutProposal, complete_segments, hypothesis_of
 from mstfilter.smc import Population, Proposal, child
 
+_MIN_VOXELS = 8  # smallest component of the occupied space
+_MAX_STEP = 0.02  # metres between the depths of connected pixels
+
 
 @dataclass(frozen=True)
 class FirstPause(Proposal):
@@ -42,55 +45,56 @@ class FirstPause(Proposal):
 
 
 @dataclass(frozen=True)
-class OneBlob(Proposal):
-    """One object: everything above the table, completed; voxels of probability `threshold` or more are occupied."""
+class Floor(Proposal):
+    """A floor.
 
-    completer: Completer = field(default_factory=Extrude)
-    objects: ObjectRule = field(default_factory=ObjectRule)
-    threshold: float = 0.5
-
-    properly_weighted: ClassVar[bool] = False
-
-    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        labels = one_blob(_occupied(self, rng, observation))
-        return Population((Hypothesis.from_labels(labels, observation.grid, observation.index),) * n)
-
-
-@dataclass(frozen=True)
-class OccupiedComponents(Proposal):
-    """Connected components of at least `min_voxels` voxels of the occupied space; other fields as in `OneBlob`."""
-
-    completer: Completer = field(default_factory=Extrude)
-    objects: ObjectRule = field(default_factory=ObjectRule)
-    threshold: float = 0.5
-    min_voxels: int = 8
-
-    properly_weighted: ClassVar[bool] = False
-
-    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        labels = connected_components(_occupied(self, rng, observation))
-        kept = np.bincount(labels.ravel()) >= self.min_voxels
-        kept[0] = False
-        numbers = np.where(kept, np.cumsum(kept), 0)
-        return Population(
-            (Hypothesis.from_labels(numbers[labels].astype(np.uint16), observation.grid, observation.index),) * n
-        )
-
-
-@dataclass(frozen=True)
-class ImageComponents(Proposal):
-    """Connected components of the image above the support plane, each completed.
-
-    ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
-    than `max_step` metres are not connected. Other fields are as in `OneBlob`.
+    Parameters
+    ----------
+    completer : Completer
+    objects : ObjectRule
+        Decides which pixels are above the table.
+    threshold : float
+        Smallest probability of an occupied voxel.
     """
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
     threshold: float = 0.5
-    max_step: float = 0.02
 
     properly_weighted: ClassVar[bool] = False
+
+    def occupied(self, rng: np.random.Generator, clip: Clip) -> np.ndarray:
+        """Labels (X, Y, Z), 1 in the completed space above the table."""
+        own = self.objects.object_pixels(clip.after, clip.grid)
+        completed = self.completer.complete(child(rng, "completion"), clip.after, [own], clip.grid)
+        return hypothesis_of(completed, clip.grid, clip.index, self.threshold).labels
+
+
+@dataclass(frozen=True)
+class OneBlob(Floor):
+    """One object: everything above the table, completed. Parameters: `Floor`."""
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        labels = one_blob(self.occupied(rng, observation))
+        return Population((Hypothesis.from_labels(labels, observation.grid, observation.index),) * n)
+
+
+@dataclass(frozen=True)
+class OccupiedComponents(Floor):
+    """Connected components of at least 8 voxels of the occupied space. Parameters: `Floor`."""
+
+    def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
+        labels = _largest(connected_components(self.occupied(rng, observation)), _MIN_VOXELS).astype(np.uint16)
+        return Population((Hypothesis.from_labels(labels, observation.grid, observation.index),) * n)
+
+
+@dataclass(frozen=True)
+class ImageComponents(Floor):
+    """Connected components of the image above the support plane, each completed.
+
+    ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
+    than 2 cm are not connected. Parameters: `Floor`.
+    """
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         frame, grid = observation.after, observation.grid
@@ -110,20 +114,17 @@ class ImageComponents(Proposal):
         first, second = [], []
         for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
             with np.errstate(invalid="ignore"):
-                joined = own[a] & own[b] & (np.abs(frame.depth[a] - frame.depth[b]) <= self.max_step)
+                joined = own[a] & own[b] & (np.abs(frame.depth[a] - frame.depth[b]) <= _MAX_STEP)
             first.append(pixel[a][joined])
             second.append(pixel[b][joined])
         edges = np.concatenate(first), np.concatenate(second)
         graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(own.size, own.size))
         part = connected_components(graph, directed=False)[1].reshape(own.shape)
-        sizes = np.bincount(part[own], minlength=int(part.max()) + 1)
-        kept = sizes >= max(1.0, scaled_area(self.objects.min_points, own.size))
-        numbers = np.where(kept, np.cumsum(kept), 0)
-        return np.where(own, numbers[part], 0).astype(np.int32)
+        return _largest(np.where(own, part + 1, 0), scaled_area(self.objects.min_points, own.size)).astype(np.int32)
 
 
-def _occupied(rule: OneBlob | OccupiedComponents, rng: np.random.Generator, clip: Clip) -> np.ndarray:
-    """Labels (X, Y, Z), 1 in the completed space above the table."""
-    own = rule.objects.object_pixels(clip.after, clip.grid)
-    completed = rule.completer.complete(child(rng, "completion"), clip.after, [own], clip.grid)
-    return hypothesis_of(completed, clip.grid, clip.index, rule.threshold).labels
+def _largest(labels: np.ndarray, least: float) -> np.ndarray:
+    """Labels that have at least `least` places, numbered from 1 in the same order; 0 elsewhere."""
+    kept = np.bincount(labels.ravel()) >= max(1.0, least)
+    kept[0] = False
+    return np.where(kept, np.cumsum(kept), 0)[labels]

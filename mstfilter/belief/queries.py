@@ -11,10 +11,10 @@
 Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
 compares them, and renaming them changes no result. Probabilities of voxels also use how sure a hypothesis is of each
 (`Hypothesis.occupancy`); queries of segmentations and actions use the labels. Voxels are integer indices (x, y, z);
-`Belief.voxel` and `Belief.box` convert metres. Pixels are (column, row). A region is a bool array of the grid's
+`Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
 shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
 
-**Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. Its
+**Information.** Every action (look from a camera, push) has one outcome under each hypothesis. Its
 expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
 weights summed over equal outcomes, at most `partition_entropy()`, which is at most log n. It measures only what the
 hypotheses disagree on; errors that all of them share do not appear. Outcomes that differ in one voxel are different.
@@ -39,7 +39,7 @@ from mstfilter.belief.information import (
     outcome_information,
     partition_distance,
 )
-from mstfilter.errors import InputError, check_component, check_integer, check_number
+from mstfilter.errors import InputError, check_component, check_number
 from mstfilter.lazy import late
 from mstfilter.scene import (
     Camera,
@@ -143,29 +143,6 @@ class Belief:
             )
         return index
 
-    def box(self, lower: Any, upper: Any) -> np.ndarray:
-        """Voxels (X, Y, Z) bool with centres in the box between two corners (3,) in metres."""
-        lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-        if lower.shape != (3,) or upper.shape != (3,):
-            raise InputError(f"corners of a box have shapes {lower.shape} and {upper.shape}, expected (3,) in metres")
-        centres = self.grid.centres()
-        inside = ((centres >= lower) & (centres <= upper)).all(axis=-1)
-        if not inside.any():
-            raise InputError(
-                f"the box from {lower.tolist()} to {upper.tolist()} m holds the centre of no voxel",
-                _extent(self.grid),
-            )
-        return inside
-
-    def _region(self, region: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Cells with voxels in a region, and the number of these voxels; None is the whole grid."""
-        counts = self._refined.sizes
-        if region is not None:
-            inside = self._refined.cells.ravel()[_flat_region(self.grid, region)]
-            counts = np.bincount(inside, minlength=len(counts))
-        cells = np.flatnonzero(counts)
-        return cells, counts[cells]
-
     # Probabilities --------------------------------------------------------------------------------------------
 
     def occupancy(self) -> np.ndarray:
@@ -175,10 +152,6 @@ class Belief:
         """
         shares = [h.shares.probability for h in self._merged[0]]
         return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
-
-    def occupancy_entropy(self) -> np.ndarray:
-        """Entropy (X, Y, Z) of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, p the `occupancy`."""
-        return binary_entropy(self.occupancy())
 
     def same_object(self, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two voxels belong to the same object.
@@ -209,13 +182,9 @@ class Belief:
         same = [(image[a] == image[b]) & (image[a] > 0) for image in images]
         return np.tensordot(self._mass, np.stack(same), axes=1)
 
-    def object_count(self, region: Any = None) -> np.ndarray:
-        """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``.
-
-        With a region, only objects with a voxel in it count.
-        """
-        count = np.cumsum(self._refined.objects_in(self._region(region)[0]))
-        return np.bincount(np.diff(count[self._refined.first]), self._mass)
+    def object_count(self) -> np.ndarray:
+        """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``."""
+        return np.bincount(np.diff(self._refined.first), self._mass)
 
     # Boundaries and entropy -----------------------------------------------------------------------------------
 
@@ -223,8 +192,8 @@ class Belief:
         """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
 
         A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
-        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
-        (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
+        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included:
+        H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
         for axis in range(3):
@@ -244,27 +213,17 @@ class Belief:
         entropy[differ] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
         return entropy
 
-    def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
-        """Entropy of the segmentation of a region (default: the whole grid).
+    def partition_entropy(self, tolerance: float = 0.0) -> float:
+        """Entropy of the segmentation.
 
-        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s of the region. This is also
-        the information of the true segmentation of the region. Without region and tolerance it is an upper bound of
-        the information of every outcome that the labels determine. The distance for the tolerance is
-        `information.partition_distance`.
+        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s. This is also the information
+        of the true segmentation. Without tolerance it is an upper bound of the information of every outcome that the
+        labels determine. The distance for the tolerance is `information.partition_distance`.
         """
-        cells, sizes = self._region(region)
-        rows = canonical_rows(self._refined.objects[:, cells])
-        return outcome_information(self._mass, rows, partition_distance, sizes, tolerance)
+        rows = canonical_rows(self._refined.objects)
+        return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
 
     # Expected information of actions --------------------------------------------------------------------------
-
-    def look_information(self, region: Any, tolerance: float = 0.0) -> float:
-        """Information of the occupancy of a region, occluded voxels included.
-
-        Outcome: ``{v in region: L_i(v) > 0}``. For one voxel of certain hypotheses this is `occupancy_entropy`.
-        """
-        cells, sizes = self._region(region)
-        return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
         """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` is faster.
@@ -284,7 +243,8 @@ class Belief:
         Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects with a voxel in the region.
         Further objects that these objects push are left out.
         """
-        moved = self._refined.objects_in(self._region(region)[0])[self._refined.objects]
+        cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
+        moved = self._refined.objects_in(cells)[self._refined.objects]
         return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
 
     def push_map(self, tolerance: float = 0.0) -> np.ndarray:
@@ -314,24 +274,7 @@ class Belief:
         best = int(np.argmax(values)) if values else 0
         return actions[best] if values and values[best] >= at_least else None
 
-    def best_push(self, tolerance: float = 0.0, where: Any = None, at_least: float = 1e-9) -> np.ndarray | None:
-        """Voxel (3,) at which a push has the largest information (`push_map`).
-
-        `where` is a region that the finger can reach; default: all voxels. None if no push has `at_least` nats.
-        """
-        information = self.push_map(tolerance).ravel()
-        reachable = np.arange(information.size) if where is None else _flat_region(self.grid, where)
-        if not len(reachable) or information[reachable].max() < at_least:
-            return None
-        best = reachable[int(np.argmax(information[reachable]))]
-        return np.array(np.unravel_index(best, self.grid.shape))
-
     # Functions of the user ------------------------------------------------------------------------------------
-
-    def expect(self, function: Callable[[Hypothesis], Any]) -> Any:
-        """Expectation ``sum_i w_i f(h_i)`` of numbers or arrays, such as the probability that a path is free."""
-        pairs = zip(self.weights, self.hypotheses, strict=True)
-        return sum(w * np.asarray(function(h), dtype=np.float64) for w, h in pairs if w > 0)
 
     def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
         """Information of an action with an outcome that the hypothesis determines.
@@ -346,26 +289,14 @@ class Belief:
             raise InputError(f"outcomes cannot be compared ({error})", "for arrays: array.tobytes()") from error
         return entropy(np.bincount(which, [w for _, w in outcomes]))
 
-    def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
+    def estimate(self) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
-        Default: the loss is 1 - quality (weighted coverage in the form ``objects``). The result is then the best
-        single answer among the hypotheses, if the true scene is distributed as they are.
+        The loss is 1 - quality (weighted coverage in the form ``objects``). The result is the best single answer
+        among the hypotheses, if the true scene is distributed as they are.
         """
         hypotheses, mass = self._merged
-        if loss is None:
-            return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
-        expected = [sum(w * loss(a, b) for b, w in zip(hypotheses, mass, strict=True)) for a in hypotheses]
-        return hypotheses[int(np.argmin(expected))]
-
-    def reweighted(self, log_likelihood: Callable[[Hypothesis], float]) -> Belief:
-        """The belief after an observation: adds ``log p(observation | h_i)`` to the log weights; -inf rules out."""
-        return Belief(self.population.reweighted(np.array([float(log_likelihood(h)) for h in self.hypotheses])))
-
-    def sample(self, rng: np.random.Generator, n: int = 1) -> tuple[Hypothesis, ...]:
-        """n independent draws, each ``h_i`` with probability ``w_i``."""
-        check_integer("number of samples", n)
-        return tuple(self.hypotheses[int(k)] for k in rng.choice(len(self), size=n, p=self.weights))
+        return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)

@@ -37,9 +37,7 @@ Options = Annotated[
 ]
 Pauses = Annotated[
     str,
-    typer.Option(
-        metavar="RULE", help="Pauses of a video: still, ends, every, frames 0,40,85, seconds 0s,4.2s, a file."
-    ),
+    typer.Option(metavar="RULE", help="Pauses of a video: still, ends, every, frames 0,40,85, seconds 0s,4.2s."),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random streams.")]
 
@@ -65,16 +63,14 @@ def safe_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "recording"
 
 
-def read_source(path: Path, format: str, options: list[str] | None, pauses: str, frames: str = "") -> Any:
+def read_source(path: Path, format: str, options: list[str] | None, pauses: str) -> Any:
     """Open a recording of any format."""
-    from mstfilter.formats import open_recording
-
-    names = ",".join(name.strip() for name in frames.split(",") if name.strip())
-    chosen = [*(options or []), *([f"frames={names},"] if names else [])]
     from rich.console import Console
 
+    from mstfilter.formats import open_recording
+
     with Console(stderr=True).status(f"reading {path.name}"):  # shown on a terminal only
-        return open_recording(path, format, chosen, pauses)
+        return open_recording(path, format, options or (), pauses)
 
 
 def print_summary(numbers: RunNumbers) -> None:

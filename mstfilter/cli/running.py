@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any
 
 import typer
@@ -23,11 +23,10 @@ from mstfilter.cli.root import (
     safe_name,
 )
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, check_output, locked, other_files, write_csv
+from mstfilter.files import atomic_folder, check_output, locked, write_csv
 from mstfilter.report.progress import progress_bar
 
 _DEMO = "occlusion"  # the family of the demo
-_SIMULATOR = "mstfilter.simulation"  # the generator in the manifest of a simulated recording
 
 
 @app.command()
@@ -42,7 +41,6 @@ def run(
     format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
-    frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
     report: Annotated[bool, typer.Option(help="Write report.html into the run folder.")] = True,
     compare: Annotated[
         bool, typer.Option("--compare", help="Also run the filter without past and on single frames, for the report.")
@@ -67,7 +65,7 @@ def run(
         check_run_folder(out, replace)
     else:
         check_output(Path("runs"), folder=True, empty=False)
-    source = read_source(recording, format, option, pauses, frames)
+    source = read_source(recording, format, option, pauses)
     name = Path(preset).stem
     folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
     _execute_all(source, configs, folder, seed, replace)
@@ -84,9 +82,7 @@ def run(
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path, typer.Option(help="Folder for recording, run and report; an earlier demo there is replaced.")
-    ] = Path("demo"),
+    out: Annotated[Path, typer.Option(help="New folder for recording, run and report.")] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
     """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
@@ -95,9 +91,8 @@ def demo(
     from mstfilter.report import read_numbers, write_report
     from mstfilter.runs import RunFolder, compared_configs
 
-    check_output(out, folder=True, empty=False)
-    with locked(out), atomic_folder(out, "replace") as work:
-        _check_earlier_demo(out)
+    check_output(out, folder=True)
+    with locked(out), atomic_folder(out) as work:
         _simulate(_DEMO, work / "recording", seed)
         recording, config = open_recording(work / "recording"), load_config("mst")
         _execute_all(recording, {"": config} | compared_configs(config), work / "run", 0)
@@ -107,23 +102,6 @@ def demo(
     for name, file in (("recording", "recording"), ("run", "run"), ("report", "report.html")):
         print(f"{name:<12}{out / file}")
     print_summary(numbers)
-
-
-def _check_earlier_demo(out: Path) -> None:
-    """Raise InputError unless a folder is missing, empty, or of a demo and contains nothing else."""
-    from mstfilter.formats import RECORDING_FILES, open_recording
-    from mstfilter.runs import RUN_FILES
-
-    own = re.compile(rf"recording/({RECORDING_FILES.pattern})|run/({RUN_FILES.pattern})|report\.html")
-    others = other_files(out, own)
-    if not others and out.exists() and any(out.iterdir()):
-        source = open_recording(out / "recording", "recording").manifest
-        if source.get("generator") != _SIMULATOR or dict(source.get("family", {})).get("name") != _DEMO:
-            others.append("recording")
-    if others:
-        raise InputError(
-            f"{out} holds something that is not of a demo: {others[0]}", "choose another folder with --out"
-        )
 
 
 @app.command("simulate")
@@ -207,13 +185,12 @@ def convert(
     format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
-    frames: Annotated[str, typer.Option(help="Frames of a folder of pairs, separated by commas.")] = "",
 ) -> None:
     """Convert data of another format to a recording folder; a stopped or failed conversion leaves no folder."""
     from mstfilter.formats import save_recording
 
     check_output(out, folder=True)
-    recording = read_source(source, format, option, pauses, frames)
+    recording = read_source(source, format, option, pauses)
     generator = recording.manifest.get("generator") or f"converted from {source.name}"
     try:
         with progress_bar("convert") as advance:
@@ -236,8 +213,6 @@ def quality(
     option: Options = None,
 ) -> None:
     """Score the hypotheses of a run and trivial baselines against the ground truth."""
-    from statistics import fmean
-
     if csv is not None:
         check_output(csv)
     from mstfilter.runs import RunFolder
@@ -251,23 +226,28 @@ def quality(
         write_csv(csv, [asdict(row) for row in rows], float_format=".6f")
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")
     print(f"{'pause':<7}{'form':<9}{'n':>4}" + "".join(f"{name:>12}" for name in names))
+    forms = list(dict.fromkeys(row.form for row in rows))
     for row in rows:
-        print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + "".join(f"{getattr(row, name):>12.3f}" for name in names))
-    for form in dict.fromkeys(row.form for row in rows):
-        these = [row for row in rows if row.form == form]
-        print(f"{'all':<7}{form:<9}{'':>4}" + "".join(f"{fmean(getattr(r, n) for r in these):>12.3f}" for n in names))
+        print(f"{row.pause:<7}{row.form:<9}{row.n:>4}" + _numbers([row], names, 12))
+    for form in forms:
+        print(f"{'all':<7}{form:<9}{'':>4}" + _numbers([row for row in rows if row.form == form], names, 12))
     if rows[0].brier == rows[0].brier:
         print("\nthe weighted set, asked whether two voxels belong to one object (lower is better)")
         scores = ("log_loss", "base_rate", "brier", "calibration_error", "energy")
-        these = [row for row in rows if row.form == rows[0].form]
+        these = [row for row in rows if row.form == forms[0]]
         print(f"{'pause':<7}" + "".join(f"{name:>19}" for name in scores))
         for row in these:
-            print(f"{row.pause:<7}" + "".join(f"{getattr(row, name):>19.3f}" for name in scores))
-        print(f"{'all':<7}" + "".join(f"{fmean(getattr(r, n) for r in these):>19.3f}" for n in scores))
+            print(f"{row.pause:<7}" + _numbers([row], scores, 19))
+        print(f"{'all':<7}" + _numbers(these, scores, 19))
         print("base_rate is the log loss of a forecast that knows only how often the answer is yes. The scores are")
         print("those of the forecasts as they come: only studies have other scenes to recalibrate them on.")
     if rows[0].where == "image":
         print("scored in the image: hypotheses are projected, hidden parts do not count")
+
+
+def _numbers(rows: Sequence[Any], names: Sequence[str], width: int) -> str:
+    """The mean of each column over rows, as cells of a table."""
+    return "".join(f"{fmean(getattr(row, name) for row in rows):>{width}.3f}" for name in names)
 
 
 def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) -> None:
@@ -296,7 +276,7 @@ def _execute_all(
                 seed,
                 replace=replace and not name,
                 allow_files=True,
-                progress=lambda p, advance=advance: advance(p.done, p.total),  # type: ignore[misc]
+                progress=advance,
             )
 
 

@@ -21,13 +21,11 @@ __components__ = {
         "tum": "Tum",
         "bop": "Bop",
         "redwood": "Redwood",
-        "dsr": "Dsr",
         "bag": "Bag",
     },
     "pauses": {
         "still": "Still",
         "at": "At",
-        "listed": "Listed",
         "ends": "Ends",
         "every": "EveryNth",
     },

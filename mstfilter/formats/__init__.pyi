@@ -1,7 +1,6 @@
 from mstfilter.formats.bag import Bag as Bag
-from mstfilter.formats.datasets import Bop as Bop, Dsr as Dsr
+from mstfilter.formats.bop import Bop as Bop
 from mstfilter.formats.folder import (
-    RECORDING_FILES as RECORDING_FILES,
     RecordingFolder as RecordingFolder,
     RecordingWriter as RecordingWriter,
     save_recording as save_recording,
@@ -11,7 +10,6 @@ from mstfilter.formats.pauses import (
     At as At,
     Ends as Ends,
     EveryNth as EveryNth,
-    Listed as Listed,
     Still as Still,
 )
 from mstfilter.formats.sources import detect_format as detect_format, open_recording as open_recording

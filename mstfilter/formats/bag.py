@@ -31,7 +31,7 @@ from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
-from mstfilter.scene import Recording, decode_image
+from mstfilter.scene import decode_image
 
 MAX_CHUNK = 2**28  #: Largest chunk of a bag when it is unpacked, in bytes
 
@@ -294,18 +294,12 @@ class Bag(VideoFormat):
         Colour topic. Default: the only one.
     depth : str
         Depth topic. Default: the only one that is registered to colour.
-    info : str
-        CameraInfo topic. Default: ``camera_info`` beside the colour topic.
-    tolerance_s : float
-        Largest difference of the time stamps of a colour and a depth image of one frame.
     registered : bool
         Treat depth as registered to colour although its frame_id or camera matrix differs.
     """
 
     colour: str = ""
     depth: str = ""
-    info: str = ""
-    tolerance_s: float = 0.02
     registered: bool = False
 
     @classmethod
@@ -314,7 +308,7 @@ class Bag(VideoFormat):
             return path.suffix in (".bag", ".mcap", ".db3")
         return (path / "metadata.yaml").is_file()
 
-    def open(self, path: Path) -> Recording:
+    def video(self, path: Path) -> Video:
         bag = BagFile(path)
         kinds = ((_IMAGE, False), (_COMPRESSED, True))
         streams = [_stream(bag, name, n, packed) for kind, packed in kinds for name, n in bag.topics(kind).items()]
@@ -338,7 +332,7 @@ class Bag(VideoFormat):
             message, where = bag.message(depth.name, entries[1][k]), f"depth message {k} of {depth.name}"
             return depth_image(message, depth.compressed, self.depth_scale, where)
 
-        video = Video(
+        return Video(
             path.resolve().stem,
             tuple(stamps[0][i] for i, _ in pairs),
             read_rgb,
@@ -348,7 +342,6 @@ class Bag(VideoFormat):
             self.depth_scale if depth.encoding != "32FC1" else 0.00025,
             distortion=distortion,
         )
-        return self.recording_of(video)
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
         found = [s for s in streams if s.encoding in _DEPTH]
@@ -372,33 +365,28 @@ class Bag(VideoFormat):
     ) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """fx, fy, cx, cy and the distortion of the colour image."""
         if self.K:
-            return self.K, ()
-        infos, usual = bag.topics(_INFO), colour.info
-        if self.info and self.info not in infos:
+            return self.K, self.distortion
+        infos, name = bag.topics(_INFO), colour.info
+        if name not in infos:
             raise InputError(
-                f"{bag.path}: no CameraInfo topic {self.info!r}", f"there are: {', '.join(infos) or 'none'}"
-            )
-        name = self.info or (usual if usual in infos else "")
-        if not name:
-            raise InputError(
-                f"{bag.path}: intrinsics are missing, there is no {usual} for {colour.name}",
-                f"choose one: info=TOPIC, of {', '.join(infos)}" if infos else "give them: K=fx,fy,cx,cy",
+                f"{bag.path}: intrinsics are missing, there is no {name} for {colour.name}",
+                "give them: K=fx,fy,cx,cy, and distortion=k1,k2,p1,p2,k3 if the images are distorted",
             )
         matrix, distortion, size = _camera_info(bag, name, "rect" in colour.name)
         if size[0] and size != colour.size:
             raise InputError(
                 f"{bag.path}: {name} is of images of {size[0]} x {size[1]}, {colour} is not",
-                "choose the CameraInfo of the colour camera: info=TOPIC",
+                "give the matrix of these images: K=fx,fy,cx,cy",
             )
         other = depth.info
-        if not self.registered and not self.info and other in infos and other != name:
+        if not self.registered and other in infos and other != name:
             of_depth, _, size = _camera_info(bag, other, "rect" in depth.name)
             if size[0] and not np.allclose(of_depth, matrix, atol=1.0):
                 raise InputError(
                     f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour",
                     "record the aligned depth; or, if it is registered: registered=true",
                 )
-        return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), distortion
+        return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), self.distortion or distortion
 
 
 def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:

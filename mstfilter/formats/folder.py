@@ -25,7 +25,6 @@ a temporary name and renamed when it is complete: if writing fails, no file rema
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mstfilter.errors import InputError, naming
-from mstfilter.files import SUMS, atomic_folder, check_output, locked, reading, write_sums, writing
+from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat, check_images
 from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
@@ -60,9 +59,6 @@ from mstfilter.scene import (
 )
 
 VERSION = 1  #: Version of the layout
-RECORDING_FILES = re.compile(  #: paths in a recording folder
-    rf"(manifest|camera|poses)\.json|voxels\.npz|{SUMS}|(rgb|depth|instance|robot)/\d{{6}}\.png"
-)
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -334,75 +330,73 @@ class RecordingFolder(RecordingFormat):
         return (path / "manifest.json").is_file()
 
     def open(self, path: Path) -> Recording:
-        return _open(path, self.pauses)
+        if not path.is_dir():
+            raise InputError(f"recording folder does not exist: {path}")
+        if not any(path.iterdir()):
+            raise InputError(
+                f"recording folder is empty: {path}",
+                *_HINTS,
+            )
+        manifest, manifest_data = _load(path / "manifest.json", _Manifest)
+        camera_file, _ = _load(path / "camera.json", _CameraFile)
+        entries, scale = manifest.frames, camera_file.depth_scale
 
+        with reading(path / "camera.json", "a recording"):
+            camera = camera_file.camera
+            grid = None if camera_file.workspace is None else camera_file.workspace.grid
+        times = tuple(e.time_s for e in entries)
+        marked = tuple(e.index for e in entries if e.role == "static")
+        if self.pauses is not None:
+            marked = self.pauses.find(times, lambda index: read_rgb(path / "rgb" / f"{index:06d}.png"))
+        if not marked:
+            raise InputError(
+                f"{path / 'manifest.json'}: no frame has role static, so there is no pause to segment",
+                "give the pauses: --pauses still, or --pauses 0,40,85 (frames)",
+            )
 
-def _open(path: Path, pauses: PauseRule | None) -> Recording:
-    if not path.is_dir():
-        raise InputError(f"recording folder does not exist: {path}")
-    if not any(path.iterdir()):
-        raise InputError(
-            f"recording folder is empty: {path}",
-            *_HINTS,
-        )
-    manifest, manifest_data = _load(path / "manifest.json", _Manifest)
-    camera_file, _ = _load(path / "camera.json", _CameraFile)
-    entries, scale = manifest.frames, camera_file.depth_scale
+        poses = {
+            e.index: rigid_from_matrix(
+                e.T_world_camera, f"{path / 'manifest.json'}: T_world_camera of frame {e.index}"
+            )
+            for e in entries
+            if e.T_world_camera is not None
+        }
 
-    with reading(path / "camera.json", "a recording"):
-        camera = camera_file.camera
-        grid = None if camera_file.workspace is None else camera_file.workspace.grid
-    times = tuple(e.time_s for e in entries)
-    marked = tuple(e.index for e in entries if e.role == "static")
-    if pauses is not None:
-        marked = pauses.find(times, lambda index: read_rgb(path / "rgb" / f"{index:06d}.png"))
-    if not marked:
-        raise InputError(
-            f"{path / 'manifest.json'}: no frame has role static, so there is no pause to segment",
-            "give the pauses: --pauses still, or --pauses 0,40,85 (frames)",
-        )
+        def read(index: int, view: Camera) -> Frame:
+            name = f"{index:06d}.png"
+            rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, scale)
+            check_images(rgb, depth, view, scale, f"frame {index} of {path}")
+            robot_path = path / "robot" / name
+            robot = read_labels(robot_path) > 0 if robot_path.exists() else None
+            return Frame(rgb, depth, view, robot)
 
-    poses = {
-        e.index: rigid_from_matrix(e.T_world_camera, f"{path / 'manifest.json'}: T_world_camera of frame {e.index}")
-        for e in entries
-        if e.T_world_camera is not None
-    }
+        if camera.T_world_camera is None or grid is None:
+            first = marked[0]
+            camera, grid = find_world(read(first, camera.at(poses[first]) if first in poses else camera), grid)
 
-    def read(index: int, view: Camera) -> Frame:
-        name = f"{index:06d}.png"
-        rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, scale)
-        check_images(rgb, depth, view, scale, f"frame {index} of {path}")
-        robot_path = path / "robot" / name
-        robot = read_labels(robot_path) > 0 if robot_path.exists() else None
-        return Frame(rgb, depth, view, robot)
+        def read_posed(index: int) -> Frame:
+            return read(index, camera.at(poses[index]) if index in poses else camera)
 
-    if camera.T_world_camera is None or grid is None:
-        first = marked[0]
-        camera, grid = find_world(read(first, camera.at(poses[first]) if first in poses else camera), grid)
+        def read_instance(index: int) -> np.ndarray | None:
+            file = path / "instance" / f"{index:06d}.png"
+            return read_labels(file) if file.exists() else None
 
-    def read_posed(index: int) -> Frame:
-        return read(index, camera.at(poses[index]) if index in poses else camera)
-
-    def read_instance(index: int) -> np.ndarray | None:
-        file = path / "instance" / f"{index:06d}.png"
-        return read_labels(file) if file.exists() else None
-
-    truth, true_poses = path / "voxels.npz", path / "poses.json"
-    true_volumes = _read_voxels(truth, grid, marked) if truth.exists() else lambda t: None
-    with naming(str(path / "manifest.json")):
-        return Recording(
-            LazyFrames(read_posed, len(entries)),
-            grid,
-            marked,
-            times,
-            name=str(manifest_data.get("name") or path.name),
-            depth_scale=scale,
-            path=path,
-            manifest=manifest_data,
-            truth=true_volumes,
-            instance=read_instance,
-            poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
-        )
+        truth, true_poses = path / "voxels.npz", path / "poses.json"
+        true_volumes = _read_voxels(truth, grid, marked) if truth.exists() else lambda t: None
+        with naming(str(path / "manifest.json")):
+            return Recording(
+                LazyFrames(read_posed, len(entries)),
+                grid,
+                marked,
+                times,
+                name=str(manifest_data.get("name") or path.name),
+                depth_scale=scale,
+                path=path,
+                manifest=manifest_data,
+                truth=true_volumes,
+                instance=read_instance,
+                poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
+            )
 
 
 def _read_poses(path: Path) -> Any:

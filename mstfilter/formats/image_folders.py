@@ -21,7 +21,7 @@ from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
 from mstfilter.reading import read_json, read_text
-from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb, rigid_from_matrix, table_residual
+from mstfilter.scene import Frame, Recording, read_labels, rigid_from_matrix, table_residual
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,9 @@ class PairedImages(RecordingFormat):
             raise InputError(
                 f"no frame {missing[0]!r} in {path}", f"there are {len(present)}: {', '.join(present[:8])}, ..."
             )
-        video = Video(
-            chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}",
-            tuple(float(k) for k in range(len(chosen))),
-            lambda index: read_rgb(path / f"{chosen[index]}_rgb.png"),
-            lambda index: read_depth(path / f"{chosen[index]}_depth.png", scale),
-            K,
-            path,
-            scale,
-        )
+        pairs = [(path / f"{name}_rgb.png", path / f"{name}_depth.png") for name in chosen]
+        title = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
+        video = Video.of_files(title, tuple(float(k) for k in range(len(chosen))), pairs, K, path, scale)
         made = video.recording(EveryNth(), KnownWorld())
 
         def instance(index: int) -> np.ndarray | None:
@@ -97,6 +91,7 @@ class PairedImages(RecordingFormat):
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_STILL = "remove the file if the camera stands still"
 _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json", "camera_info.yaml")
 
 
@@ -107,7 +102,7 @@ class Redwood(VideoFormat):
     Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix``, column by column. ``camera_info.yaml`` is a message or a calibration file of ROS.
-    Images are paired by the first number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
+    Images are paired by the last number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
     16 bits, or float in metres (.npy, .tif). A trajectory ``.log`` of a moving camera has five lines per frame: three
     numbers, then a 4 x 4 camera-to-world matrix. Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
 
@@ -117,21 +112,12 @@ class Redwood(VideoFormat):
     ----------
     depth_scale : float
         Metres per unit of integer depth. Default: from the file of intrinsics, else 0.001.
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3. Default: from the file of intrinsics, else none.
     fps : float
         Frames per second, if names are no time stamps. Default: from the file of intrinsics, else 30.
-    tolerance_s : float
-        Largest difference of the time stamps of a colour and a depth image of one frame.
-    moving : bool
-        Use the trajectory, if there is one.
     """
 
     depth_scale: float = 0.0
-    distortion: tuple[float, ...] = ()
     fps: float = 0.0
-    tolerance_s: float = 0.02
-    moving: bool = True
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -140,11 +126,11 @@ class Redwood(VideoFormat):
         folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
         return any((path / name).is_dir() for name in folders)
 
-    def open(self, path: Path) -> Recording:
+    def video(self, path: Path) -> Video:
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         colour, depth = _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
-        logs = sorted(path.glob("*.log")) if self.moving else []
+        logs = sorted(path.glob("*.log"))
         if len(logs) > 1:
             raise InputError(
                 f"{path} has {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "remove all but one"
@@ -153,11 +139,10 @@ class Redwood(VideoFormat):
         K = self.K or _stored_matrix(path, file, stored)
         scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
         fps = self.fps or _stored(file, stored, "fps", 30)
-        video = Video(
+        video = Video.of_files(
             path.resolve().name,
             stamps or tuple(k / fps for k in range(len(pairs))),
-            lambda index: read_rgb(pairs[index][0]),
-            lambda index: read_depth(pairs[index][1], scale),
+            pairs,
             K,
             path,
             scale,
@@ -170,7 +155,7 @@ class Redwood(VideoFormat):
                     f"{file} is for images of another {name}: the images have {n}",
                     "scale the intrinsics, or give them: K=fx,fy,cx,cy",
                 )
-        return self.recording_of(video)
+        return video
 
 
 def _is_recording(path: Path) -> bool:
@@ -187,27 +172,25 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     if not files:
         raise InputError(f"{folder} has no image", f"expected {', '.join(suffixes)}")
-    for position in (0, -1):
-        numbers = {file: _number(file, position) for file in files}
-        if len(set(numbers.values())) == len(files):
-            return sorted(files, key=numbers.__getitem__)
-    raise InputError(
-        f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
-        "name them 000000, 000001, ..., or by time in seconds",
-    )
+    if len({_number(file) for file in files}) < len(files):
+        raise InputError(
+            f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
+            "name them 000000, 000001, ..., or by time in seconds",
+        )
+    return sorted(files, key=_number)
 
 
-def _number(file: Path, position: int) -> Decimal:
-    """The first (0) or the last (-1) number in a name; -1 if there is none."""
+def _number(file: Path) -> Decimal:
+    """The last number in a name; -1 if there is none."""
     found = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return Decimal(found[position] if found else -1)
+    return Decimal(found[-1] if found else -1)
 
 
 def _paired(
     path: Path, colour: list[Path], depth: list[Path], tolerance_s: float
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
     """Pairs of files, and the time of each in seconds; no times if names are frame numbers."""
-    numbers = [[_number(file, 0) for file in files] for files in (colour, depth)]
+    numbers = [[_number(file) for file in files] for files in (colour, depth)]
     seconds = [[_seconds(number) for number in side] for side in numbers]
     if all(value is not None for side in seconds for value in side):
         stamps = [[float(value - seconds[0][0]) for value in side] for side in seconds]  # type: ignore[operator]
@@ -304,13 +287,13 @@ def _four(K: Any) -> tuple[float, ...]:
 
 def _trajectory(path: Path, n: int) -> list[RigidTransform]:
     """Camera-to-world poses of a .log file, one per frame."""
-    with reading(path, "a trajectory", "or ignore it: moving=false"):
+    with reading(path, "a trajectory", _STILL):
         lines = read_text(path, "a trajectory").splitlines()
         rows = [[float(v) for v in line.split()] for line in lines if line.strip()]
     if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
         raise InputError(
             f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
-            "or ignore it: moving=false",
+            _STILL,
         )
     return [rigid_from_matrix(np.array(rows[5 * k + 1 : 5 * k + 5]), f"{path}: pose of frame {k}") for k in range(n)]
 
@@ -322,28 +305,16 @@ class Tum(VideoFormat):
     Lines of rgb.txt and depth.txt are ``timestamp filename``, those of groundtruth.txt
     ``timestamp tx ty tz qx qy qz qw``. Depth is in units of 1/5000 m. Format: Sturm et al. 2012.
 
-    Further parameters: `VideoFormat`.
-
-    Parameters
-    ----------
-    distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3.
-    tolerance_s : float
-        Largest difference of the time stamps of a colour and a depth image of one frame.
-    moving : bool
-        Use groundtruth.txt, if it exists.
+    Parameters: `VideoFormat`.
     """
 
     depth_scale: float = 0.0002
-    distortion: tuple[float, ...] = ()
-    tolerance_s: float = 0.02
-    moving: bool = True
 
     @classmethod
     def detects(cls, path: Path) -> bool:
         return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
 
-    def open(self, path: Path) -> Recording:
+    def video(self, path: Path) -> Video:
         colour, depth = (_table(path / name, 2) for name in ("rgb.txt", "depth.txt"))
         if not self.K:
             raise InputError(
@@ -358,18 +329,16 @@ class Tum(VideoFormat):
 
         times = tuple(stamps[0][i] for i, _ in pairs)
         truth = path / "groundtruth.txt"
-        video = Video(
+        return Video.of_files(
             path.resolve().name,
             times,
-            lambda index: read_rgb(path / colour[pairs[index][0]][1]),
-            lambda index: read_depth(path / depth[pairs[index][1]][1], self.depth_scale),
+            [(path / colour[i][1], path / depth[j][1]) for i, j in pairs],
             self.K,
             path,
             self.depth_scale,
-            motion=_motion(truth, times) if self.moving and truth.is_file() else None,
+            motion=_motion(truth, times) if truth.is_file() else None,
             distortion=self.distortion,
         )
-        return self.recording_of(video)
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:
@@ -401,12 +370,13 @@ def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
         stamps = rows[:, 0]
         poses = RigidTransform.from_components(rows[:, 1:4], Rotation.from_quat(rows[:, 4:8]))
     except (ValueError, IndexError) as error:
-        raise InputError(f"{path} does not hold poses: {error}", "or ignore it: moving=false") from error
+        raise InputError(f"{path} does not hold poses: {error}", _STILL) from error
     nearest = [int(np.abs(stamps - t).argmin()) for t in times]
     difference = max(abs(stamps[k] - t) for k, t in zip(nearest, times, strict=True))
     if difference > 0.1:
         raise InputError(
             f"{path}: the nearest pose is {difference:.2f} s from an image, expected at most 0.1 s",
-            "check that it belongs to this recording, or ignore it: moving=false",
+            "check that it belongs to this recording",
+            _STILL,
         )
     return [poses[k] for k in nearest]

@@ -13,14 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, naming
-from mstfilter.fields import NonNegativeFloat, PositiveInt, Share
-from mstfilter.reading import read_text
+from mstfilter.errors import InputError
+from mstfilter.fields import NonNegativeFloat, PositiveInt
 from mstfilter.scene import PauseRule, grey_blocks
 
 
@@ -63,20 +61,6 @@ class At(PauseRule):
         return tuple(sorted({*(i % n for i in self.frames), *nearest}))
 
 
-@dataclass(frozen=True)
-class Listed(PauseRule):
-    """A text file of frame indices, or of seconds that end in ``s``; ``#`` starts a comment."""
-
-    file: str = "pauses.txt"
-
-    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        lines = read_text(Path(self.file), "a file of pauses").splitlines()
-        words = [word for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
-        with naming(self.file):
-            rule = At(**_numbers(words))
-        return rule.find(times, read_rgb)
-
-
 def _numbers(words: list[str]) -> dict[str, Any]:
     try:
         return {
@@ -90,15 +74,14 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 
 
 def pauses_from_text(text: str) -> dict[str, Any]:
-    """The configuration of a rule from the text of a user: the name of a rule, numbers, or the path of a file."""
+    """The configuration of a rule from the text of a user: numbers, or the name of a rule."""
     words = text.replace(",", " ").split()
-    numbers = words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words)
-    if numbers and (len(words) > 1 or not Path(text).is_file()):  # a long list is no path
+    if words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words):
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
-    named = text in _NAMES or not Path(text).is_file()
-    return {"component": text} if named else {"component": "listed", "file": text}
+    return {"component": text}
 
 
+_SHARE = 0.001  # largest share of blocks that differ without motion
 _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if the block never rests
 
 
@@ -125,8 +108,6 @@ class Still(PauseRule):
     ----------
     hold_s : float
         Shortest interval, in seconds.
-    share : float
-        Largest share of blocks that differ without motion.
     levels : float
         Change in grey levels (of 255) from which a block differs, or six times its noise if that is more.
     region : tuple of 4 float
@@ -135,7 +116,6 @@ class Still(PauseRule):
     """
 
     hold_s: NonNegativeFloat = 0.5
-    share: Share = 0.001
     levels: NonNegativeFloat = 3.0
     region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
 
@@ -166,7 +146,7 @@ class Still(PauseRule):
             raise InputError(f"images differ in size: {sorted({image.shape for image in images})} blocks")
         if len(images) == 1:
             return ((0, 0),)
-        limit, allowed = self._limit(images), self.share * images[0].size
+        limit, allowed = self._limit(images), _SHARE * images[0].size
         runs, first = [], 0
         for index in range(1, len(images) + 1):
             if index < len(images) and (_changes(images[first], images[index]) > limit).sum() <= allowed:
@@ -188,6 +168,3 @@ class Still(PauseRule):
         limit = np.clip(6 * np.maximum(quarter, overall), self.levels, None)
         bounded: np.ndarray = np.minimum(limit, max(_MAX_LEVELS * self.levels, 6 * overall))
         return bounded
-
-
-_NAMES = ("still", "ends", "every", "at", "listed")  # a file of such a name is not read as a list of pauses

@@ -11,6 +11,7 @@ of ``formats/pauses.py`` decides where the pauses are.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def open_recording(
 
 
 def pause_rule(text: str) -> PauseRule:
-    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s", or the path of a file."""
+    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s"."""
     rule: PauseRule = _REGISTRY.build("pauses", pauses_from_text(text))
     return rule
 
@@ -105,23 +106,11 @@ def format_settings(options: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_lists(text: str) -> str:
-    """``K=1,2,3`` as ``K=[1, 2, 3]``; words are quoted."""
+    """``K=1,2,3`` as ``K=["1", "2", "3"]``; the type of the field makes numbers of words."""
     path, equals, value = text.partition("=")
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text
-    words = [word.strip() for word in value.split(",") if word.strip()]
-    return f"{path}=[{', '.join(map(_quoted, words))}]"
-
-
-def _quoted(word: str) -> str:
-    """A word as a TOML value; numbers with leading zeros are texts."""
-    try:
-        number = float(word)
-    except ValueError:
-        return repr(word)
-    if word.lstrip("+-").isdigit():
-        return word if str(int(word)) == word else repr(word)
-    return repr(number)
+    return f"{path}={json.dumps([word.strip() for word in value.split(',') if word.strip()])}"
 
 
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".gif")

@@ -1,6 +1,6 @@
 """Videos with depth: the interface of all readers, and what they share.
 
-A reader is a subclass of `RecordingFormat`:
+A reader is a subclass of `RecordingFormat`. One of a video is a `VideoFormat`, which defines ``video(path)``:
 
 >>> reader = Tum(K=(525, 525, 319.5, 239.5))
 >>> if reader.detects(path):
@@ -43,6 +43,8 @@ from mstfilter.scene import (
     VoxelGrid,
     check_depth,
     find_world,
+    read_depth,
+    read_rgb,
     rigid_from_matrix,
 )
 
@@ -142,6 +144,27 @@ class Video:
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
     distortion: tuple[float, ...] = ()  #: OpenCV's k1, k2, p1, p2, k3, ... of both images; they are undistorted
 
+    @classmethod
+    def of_files(
+        cls,
+        name: str,
+        times: tuple[float, ...],
+        pairs: Sequence[tuple[Path, Path]],
+        K: tuple[float, ...],
+        path: Path,
+        depth_scale: float,
+        **more: Any,
+    ) -> Video:
+        """A video with a file of colour and a file of depth for each frame."""
+
+        def rgb(index: int) -> np.ndarray:
+            return read_rgb(pairs[index][0])
+
+        def depth(index: int) -> np.ndarray:
+            return read_depth(pairs[index][1], depth_scale)
+
+        return cls(name, times, rgb, depth, K, path, depth_scale, **more)
+
     def between(self, start_s: float, stop_s: float) -> Video:
         """The frames from `start_s` to `stop_s` seconds after the first."""
         kept = [k for k, t in enumerate(self.times) if start_s <= t - self.times[0] <= stop_s]
@@ -236,6 +259,10 @@ class VideoFormat(RecordingFormat):
         fx, fy, cx, cy in pixels. Default: from the files.
     depth_scale : float
         Metres per unit of 16-bit depth.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2, k3 of both images. Default: from the files, else none.
+    tolerance_s : float
+        Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float
         Part of the video that is used, in seconds after its first frame.
     pauses : PauseRule
@@ -246,14 +273,20 @@ class VideoFormat(RecordingFormat):
 
     K: tuple[float, ...] = ()
     depth_scale: float = 0.001
+    distortion: tuple[float, ...] = ()
+    tolerance_s: float = 0.02
     start_s: float = 0.0
     stop_s: float = math.inf
     pauses: PauseRule = field(default_factory=Still)
     world: KnownWorld = field(default_factory=KnownWorld)
 
-    def recording_of(self, video: Video) -> Recording:
-        """The recording of the part of a video that is used."""
-        return video.between(self.start_s, self.stop_s).recording(self.pauses, self.world)
+    @abstractmethod
+    def video(self, path: Path) -> Video:
+        """All frames of the files, and their calibration. Raises InputError if the data are not valid."""
+
+    def open(self, path: Path) -> Recording:
+        """The recording of the part of the video that is used."""
+        return self.video(path).between(self.start_s, self.stop_s).recording(self.pauses, self.world)
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:

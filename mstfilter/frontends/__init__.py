@@ -6,9 +6,9 @@
 ==================  ===================================================================
 `mask_files`        folders of instance masks with alternatives: layout, reader, writer
 `mask_trees`        nested masks as a tree whose cuts are levels
-`mask_proposal`     the proposal, the boundary model, and the recipe for SAM
+`mask_proposal`     the proposal, and the recipe for SAM
 `completions`       meshes, point clouds and voxels of others as completions
-`mask_trackers`     SAM 2, EdgeTAM and Cutie through their packages
+`mask_trackers`     SAM 2 and EdgeTAM through their package
 ==================  ===================================================================
 
 The networks of the published system, COB and SiamMask, are files in ``models/published`` that the registry loads like
@@ -23,8 +23,8 @@ __getattr__, __dir__, __all__ = attach(__name__, __file__)
 _COB, _SIAMMASK = (f"{models_folder()}/published/{name}.py" for name in ("cob", "siammask"))
 __components__ = {
     "proposal": {"mask_folder": "MaskProposal"},
-    "boundary": {"mask_folder": "MaskBoundary", "cob": f"{_COB}:CobBoundary"},
+    "boundary": {"cob": f"{_COB}:CobBoundary"},
     "tree": {"cob": f"{_COB}:CobTree"},
     "completer": {"external": "ExternalCompletion"},
-    "tracker": {"siammask": f"{_SIAMMASK}:SiamMaskTracker", "sam2": "Sam2Tracker", "cutie": "CutieTracker"},
+    "tracker": {"siammask": f"{_SIAMMASK}:SiamMaskTracker", "sam2": "Sam2Tracker"},
 }

@@ -6,12 +6,10 @@ from mstfilter.frontends.mask_files import (
     write_masks as write_masks,
 )
 from mstfilter.frontends.mask_proposal import (
-    MaskBoundary as MaskBoundary,
     MaskProposal as MaskProposal,
-    border_probability as border_probability,
     write_automatic_masks as write_automatic_masks,
 )
-from mstfilter.frontends.mask_trackers import CutieTracker as CutieTracker, Sam2Tracker as Sam2Tracker
+from mstfilter.frontends.mask_trackers import Sam2Tracker as Sam2Tracker
 from mstfilter.frontends.mask_trees import (
     mask_tree as mask_tree,
     nested_masks as nested_masks,

@@ -21,21 +21,20 @@ holes do no harm. A voxel is occupied by a cloud if a point is in it; spaces enc
 
 from __future__ import annotations
 
-import copy
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
 from mstfilter.completion.observed import frame_points
 from mstfilter.errors import InputError
-from mstfilter.fields import Bounds
+from mstfilter.fields import bound_to
 from mstfilter.files import reading
-from mstfilter.frontends.mask_files import read_weights
+from mstfilter.frontends.mask_files import read_label_image, read_weights
 from mstfilter.open3d_import import import_open3d
 from mstfilter.reading import MAX_FILE, read_bytes, unpack_arrays
 from mstfilter.scene import (
@@ -50,11 +49,12 @@ from mstfilter.scene import (
     content_key,
     memo,
     occupied_box,
-    read_labels,
 )
 
 _MESHES = (".ply", ".obj", ".stl", ".off")
 _MASK = "mask.png"
+#: Smallest IoU of a mask with the stored mask, both without pixels that cannot belong to an object.
+_MIN_IOU = 0.5
 _WEIGHTS = "weights.json"
 #: Directions of the rays of the inside test; not along the axes, so that they miss edges of axis-parallel meshes.
 _RAYS = np.array([[1.0, 1.1e-4, 1.7e-4], [1.3e-4, 1.0, 0.7e-4], [0.9e-4, 1.9e-4, 1.0]], np.float32)
@@ -73,8 +73,8 @@ class ObjectShapes:
 class ExternalCompletion(ClipCompleter, UsesFiles):
     """Shapes from a folder, in place of an estimate.
 
-    The shapes of a mask are those of the stored mask with the highest IoU. Voxels observed as free are cleared, and
-    the visible surface is occupied, as for any completer.
+    The shapes of a mask are those of the stored mask with the highest IoU, at least 0.5. Of several, one is drawn for
+    each hypothesis by its weight. Voxels observed as free are cleared, and the visible surface is occupied.
 
     Parameters
     ----------
@@ -82,19 +82,12 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         The folder of shapes.
     axes : {"camera", "world"}
         The frame of the shapes.
-    draws : {"sample", "mean"}
-        Several shapes of a mask: one is drawn for each hypothesis by its weight, or their weighted mean is the
-        probability of a voxel.
-    min_iou : float
-        Smallest IoU of a mask with the stored mask, both without pixels that cannot belong to an object.
     other : Completer, optional
         For masks without a stored mask. Default: such a mask is an error.
     """
 
     folder: str = ""
     axes: Literal["camera", "world"] = "camera"
-    draws: Literal["sample", "mean"] = "sample"
-    min_iou: Annotated[float, Bounds(above=0, at_most=1)] = 0.5
     other: Completer | None = None
 
     stochastic: ClassVar[bool] = True
@@ -108,12 +101,9 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
     def at(self, clip: Clip) -> ExternalCompletion:
         """The completer with the shapes of the pause that the clip ends at."""
-        bound = copy.copy(self)
         found = read_shapes(self.folder, clip.index, clip.after.depth.shape)
         other = self.other.at(clip) if isinstance(self.other, ClipCompleter) else self.other
-        for name, value in (("_shapes", found), ("other", other)):
-            object.__setattr__(bound, name, value)  # components are frozen
-        return bound
+        return bound_to(self, _shapes=found, other=other)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         """The visible surface; `complete_each` adds the shape of the mask."""
@@ -144,26 +134,21 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         known[frame_points(frame, grid)[0]] = True
         ious = [(mask & s.mask).sum() / max((mask | (s.mask & known.reshape(mask.shape))).sum(), 1) for s in shapes]
         best = int(np.argmax(ious)) if shapes else -1
-        if best < 0 or ious[best] < self.min_iou:
+        if best < 0 or ious[best] < _MIN_IOU:
             if self.other is None:
                 raise InputError(
                     f"no stored shape fits a mask of {int(mask.sum())} pixels in {self.folder}: "
-                    f"the best IoU is {max(ious, default=0):.2f}, at least {self.min_iou:g} is needed",
+                    f"the best IoU is {max(ious, default=0):.2f}, at least {_MIN_IOU:g} is needed",
                     "name a completer for other masks, for example update.completer.other=extrude",
                 )
             return self.other.complete_each([rng], frame, [mask], grid)[0]
         chosen = shapes[best]
-        if self.draws == "mean":
-            volumes = [self._volume(path, frame.camera, grid) for path in chosen.files]
-            shape = np.tensordot(chosen.weights, np.array(volumes), 1).astype(np.float32)
-            name = ",".join(path.name for path in chosen.files)
-        else:
-            path = chosen.files[int(rng.choice(len(chosen.files), p=chosen.weights))]
-            shape, name = self._volume(path, frame.camera, grid), path.name
+        path = chosen.files[int(rng.choice(len(chosen.files), p=chosen.weights))]
+        shape = self._volume(path, frame.camera, grid)
         offset, seen = observed_box(frame, mask, grid, self._reaching(shape, frame, mask, grid))
         box = tuple(slice(int(a), int(a) + n) for a, n in zip(offset, seen.points.shape, strict=True))
         p = np.where(seen.free, 0, np.maximum(shape[box], self.fill(rng, seen))).astype(np.float32)
-        key = content_key("shape", np.packbits(mask), frame.key, grid.key, component_key(self), shape, name)
+        key = content_key("shape", np.packbits(mask), frame.key, grid.key, component_key(self), shape, path.name)
         return Completion(offset, p, seen.points, key.hex()[:16])
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
@@ -182,9 +167,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
             return self
         low, high = np.array([[s.start, s.stop] for s in occupied]).T
         reach = max((readings.min(axis=0) - low).max(), (high - 1 - readings.max(axis=0)).max(), 0)
-        wider = copy.copy(self)
-        object.__setattr__(wider, "padding", int(reach))
-        return wider
+        return bound_to(self, padding=int(reach))
 
 
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
@@ -207,17 +190,14 @@ def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple
 def _read_object(folder: Path, shape: tuple[int, int]) -> ObjectShapes:
     if not (folder / _MASK).is_file():
         raise InputError(f"{folder} has no {_MASK}", "it marks the pixels of the object")
-    mask = read_labels(folder / _MASK) > 0
-    if mask.shape != shape:
-        raise InputError(f"{folder / _MASK} has shape {mask.shape}, the image is {shape}")
+    mask = read_label_image(folder / _MASK, shape) > 0
     files = [p for p in sorted(folder.iterdir()) if p.name not in (_MASK, _WEIGHTS) and not p.name.startswith(".")]
     for path in files:
         if path.suffix not in (*_MESHES, ".npz"):
             raise InputError(f"{path} is not a file of a shape", f"expected {', '.join((*_MESHES, '.npz'))}")
     if not files:
         raise InputError(f"{folder} has no shape", f"expected files {', '.join((*_MESHES, '.npz'))}")
-    weights = read_weights(folder, files)
-    given = np.ones(len(files)) if weights is None else np.array([weights[p.name] for p in files])
+    given = np.array(read_weights(folder, files) or [1.0] * len(files))
     return ObjectShapes(mask, tuple(files), given / given.sum())
 
 

@@ -19,7 +19,7 @@ A file is one set of masks of the size of the image, disjoint or nested (`mstfil
 
 * ``.png``: label image, 8 or 16 bits, 0 = no mask.
 * ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), for labels in ascending
-  order. An optional ``image`` is the `image_key` of the colour image; masks of another image are then an error.
+  order.
 * ``.json``: a list of COCO annotations, or ``{"masks": [...]}``. Each has ``segmentation: {size: [H, W], counts}``,
   run lengths as numbers or compressed, and optionally ``score`` or ``predicted_iou``, as SAM writes it.
 
@@ -49,6 +49,8 @@ from mstfilter.segmentation import Tree
 MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
 _SUFFIXES = (".png", ".npz", ".json")
 _WEIGHTS = "weights.json"
+#: Number of axes, kinds of type, and words for an error, of the arrays in an npz file.
+_KINDS = {"labels": (2, "iu", "integers (H, W)"), "masks": (3, "b", "bool (n, H, W)")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +71,8 @@ class PauseMasks:
     key: bytes  #: key of the content of the files
 
 
-def image_key(rgb: np.ndarray) -> str:
-    """Key of a colour image (H, W, 3) uint8."""
-    return content_key("image", np.asarray(rgb)).hex()
-
-
-def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.ndarray | None = None) -> PauseMasks:
-    """Read the masks of a pause. `shape` is that of the image, (H, W); `rgb` is compared with the key in npz files.
+def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
+    """Read the masks of a pause. `shape` is that of the image, (H, W).
 
     Files are read at each call, and their content is parsed once. Raises InputError if the folder has no masks for
     the pause, or a file cannot be used.
@@ -94,19 +91,15 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int], rgb: np.n
     groups = groups or {"": _alternatives(where)}
     content = {p: read_bytes(p, "masks") for group in groups.values() for p in group}
     weights = {name: read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
-    image = "" if rgb is None else image_key(rgb)
     key = content_key(
         "masks",
         shape,
-        image,
         *(part for p, data in content.items() for part in (p.relative_to(where.parent).as_posix(), data)),
-        *((w and sorted(w.items()), name) for name, w in weights.items()),
+        *((w, name) for name, w in weights.items()),
     )
 
     def parse() -> PauseMasks:
-        regions = tuple(
-            _region(name, group, content, weights.get(name), shape, image) for name, group in groups.items()
-        )
+        regions = tuple(_region(name, group, content, weights.get(name), shape) for name, group in groups.items())
         _check_apart(regions, where)
         return PauseMasks(regions, key)
 
@@ -156,8 +149,8 @@ def _alternatives(folder: Path) -> list[Path]:
     return files
 
 
-def read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
-    """The content of weights.json, if there is one."""
+def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
+    """The weight of each file from weights.json, if there is one."""
     path = folder / _WEIGHTS
     if not path.is_file():
         return None
@@ -171,30 +164,27 @@ def read_weights(folder: Path, files: list[Path]) -> dict[str, float] | None:
             raise InputError(f"{path}: weight of {name} is {value!r}, expected a finite number of at least 0")
     if sum(weights.values()) <= 0:
         raise InputError(f"{path}: all weights are 0")
-    return {name: float(value) for name, value in weights.items()}
+    return [float(weights[p.name]) for p in files]
 
 
 def _region(
     name: str,
     files: list[Path],
     content: Mapping[Path, bytes],
-    weights: Mapping[str, float] | None,
+    weights: Sequence[float] | None,
     shape: tuple[int, int],
-    image: str,
 ) -> MaskRegion:
     trees, stops, means = [], [], []
     for path in files:
         with naming(str(path)):
-            masks, scores = _READERS[path.suffix](path, content[path], shape, image)
+            masks, scores = _READERS[path.suffix](path, content[path], shape)
             tree, stop = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
         trees.append(tree)
         stops.append(stop)
         means.append(_mean_of_largest(masks, scores))
-    given = np.array(means if weights is None else [weights[p.name] for p in files])
-    total = given.sum()
-    return MaskRegion(
-        name, given / total if total > 0 else np.full(len(files), 1 / len(files)), tuple(trees), tuple(stops)
-    )
+    given = np.array(means if weights is None else weights)
+    share = given / given.sum() if given.sum() > 0 else np.full(len(files), 1 / len(files))
+    return MaskRegion(name, share, tuple(trees), tuple(stops))
 
 
 def _mean_of_largest(masks: np.ndarray, scores: np.ndarray) -> float:
@@ -237,61 +227,48 @@ def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> No
         )
 
 
-def _check_amount(path: Path, n: int, shape: tuple[int, int]) -> None:
-    """Raise InputError if masks need too much memory; a small file can hold many empty ones."""
-    if n * shape[0] * shape[1] > MAX_FILE:
-        raise InputError(f"{path} has {n} masks, at most {MAX_FILE // (shape[0] * shape[1])} of this size are read")
-
-
-def _read_png(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
-    labels = read_labels(path)
-    _check_shape(path, labels.shape, shape)
+def _read_png(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    labels = read_label_image(path, shape)
     return labels, np.ones(len(np.unique(labels[labels > 0])))
 
 
-def _read_npz(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
+def read_label_image(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """A label image (H, W) of the size of the image; raises InputError if it has another."""
+    labels = read_labels(path)
+    _check_shape(path, labels.shape, shape)
+    return labels
+
+
+def _read_npz(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     with reading(path, "masks", "expected arrays of numbers from numpy.savez; objects (pickle) are not read"):
         arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
     kind = "labels" if "labels" in arrays else "masks"
     if kind not in arrays:
         raise InputError(f"{path} has no array labels or masks, only {', '.join(sorted(arrays)) or 'nothing'}")
-    masks = arrays[kind]
-    if masks.ndim != (2 if kind == "labels" else 3):
-        raise InputError(
-            f"{path}: {kind} has shape {masks.shape}, expected {'(H, W)' if kind == 'labels' else '(n, H, W)'}"
-        )
+    masks, (ndim, types, expected) = arrays[kind], _KINDS[kind]
+    if masks.ndim != ndim or masks.dtype.kind not in types:
+        raise InputError(f"{path}: {kind} has shape {masks.shape} and type {masks.dtype}, expected {expected}")
     _check_shape(path, masks.shape[-2:], shape)
-    if kind == "masks" and (masks.dtype.kind != "b" or len(masks) > MAX_MASKS):
+    numbers = masks if kind == "labels" else np.array(len(masks))
+    if numbers.min(initial=0) < 0 or numbers.max(initial=0) > MAX_MASKS:
         raise InputError(
-            f"{path}: masks has type {masks.dtype} and length {len(masks)}, expected bool, at most {MAX_MASKS}"
-        )
-    if kind == "labels" and not np.issubdtype(masks.dtype, np.integer):
-        raise InputError(f"{path}: labels has type {masks.dtype}, expected integers")
-    if kind == "labels" and (masks.min(initial=0) < 0 or masks.max(initial=0) > MAX_MASKS):
-        raise InputError(
-            f"{path}: labels are {masks.min()} to {masks.max()}, expected 0 to {MAX_MASKS}",
+            f"{path}: labels are {numbers.min()} to {numbers.max()}, expected 0 to {MAX_MASKS}",
             "labels have 16 bits; number the masks from 1",
         )
     n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))
     scores = arrays.get("scores", np.ones(n))
-    if image and str(arrays.get("image", image)) != image:
-        raise InputError(f"masks of {path} were made from another image", "files are numbered by pause, from 0")
     if not np.issubdtype(scores.dtype, np.number):
         raise InputError(f"{path}: scores has type {scores.dtype}, expected numbers")
     return masks, scores
 
 
-def _json(path: Path, data: bytes) -> Any:
+def _read_json(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     with reading(path, "masks"):
-        return json.loads(data)
-
-
-def _read_json(path: Path, data: bytes, shape: tuple[int, int], image: str) -> tuple[np.ndarray, np.ndarray]:
-    entries = _json(path, data)
+        entries = json.loads(data)
     entries = entries.get("masks") if isinstance(entries, dict) else entries
-    if not isinstance(entries, list) or len(entries) > MAX_MASKS:
-        raise InputError(f"{path} is not a list of at most {MAX_MASKS} masks, or an object with such a list `masks`")
-    _check_amount(path, len(entries), shape)
+    most = min(MAX_MASKS, MAX_FILE // (shape[0] * shape[1]))  # a small file can hold many large masks
+    if not isinstance(entries, list) or len(entries) > most:
+        raise InputError(f"{path} is not a list of at most {most} masks, or an object with such a list `masks`")
     masks, scores = np.zeros((len(entries), *shape), dtype=bool), np.ones(len(entries))
     for k, entry in enumerate(entries):
         rle = entry.get("segmentation") if isinstance(entry, dict) else None
@@ -353,7 +330,6 @@ def write_masks(
     alternatives: Sequence[np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]],
     weights: Sequence[float] | None = None,
     region: str = "",
-    rgb: np.ndarray | None = None,
 ) -> None:
     """Write the alternatives of a pause, or of one of its regions, as npz files. Earlier ones are replaced.
 
@@ -370,8 +346,6 @@ def write_masks(
         One weight for each alternative. Default: from the scores.
     region : str
         Name of the region; empty for the whole image.
-    rgb : (H, W, 3) uint8, optional
-        The image. The reader then refuses the masks for another image.
     """
     path = Path(folder) / f"{pause:06d}" / region
     if not len(alternatives) or (weights is not None and len(weights) != len(alternatives)):
@@ -386,12 +360,10 @@ def write_masks(
             arrays: dict[str, np.ndarray] = {"labels" if masks.ndim == 2 else "masks": masks}
             if scores is not None:
                 arrays["scores"] = np.asarray(scores, dtype=np.float64)
-            if rgb is not None:
-                arrays["image"] = np.array(image_key(rgb))
             name = partial / f"{k}.npz"
             np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
             content = {name: read_bytes(name, "masks")}
-            _region("", [name], content, None, masks.shape[-2:], "")  # the checks of the reader
+            _region("", [name], content, None, masks.shape[-2:])  # the checks of the reader
         if weights is not None:
             write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
             read_weights(partial, _alternatives(partial))

@@ -1,4 +1,4 @@
-"""Hypotheses and boundary maps from instance masks that another program made.
+"""Hypotheses from instance masks that another program made.
 
 >>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
@@ -6,16 +6,10 @@
 `mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region,
 drawn by its weight and independently of the other regions, and a cut of the tree of its masks. Combinations are not
 enumerated: the work is that of the alternatives that are drawn, and each distinct mask is completed once.
-
-The same masks can be boundaries of a segmentation tree:
-
->>> overrides = "proposal.boundary=mask_folder", "proposal.boundary.folder=masks", "proposal.tree=ucm"
->>> filter = mstfilter.preset("mst", *overrides)
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,14 +18,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.errors import InputError
-from mstfilter.fields import Share
-from mstfilter.frontends.mask_files import MaskRegion, PauseMasks, read_masks, write_masks
+from mstfilter.frontends.mask_files import read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
-from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
+from mstfilter.scene import Clip, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.segmentation import (
-    BoundaryModel,
-    ClipBoundary,
     CutSampler,
     ExactCuts,
     ObjectRule,
@@ -70,12 +60,12 @@ class MaskProposal(Proposal, UsesFiles):
     def check_files(self, recording: Recording) -> None:
         """Read the masks of all pauses."""
         for clip in recording.clips():
-            read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
+            read_masks(self.folder, clip.index, clip.after.depth.shape)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """`n` hypotheses about the scene at the end of the clip, with equal weights."""
         frame, grid = observation.after, observation.grid
-        masks = read_masks(self.folder, observation.index, frame.depth.shape, frame.rgb)
+        masks = read_masks(self.folder, observation.index, frame.depth.shape)
         chosen: list[list[int]] = [[] for _ in range(n)]
         pixels: dict[int, np.ndarray] = {}
         alternatives = {}
@@ -123,92 +113,6 @@ def _number(content: bytes) -> int:
     return int.from_bytes(content_key(content)[:8], "big") >> 2
 
 
-@dataclass(frozen=True)
-class MaskBoundary(ClipBoundary, UsesFiles):
-    """The probability that a segmentation drawn from a folder of masks has a border at a pixel.
-
-    The law is that of `MaskProposal` with `ExactCuts` at temperature 1. Borders are borders of masks, so they do not
-    have the statistics of image gradients. Combine the model with the tree ``ucm``, not with ``learned``, whose
-    weights were fitted to `ColourDepthBoundary`.
-
-    Parameters
-    ----------
-    folder : str
-        The folder of masks.
-    weight : float
-        Factor of the probability, 0 to 1.
-    objects : ObjectRule
-        Decides which masks are objects, as in `MaskProposal`.
-    other : BoundaryModel, optional
-        A second model; the result is the maximum of both.
-    """
-
-    folder: str = ""
-    weight: Share = 1.0
-    objects: ObjectRule = field(default_factory=ObjectRule)
-    other: BoundaryModel | None = None
-
-    def check_files(self, recording: Recording) -> None:
-        """Read the masks of all pauses."""
-        MaskProposal(self.folder).check_files(recording)
-
-    def at(self, clip: Clip) -> MaskBoundary:
-        """The model with the masks of the pause that the clip ends at."""
-        bound = copy.copy(self)
-        masks = read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
-        other = self.other.at(clip) if isinstance(self.other, ClipBoundary) else self.other
-        for name, value in (("_masks", masks), ("other", other)):
-            object.__setattr__(bound, name, value)  # components are frozen
-        return bound
-
-    @property
-    def bound_key(self) -> bytes:
-        """Key of the masks; empty before `at`."""
-        masks = self.__dict__.get("_masks")
-        return b"" if masks is None else masks.key
-
-    def boundary(self, frame: Frame) -> np.ndarray:
-        """(H, W) float32; raises InputError before `at`."""
-        masks: PauseMasks | None = self.__dict__.get("_masks")
-        if masks is None:
-            raise InputError("MaskBoundary does not know the pause of a frame", "call MaskBoundary.at(clip) first")
-        edge = self.weight * border_probability(masks.regions, frame, self.objects)
-        if self.other is not None:
-            edge = np.maximum(edge, self.other.boundary(frame))
-        return edge.astype(np.float32)
-
-
-def border_probability(regions: Iterable[MaskRegion], frame: Frame, objects: ObjectRule) -> np.ndarray:
-    """(H, W) probability of a border between a pixel and one of its four neighbours, the largest of the four."""
-    shape = frame.depth.shape
-    joined = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
-    for region in regions:
-        apart = np.zeros_like(joined[0]), np.zeros_like(joined[1])
-        for weight, tree, stop in zip(region.weights, region.trees, region.stops, strict=True):
-            stop = _stops_at_objects(tree, stop, objects.segments(tree, frame).is_object)
-            below, position = _split_probability(tree, stop), tree.leaf_position[tree.leaves]
-            for p, a, b in ((apart[0], position[:, :-1], position[:, 1:]), (apart[1], position[:-1], position[1:])):
-                pairs = a != b
-                low, high = np.minimum(a[pairs], b[pairs]), np.maximum(a[pairs], b[pairs])
-                p[pairs] += weight * below[tree.lowest_common(low, high)]
-        for total, p in zip(joined, apart, strict=True):
-            total *= 1 - p
-    out = np.zeros(shape)
-    across, down = 1 - joined[0], 1 - joined[1]
-    for part, p in ((out[:, 1:], across), (out[:, :-1], across), (out[1:], down), (out[:-1], down)):
-        np.maximum(part, p, out=part)
-    return out
-
-
-def _split_probability(tree: Tree, stop: np.ndarray) -> np.ndarray:
-    """(N,) probability that a walk goes below the node, if it stops with probabilities `stop` (N,)."""
-    below = np.ones(tree.n_nodes)
-    for node in range(tree.n_nodes - 1, -1, -1):
-        above = 1.0 if node == tree.root else below[tree.parent[node]]
-        below[node] = above * (1 - stop[node])
-    return below
-
-
 class MaskGenerator(Protocol):
     """A mask generator as in SAM (`SamAutomaticMaskGenerator`) and SAM 2 (`SAM2AutomaticMaskGenerator`)."""
 
@@ -225,4 +129,4 @@ def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGen
         found = generator.generate(clip.after.rgb.copy())
         masks = np.array([one["segmentation"] for one in found], dtype=bool).reshape(-1, *clip.after.depth.shape)
         scores = np.clip([one.get("predicted_iou", 1.0) for one in found], 0, None)
-        write_masks(folder, clip.index, [nested_masks(masks, scores, share)], rgb=clip.after.rgb)
+        write_masks(folder, clip.index, [nested_masks(masks, scores, share)])

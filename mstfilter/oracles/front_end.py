@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
@@ -73,37 +73,26 @@ class TrueMasks(UsesTruth, Proposal):
 
 @dataclass(frozen=True)
 class TrueBoundary(UsesTruth, BoundaryModel):
-    """True borders between objects in the image.
+    """The measured strength near true borders between objects in the image, 0 elsewhere.
 
-    Parameters
-    ----------
-    form : {"crisp", "cleaned"}
-        *crisp* has 1 on both sides of every true border, 0 elsewhere, for `UcmTree`. The form *cleaned* has the
-        measured strength near true borders, 0 elsewhere, for the learned tree, which is fitted to measured strengths.
-        Quality of the best cut on 16 simulated images with measured, crisp and cleaned boundaries: .914, .485, .952
-        for the learned tree; .868, .998, .901 for `UcmTree`.
-    measured : BoundaryModel
-        Model of the measured strength.
+    Trees are fitted to measured strengths, so the strength is that of the model `measured`.
     """
 
-    form: Literal["crisp", "cleaned"] = "crisp"
     measured: BoundaryModel = field(default_factory=ColourDepthBoundary)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def boundary(self, frame: Frame) -> np.ndarray:
         """(H, W) float32; the frame must be at a pause."""
+        import cv2
+
         image = self.truth.instance(self.truth.pause_of(frame))
         if frame.robot_mask is not None:
             image = np.where(frame.robot_mask, -1, image)
-        edge = np.zeros(image.shape, np.float32)
+        edge = np.zeros(image.shape, np.uint8)  # 1 on both sides of a border
         across, down = image[:, 1:] != image[:, :-1], image[1:] != image[:-1]
         edge[:, 1:][across] = edge[:, :-1][across] = 1
         edge[1:][down] = edge[:-1][down] = 1
-        if self.form == "crisp":
-            return edge
-        import cv2
-
         size = 2 * max(1, round(scaled_length(_REACH, frame.camera.width))) + 1
         near = cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
         return np.where(near, self.measured.boundary(frame), 0).astype(np.float32)

@@ -122,7 +122,7 @@ class TruePairs(UsesTruth, PairOdds):
 
 #: Overrides of the preset ``mst`` by stage. A new component keeps the fields of ``mst`` that it has too.
 STAGES: dict[str, tuple[str, ...]] = {
-    "boundary": ('proposal.boundary={component="true_boundary", form="cleaned"}',),
+    "boundary": ("proposal.boundary=true_boundary",),
     "masks": ("proposal=true_masks", "proposal.completer=surface"),
     "completion": ("update.completer=true_completion",),
     "motions": ("transition=true_motions",),

@@ -13,7 +13,6 @@ equality do not change when it is bound. Its `component_key` does change.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar
@@ -21,6 +20,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 import numpy as np
 
 from mstfilter.errors import InputError
+from mstfilter.fields import bound_to
 from mstfilter.registry import nested_components
 from mstfilter.scene import Frame, Recording
 
@@ -104,9 +104,7 @@ class UsesTruth:
 
     def bind(self: T, truth: RecordingTruth) -> T:
         """The same component, bound to this truth."""
-        bound = copy.copy(self)
-        object.__setattr__(bound, "_truth", truth)  # components are frozen
-        return bound
+        return bound_to(self, _truth=truth)
 
     @property
     def bound_key(self) -> bytes:

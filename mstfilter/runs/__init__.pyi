@@ -1,5 +1,4 @@
 from mstfilter.runs.run import (
-    RunProgress as RunProgress,
     check_run_folder as check_run_folder,
     code_version as code_version,
     compared_configs as compared_configs,

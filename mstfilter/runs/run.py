@@ -15,7 +15,6 @@ import platform
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -45,15 +44,6 @@ def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return {"without past": found, "single frame": found | {"proposal": {**proposal, "sampler": "optimal"}}}
 
 
-@dataclass(frozen=True)
-class RunProgress:
-    """Progress of a run: pauses done, pauses in total, wall seconds of the last step."""
-
-    done: int
-    total: int
-    seconds: float = 0.0
-
-
 def filter_recording(
     recording: Recording,
     config: Mapping[str, Any],
@@ -62,7 +52,7 @@ def filter_recording(
     *,
     replace: bool = False,
     allow_files: bool = False,
-    progress: bool | Callable[[RunProgress], None] = False,
+    progress: bool | Callable[[int, int], None] = False,
 ) -> RunFolder:
     """Filter a recording and return the run folder.
 
@@ -80,7 +70,8 @@ def filter_recording(
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     progress : bool or callable
-        True shows a progress bar; a function is called before the first step and after every step.
+        True shows a progress bar; a function is called before the first step and after every step, with the number
+        of pauses done and of all pauses.
 
     Raises
     ------
@@ -101,11 +92,10 @@ def filter_recording(
         done = 0 if folder is None else folder.n_pauses
         state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
         doubts: list[Finding] = []
-        with progress_of(progress, "filter") as show:
-            advance: Callable[[RunProgress], None] = (lambda p: show(p.done, p.total)) if progress is True else show
+        with progress_of(progress, "filter") as advance:
             try:
                 clips = recording.clips()
-                advance(RunProgress(done, len(clips)))
+                advance(done, len(clips))
                 for clip in clips[done:]:
                     state, info = bound.step(state, clip)
                     truth = recording.truth(clip.index)
@@ -120,7 +110,7 @@ def filter_recording(
                     if not doubts and state.population is not None:  # said once
                         doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
                         report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
-                    advance(RunProgress(clip.index + 1, len(clips), sum(info.seconds.values())))
+                    advance(clip.index + 1, len(clips))
             except BaseException as error:
                 if folder is not None:
                     folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")

@@ -17,14 +17,12 @@ Layout::
     compare/without-past     run folders of other filters on the same recording, if asked for
 
 A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one, which contains the step, the
-seed and a hash of run.json. Its arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same
-seed gives the same bytes in all files except seconds.json.
+holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
+are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import re
@@ -243,12 +241,6 @@ class RunFolder:
         """Number of complete pauses."""
         return next(t for t in itertools.count() if not self.pause(t).is_dir())
 
-    @property
-    def key(self) -> str:
-        """A hash of run.json without the status; the states of the run contain it."""
-        kept = {name: value for name, value in self.description.items() if name != "status"}
-        return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
-
     def pause(self, t: int) -> Path:
         """Folder of a pause."""
         return self.path / "pauses" / f"{t:03d}"
@@ -282,7 +274,7 @@ class RunFolder:
             if instance is not None:
                 write_image(folder / "instance.png", instance)
             write_json(folder / "camera.json", CameraFile.of(camera.at(camera.pose)).model_dump())
-            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True, run=self.key)
+            save_state(folder / "state.npz", state, HypothesisCodec(), compress=True)
             quality: dict[str, list[float]] | None = None
             if truth is not None:
                 pairs = np.zeros((2, 0)) if questions is None else np.stack([questions.first, questions.second])
@@ -307,39 +299,21 @@ class RunFolder:
             )
 
     def damage(self) -> list[str]:
-        """What is wrong with files of the run: those that differ from their hashes, and states of another run."""
+        """The files of the run that differ from their hashes."""
         found = damaged_files(self.path) if self.description["status"] == "done" else []
         for t in range(self.n_pauses):
-            found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t)) or self._foreign(t)]
+            found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t))]
         return found
-
-    def _foreign(self, t: int) -> list[str]:
-        """In what the state of a pause differs from one of this run."""
-        path = self.pause(t) / "state.npz"
-        with reading(path, "a pause of a run"), np.load(path, allow_pickle=False) as data:
-            head = json.loads(str(data["head"]))
-        expected = {"t": t + 1, "seed": self.description["seed"], "run": self.key}
-        differs = [name for name, value in expected.items() if head.get(name) != value]
-        names = {"t": "step", "run": "hash of run.json"}
-        return [
-            f"state.npz belongs to another run: {names.get(name, name)} {head.get(name)}, expected {expected[name]}"
-            for name in differs
-        ]
 
     def repair(self) -> None:
         """Prepare the folder for resuming: remove what a killed process left, and damaged pauses with a warning.
 
-        All pauses after a damaged one are removed. Raises InputError if a pause belongs to another run.
+        All pauses after a damaged one are removed.
         """
         sweep(self.path)
         sweep(self.path / "pauses")
         good = 0
         while not (wrong := damaged_files(self.pause(good))):
-            if foreign := self._foreign(good):
-                raise InputError(
-                    f"{self.pause(good)}/{foreign[0]}",
-                    "choose another folder, or start again (on the command line: --replace)",
-                )
             good += 1
         later = sorted(path for path in (self.path / "pauses").glob("[0-9]*") if int(path.name) >= good)
         for path in reversed(later):

@@ -26,7 +26,7 @@ from mstfilter.errors import InputError, describe_error, exhausted
 from mstfilter.files import atomic_folder
 from mstfilter.formats import open_recording
 from mstfilter.presets import PACKAGES
-from mstfilter.runs import RunFolder, RunProgress, code_version, filter_recording
+from mstfilter.runs import RunFolder, code_version, filter_recording
 from mstfilter.scene import Recording, scene_cache
 from mstfilter.scoring import measure_pause
 from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
@@ -87,11 +87,10 @@ def _run(job: Job) -> None:
     costs: list[dict[str, float]] = []
     began = time.process_time()
 
-    def progress(p: RunProgress) -> None:
+    def progress(done: int, total: int) -> None:
         nonlocal began
-        if p.done:
-            spent = time.process_time() - began
-            costs.append({"seconds": p.seconds, "core_seconds": spent, "peak_mb": peak_megabytes()})
+        if done:
+            costs.append({"core_seconds": time.process_time() - began, "peak_mb": peak_megabytes()})
         reset_peak()
         began = time.process_time()
 
@@ -108,7 +107,9 @@ def _run(job: Job) -> None:
                 progress=progress,
             )
         for t, cost in enumerate(costs):
-            cost.update({f"seconds_{stage}": seconds for stage, seconds in run.seconds(t).items()})
+            stages = run.seconds(t)
+            by_stage = {f"seconds_{stage}": seconds for stage, seconds in stages.items()}
+            costs[t] = {"seconds": sum(stages.values()), **cost, **by_stage}
         rows = write_measures(run, recording)
         write_result(work, {"identity": job["identity"], "status": "done", "rows": rows, "costs": costs})
         if job["keep"] == "tables":

@@ -10,7 +10,7 @@ from mstfilter.belief.information import partition_distance
 from mstfilter.errors import InputError
 from mstfilter.scene import Hypothesis, VoxelGrid
 from mstfilter.smc import Population
-from tests.belief.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes, voxels_of
+from tests.belief.test_belief import CAMERA, GRID, SHAPE, belief_of, scenes
 
 
 def test_distance_of_partitions():
@@ -23,8 +23,6 @@ def test_distance_of_partitions():
 def test_places_in_metres():
     belief = belief_of(*scenes(0))
     np.testing.assert_array_equal(belief.voxel([[-0.02, -0.015, 0.0], [0.0199, 0.0, 0.015]]), [[0, 0, 0], [3, 1, 1]])
-    box = belief.box((-0.01, -1, -1), (0.01, 0, 0.01))
-    assert voxels_of(box) == [(x, y, 0) for x in (1, 2) for y in (0, 1)]
 
 
 BAD = {
@@ -36,12 +34,10 @@ BAD = {
     "point outside": (lambda b: b.voxel([[0, 0, 0], [0, 0, 9.0]]), "9.0.*outside"),
     "NaN point": (lambda b: b.voxel([0, 0, np.nan]), "outside"),
     "no point": (lambda b: b.voxel([0, 0]), "shape"),
-    "box outside": (lambda b: b.box((5, 5, 5), (6, 6, 6)), "box"),
-    "half a box": (lambda b: b.box((0, 0), (1, 1, 1)), "corners"),
     "voxel outside": (lambda b: b.same_object((0, 0, 0), (4, 0, 0)), r"\[4, 0, 0\].*outside"),
     "negative voxel": (lambda b: b.same_object((0, 0, 0), (0, 0, -1)), "outside"),
     "metres for voxels": (lambda b: b.same_object((0, 0, 0), (0.0, 0.01, 0.0)), "integers"),
-    "region of another grid": (lambda b: b.look_information(np.ones((2, 2, 2), bool)), "region has shape"),
+    "region of another grid": (lambda b: b.push_information(np.ones((2, 2, 2), bool)), "region has shape"),
     "region outside": (lambda b: b.push_information([(0, 0, 0), (9, 9, 9)]), "outside"),
     "pixel outside": (lambda b: b.same_object_at_pixels(CAMERA, (0, 0), (20, 0)), r"\[20, 0\].*20 x 16"),
     "negative pixel": (lambda b: b.same_object_at_pixels(CAMERA, (0, 0), (3, -1)), "outside"),
@@ -49,13 +45,10 @@ BAD = {
     "no camera": (lambda b: b.view_information("left"), "Camera"),
     "no camera for pixels": (lambda b: b.same_object_at_pixels(None, (0, 0), (0, 0)), "Camera"),
     "negative tolerance": (lambda b: b.push_map(-1), "tolerance is -1"),
-    "NaN tolerance": (lambda b: b.look_information((0, 0, 0), np.nan), "tolerance"),
+    "NaN tolerance": (lambda b: b.push_information((0, 0, 0), np.nan), "tolerance"),
     "no tolerance": (lambda b: b.partition_entropy(tolerance="a"), "tolerance"),
-    "no samples": (lambda b: b.sample(np.random.default_rng(0), 0), "samples"),
     "array outcome": (lambda b: b.information(lambda h: h.labels), "outcome"),
     "NaN": (lambda b: b.most_informative("ab", {"a": float("nan"), "b": 1.0}.__getitem__), "action 0 is NaN"),
-    "NaN likelihood": (lambda b: b.reweighted(lambda h: np.nan), "NaN"),
-    "ruled out": (lambda b: b.reweighted(lambda h: -np.inf), "no particle"),
 }
 
 

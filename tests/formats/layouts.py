@@ -76,22 +76,3 @@ def write_redwood(path, shifts=SHIFTS, scale=0.001):
     matrix = CAMERA.K.T.ravel().tolist()
     (path / "intrinsic.json").write_text(json.dumps({"width": 160, "height": 120, "intrinsic_matrix": matrix}))
     return path
-
-
-def write_dsr(path, shifts=(0, 2, 4), sequence="7"):
-    """Two boxes in volumes of 64 x 48 x 24 voxels of 4 mm, (y, x, z) as the layout has them."""
-    import h5py
-
-    path.mkdir(parents=True, exist_ok=True)
-    for k, shift in enumerate(shifts):
-        mask = np.zeros((48, 64, 24), np.int64)
-        mask[10:20, 10 + shift : 20 + shift, :12] = 1
-        mask[25:40, 40:50, :6] = 2
-        tsdf = np.where(mask > 0, -0.5, 0.6).astype(np.float32)
-        colour = np.full((48, 64, 3), (150, 130, 110), np.uint8)
-        top = mask.max(axis=2)
-        colour[top == 1], colour[top == 2] = (190, 60, 50), (50, 90, 180)
-        with h5py.File(path / f"{sequence}_{k}.hdf5", "w") as file:
-            for key, value in {"tsdf": tsdf, "mask_3d": mask, "color_heightmap": colour}.items():
-                file.create_dataset(key, data=value, compression="gzip")
-    return path

@@ -145,7 +145,6 @@ FAULTS = {
     "no intrinsics": (with_messages(info=False), Bag(), "intrinsics are missing"),
     "wrong topic": (with_messages(), Bag(colour="/camera/colour"), "no image topic '/camera/colour'"),
     "depth for colour": (with_messages(), Bag(colour=DEPTH), "has no colour images"),
-    "wrong info": (with_messages(), Bag(info="/info"), "no CameraInfo topic '/info'"),
     "two colours": (two_colours, Bag(), "2 topics could be colour"),
     "sizes differ": (small_depth, Bag(), "differ in size: depth is not registered"),
     "other frame": (with_messages(frame="camera_depth_optical_frame"), Bag(), "not registered"),

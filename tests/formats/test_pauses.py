@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.formats.pauses import At, Ends, EveryNth, Listed, Still, grey_blocks, pauses_from_text
+from mstfilter.formats.pauses import At, Ends, EveryNth, Still, grey_blocks, pauses_from_text
 from mstfilter.scene import Recording
 from tests.formats.layouts import PAUSES, video
 from tests.scene.scenes import CAMERA, table_scene
@@ -23,27 +20,20 @@ def none(index):
     raise AssertionError("no image is needed")
 
 
-def test_given_pauses(tmp_path):
+def test_given_pauses():
     assert At(frames=(30, 0, -1)).find(TIMES, none) == (0, 30, 39)
     assert At(seconds=(0.0, 1.52, 3.9)).find(TIMES, none) == (0, 15, 39)
     assert Ends().find(TIMES, none) == (0, 39)
     assert Ends().find(TIMES[:1], none) == (0,)
     assert EveryNth(15).find(TIMES, none) == (0, 15, 30)
-    file = tmp_path / "pauses.txt"
-    file.write_text("# first the empty table\n0\n12, 20  # seconds too\n3.5s\n")
-    assert Listed(str(file)).find(TIMES, none) == (0, 12, 20, 35)
     for rule, message in (
         (At(), "no pause"),
         (At(frames=(40,)), "frame 40: the video has 40"),
         (At(frames=(2.7,)), "frame 2.7: the video has 40"),
         (At(seconds=(9.0,)), "lasts from 0 to 3.9 s"),
-        (Listed(str(tmp_path / "none")), "is missing"),
     ):
         with pytest.raises(InputError, match=message):
             rule.find(TIMES, none)
-    file.write_text("0 twelve\n")
-    with pytest.raises(InputError, match=r"pauses.txt: .*twelve"):
-        Listed(str(file)).find(TIMES, none)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +41,6 @@ def test_given_pauses(tmp_path):
     [
         (EveryNth, {"n": 0}, "n is 0, expected an integer of at least 1"),
         (Still, {"hold_s": -0.1}, "hold_s is -0.1"),
-        (Still, {"share": 1.5}, "share is 1.5"),
         (Still, {"levels": -1.0}, "levels is -1.0"),
         (Still, {"region": (0.5, 0.0, 0.5, 1.0)}, "region is"),
         (Still, {"region": (0.1, 0.2)}, "region is"),
@@ -62,23 +51,16 @@ def test_numbers_of_rules_have_bounds(rule, wrong, message):
         rule(**wrong)
 
 
-def test_pauses_as_text(tmp_path):
+def test_pauses_as_text():
     assert pauses_from_text("0,40,85") == {"component": "at", "frames": (0, 40, 85)}
     assert pauses_from_text("0s, 4.2s,9") == {"component": "at", "seconds": (0.0, 4.2), "frames": (9,)}
     assert pauses_from_text("-1") == {"component": "at", "frames": (-1,)}
     assert pauses_from_text("still") == {"component": "still"}
-    file = tmp_path / "p.txt"
-    file.write_text("0")
-    assert pauses_from_text(str(file)) == {"component": "listed", "file": str(file)}
     with pytest.raises(InputError, match="1.5"):
         pauses_from_text("0,1.5")
-    assert pauses_from_text(",".join(map(str, range(400))))["frames"] == tuple(range(400))  # too long for a path
-    with contextlib.chdir(tmp_path):
-        Path("still").write_text("0", encoding="utf-8")
-        assert pauses_from_text("still") == {"component": "still"}
 
 
-def test_pauses_of_arrays(tmp_path):
+def test_pauses_of_arrays():
     """The rules of the command line, and its default if the times are known."""
     scenes = [table_scene(shift) for shift in (0, 0, 0, 1, 2, 3, 3, 3, 3)]
     rgb, depth = np.stack([s[0] for s in scenes]), np.stack([s[1] for s in scenes])
@@ -166,34 +148,3 @@ def test_blocks_are_means():
     blocks = grey_blocks(image)
     assert blocks.shape == (24, 81)
     np.testing.assert_allclose(blocks[3, 5], image[6:8, 10:12].mean(), rtol=1e-6)
-
-
-def test_still_intervals_of_a_simulated_recording():
-    """Pushes with sensor noise, each pause held for a second: exactly the pauses are found.
-
-    The truth is the simulator's: a frame belongs to a pause if it was drawn from the world at rest.
-    """
-    from mstfilter.simulation import SimulatedScene, advance_push, finish_push, scene_family
-
-    family = replace(scene_family("demo"), n_actions=2, supersample=False)
-    scene = SimulatedScene(family, seed=3)
-    images, pause_of = [], []
-
-    def see(pause):
-        images.append(scene.frame_images(len(images))["rgb"])
-        pause_of.append(pause)
-
-    fps = 6.0
-    for action in range(family.n_actions + 1):
-        for _ in range(7):
-            see(action)
-        if action == family.n_actions:
-            break
-        push = scene.choose_push(action)
-        for step in range(int(push.seconds * fps)):
-            advance_push(scene.world, push, step / fps, (step + 1) / fps)
-            see(None)
-        advance_push(scene.world, push, int(push.seconds * fps) / fps, push.seconds)
-        finish_push(scene.world)
-    found = Still(hold_s=0.8).find(times_of(images, fps), lambda k: images[k])
-    assert [pause_of[k] for k in found] == list(range(family.n_actions + 1))

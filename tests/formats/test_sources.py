@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats.image_folders import PairedImages
+from mstfilter.formats.image_folders import PairedImages, Redwood
 from mstfilter.formats.sources import detect_format, format_settings, open_recording
 from mstfilter.presets import REGISTRY
 from mstfilter.scene import render, write_image
@@ -20,7 +20,6 @@ WRITERS = {
     "tum": layouts.write_tum,
     "bop": layouts.write_bop,
     "redwood": layouts.write_redwood,
-    "dsr": layouts.write_dsr,
     "recording": write,
 }
 
@@ -40,7 +39,7 @@ def test_unknown_and_ambiguous(tmp_path):
     for name in ("notes", "data.bin"):
         with pytest.raises(InputError, match="has no known format") as caught:
             open_recording(tmp_path / name)
-        assert "tum, bop, redwood, dsr, bag" in caught.value.hints[0]
+        assert "tum, bop, redwood, bag" in caught.value.hints[0]
     path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")
     for part in ("rgb.txt", "depth.txt"):
         (path / part).write_text("0 a.png\n")
@@ -54,14 +53,10 @@ def test_unknown_and_ambiguous(tmp_path):
 
 
 def test_options_as_text():
-    assert format_settings(
-        ["K=525,525,319.5,239.5", "world.workspace=-1,-1,0,1,1,.5", "frames=a,007,8", "moving=false"]
-    ) == {
-        "K": [525, 525, 319.5, 239.5],
-        "world": {"workspace": [-1, -1, 0, 1, 1, 0.5]},
-        "frames": ["a", "007", 8],
-        "moving": False,
-    }
+    fields = format_settings(["K=525,525,319.5,.5", "world.workspace=-1,-1,0,1,1,.5", "start_s=2"])
+    reader = REGISTRY.make(Redwood, fields)
+    assert (reader.K, reader.world.workspace, reader.start_s) == ((525, 525, 319.5, 0.5), (-1, -1, 0, 1, 1, 0.5), 2)
+    assert REGISTRY.make(PairedImages, format_settings(["frames=a,007,8"])).frames == ("a", "007", "8")
 
 
 def test_a_single_number_is_a_list_of_one():

@@ -149,8 +149,6 @@ def test_draws_follow_their_weights_and_differ_between_hypotheses(tmp_path):
     assert abs(large - 100) < 5 * np.sqrt(400 * 0.25 * 0.75)  # wrong with probability 6e-7
     again = proposal.sample(np.random.default_rng(0), CLIP, 400)
     assert [h.key for h in again.particles] == [h.key for h in population.particles]
-    mean = occupied(replace(completer, draws="mean"), 1)
-    assert set(np.round(mean, 6).ravel()) == {0, 0.25, 1}
 
 
 def test_masks_without_a_shape(tmp_path):
@@ -239,7 +237,7 @@ def test_folders_that_are_missing(tmp_path):
     with pytest.raises(InputError, match=r"has no mask\.png"):
         ExternalCompletion(folder=str(tmp_path)).at(CLIP)
     write_image(tmp_path / "000000" / "cup" / "mask.png", np.ones((4, 5), np.uint8))
-    with pytest.raises(InputError, match=r"has shape \(4, 5\)"):
+    with pytest.raises(InputError, match="are 4 x 5 pixels, the image is"):
         ExternalCompletion(folder=str(tmp_path)).at(CLIP)
 
 

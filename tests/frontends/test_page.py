@@ -33,7 +33,6 @@ def test_all_pauses_are_checked_before_a_run(tmp_path):
     folder = f"folder={tmp_path / 'masks'}"
     for overrides, message in (
         (("proposal=mask_folder", f"proposal.{folder}"), "no masks for pause 1"),
-        (("proposal.boundary=mask_folder", f"proposal.boundary.{folder}"), "no masks for pause 1"),
         (("proposal.completer=external", f"proposal.completer.{folder}"), "none for pause 1"),
         (("proposal.boundary=cob", "proposal.boundary.weights=none"), "do not exist"),
         (("proposal.tree=cob", "proposal.tree.contours.weights=none"), "do not exist"),

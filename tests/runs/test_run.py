@@ -8,28 +8,20 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.formats import open_recording
 from mstfilter.frontends import ExternalCompletion, write_masks
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs.run import component_files, filter_recording
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import scene_cache
 from mstfilter.scoring import weighted_coverage
-from tests.scene.scenes import CAMERA, GRID, table_scene
+from tests.study.scenes import slide
+from tests.study.test_failures import BROKEN
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Three pauses; box 1 slides 2 voxels to the right between them."""
-    path = tmp_path_factory.mktemp("recordings") / "slide"
-    rng = np.random.default_rng(0)
-    with RecordingWriter(path, CAMERA, GRID) as writer:
-        for index, shift in enumerate((0, 1, 2, 3, 4)):
-            rgb, depth, labels = table_scene(shift, rng)
-            writer.add_frame(rgb, depth, index / 5, "action" if index % 2 else "static")
-            if index % 2 == 0:
-                writer.add_voxels(labels)
-    return open_recording(path)
+    return open_recording(slide(tmp_path_factory.mktemp("recordings") / "slide"))
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +71,8 @@ def test_the_same_seed_gives_the_same_bytes(recording, finished, tmp_path):
 @pytest.mark.parametrize("stop", [0, 1, 2])
 def test_an_interrupted_run_resumes_to_the_same_result(recording, finished, tmp_path, stop):
 
-    def interrupt(progress):
-        if progress.done == stop and not (tmp_path / "stopped").exists():
+    def interrupt(done, total):
+        if done == stop and not (tmp_path / "stopped").exists():
             (tmp_path / "stopped").touch()
             raise KeyboardInterrupt
 
@@ -126,28 +118,15 @@ def test_broken_input_and_useless_settings_make_no_folder(recording, tmp_path):
 
 
 def test_a_failing_component_leaves_complete_pauses(recording, tmp_path):
-    source = tmp_path / "mine.py"
-    source.write_text(
-        "from dataclasses import dataclass\n"
-        "from mstfilter.tracking.transition import IdentityTransition\n"
-        "from mstfilter.smc.interfaces import Transition\n"
-        "@dataclass(frozen=True)\n"
-        "class Breaks(Transition):\n"
-        "    at: int = 2\n"
-        "    def predict(self, rng, population, observation):\n"
-        "        if observation.index == self.at:\n"
-        "            raise RuntimeError('broke')\n"
-        "        return population\n"
-    )
-    config = load_config("mst", [f"transition={source}:Breaks"])
+    overrides = f"transition={BROKEN}:Breaks", "transition.at=2"
     with pytest.raises(RuntimeError, match="broke"):
-        filter_recording(recording, config, tmp_path / "run", allow_files=True)
+        filter_recording(recording, load_config("mst", overrides), tmp_path / "run", allow_files=True)
     run = RunFolder.open(tmp_path / "run")
     assert run.n_pauses == 2
     assert run.description["status"] == "failed"
-    assert run.description["config"]["transition"]["component"] == f"{source}:Breaks"
+    assert run.description["config"]["transition"]["component"].endswith("broken.py:Breaks")
     with pytest.raises(InputError, match="not loaded here"):
-        load_config("mst", [f"transition={source}:Breaks"], allow_files=False)
+        load_config("mst", overrides, allow_files=False)
 
 
 def test_a_changed_component_file_or_recording_is_another_run(recording, tmp_path):

@@ -142,7 +142,7 @@ FAULTS = {
     "no folder": (shutil.rmtree, "does not exist"),
     "truncated PNG": (lambda f: cut_file(f / "rgb/000003.png", -40), "truncated"),
     "no manifest": (lambda f: (f / "manifest.json").unlink(), "manifest.json is missing"),
-    "not JSON": (lambda f: (f / "camera.json").write_text("{"), "not valid JSON"),
+    "not JSON": (lambda f: (f / "camera.json").write_text("{"), "camera.json cannot be read: Expecting"),
     "no pause": (
         lambda f: change(f, "manifest.json", lambda m: [e.update(role="action") for e in m["frames"]]),
         "no frame has role static",

@@ -13,7 +13,6 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.formats import Video, VideoFormat
-from mstfilter.scene import Recording, read_depth, read_rgb
 
 
 @dataclass(frozen=True)
@@ -33,19 +32,17 @@ class MyFormat(VideoFormat):
         """Whether a path has this layout. Raises no error."""
         return (path / "rgb").is_dir() and (path / "camera.json").is_file()
 
-    def open(self, path: Path) -> Recording:
-        """The recording. The pose of the camera is found from the table; images are read when they are used."""
+    def video(self, path: Path) -> Video:
+        """The frames and their calibration. Pauses and the pose of the camera are found; images are read late."""
         names = sorted(file.name for file in (path / "rgb").glob("*.png"))
         if not names:
             raise InputError(f"{path / 'rgb'} has no image")
         K = np.asarray(json.loads((path / "camera.json").read_text())["K"])
-        video = Video(
+        return Video.of_files(
             name=path.name,
             times=tuple(k / self.fps for k in range(len(names))),
-            read_rgb=lambda index: read_rgb(path / "rgb" / names[index]),
-            read_depth=lambda index: read_depth(path / "depth" / names[index], self.depth_scale),
+            pairs=[(path / "rgb" / name, path / "depth" / name) for name in names],
             K=self.K or (K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             path=path,
             depth_scale=self.depth_scale,
         )
-        return self.recording_of(video)
