@@ -23,7 +23,7 @@ from mstfilter.processes import check_main_guard
 from mstfilter.reading import check_private, read_json
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, Local, Tell
+from mstfilter.study.executors import Executor, Local, Tell
 from mstfilter.study.plan import Plan, StudyRun, StudyScene, make_plan
 from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
 
@@ -35,8 +35,8 @@ class StudyProgress:
     """Progress of a study."""
 
     what: str  #: {"recordings", "runs"}
-    event: Event | None  #: the last event; None at the beginning of a part
-    name: str  #: of the job that the event belongs to
+    name: str  #: the job that has ended or lost its worker; empty at the beginning of a part
+    outcome: JobOutcome | None  #: how the job ended; None if its worker died
     done: int  #: jobs of this part; `done` includes those of earlier calls
     failed: int
     total: int
@@ -77,7 +77,7 @@ def run_study(
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. Default: the user's cache folder.
     progress : bool or callable
-        True shows progress bars; a function is called with every event.
+        True shows progress bars; a function is called whenever a job ends or loses its worker.
 
     Raises
     ------
@@ -149,13 +149,12 @@ class _Call:
         jobs = [self._run_job(run) for run in runs]
         count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
 
-        def tell(event: Event) -> None:
-            run = runs[event.job]
-            if event.kind == "lost":
-                sweep(self.folder.path / "runs", run.folder)
-            if event.outcome is not None and event.outcome.status != "done":
-                _write_failure(self.folder, run, event.outcome)
-            count(event)
+        def tell(k: int, outcome: JobOutcome | None) -> None:
+            if outcome is None:
+                sweep(self.folder.path / "runs", runs[k].folder)
+            elif outcome.status != "done":
+                _write_failure(self.folder, runs[k], outcome)
+            count(k, outcome)
 
         outcomes = self.executor.run(jobs, tell)
         failed = [(run, outcome) for run, outcome in zip(runs, outcomes, strict=True) if outcome.status != "done"]
@@ -190,16 +189,16 @@ class _Call:
         return self._job("run", run.name, run.scene, more)
 
     def _counter(self, what: str, jobs: Sequence[Job], done: int, total: int, failed: int) -> Tell:
-        """A function that turns the events of jobs into progress."""
+        """A function that turns the outcomes of jobs into progress."""
 
-        def count(event: Event) -> None:
+        def count(k: int, outcome: JobOutcome | None) -> None:
             nonlocal done, failed
-            if event.outcome is not None:
-                done += event.outcome.status == "done"
-                failed += event.outcome.status != "done"
-            self.report(StudyProgress(what, event, jobs[event.job]["name"], done, failed, total))
+            if outcome is not None:
+                done += outcome.status == "done"
+                failed += outcome.status != "done"
+            self.report(StudyProgress(what, jobs[k]["name"], outcome, done, failed, total))
 
-        self.report(StudyProgress(what, None, "", done, failed, total))
+        self.report(StudyProgress(what, "", None, done, failed, total))
         return count
 
 

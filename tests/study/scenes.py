@@ -7,7 +7,6 @@ import numpy as np
 from mstfilter.formats import RecordingWriter
 from mstfilter.scene import scene_cache
 from mstfilter.study import Executor
-from mstfilter.study.executors import Event
 from mstfilter.study.jobs import perform
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -35,7 +34,6 @@ class InProcess(Executor):
         scene_cache.clear()  # as in a new worker
         outcomes = []
         for k, job in enumerate(jobs):
-            tell(Event("started", k))
             outcomes.append(perform(job))
-            tell(Event("ended", k, outcome=outcomes[-1]))
+            tell(k, outcomes[-1])
         return outcomes

@@ -28,8 +28,8 @@ seeds = [0, 1]
 recordings = "slide-*"
 group = "slide"
 [[arms]]
-preset = "mst"
-set = ["transition=identity", "update.n_views=1,2"]
+preset = "floor_components"
+set = ["resampler=systematic,residual"]
 [smoke]
 seeds = 3
 """
@@ -60,8 +60,8 @@ def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     rows = table(tmp_path / "out" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
-        "mst transition=identity update.n_views=1",
-        "mst transition=identity update.n_views=2",
+        "floor_components resampler=systematic",
+        "floor_components resampler=residual",
     }
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
@@ -143,7 +143,7 @@ def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
 
 def test_a_worker_with_other_code_refuses():
     outcome = perform({"kind": "run", "code": "another", "folder": "unused"})
-    assert outcome.error == "the code has changed since the study began"
+    assert outcome.error == "this process has other code of mstfilter than the study began with"
 
 
 def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
