@@ -105,7 +105,7 @@ def _run(job: Job) -> None:
                 job["config"],
                 work,
                 job["seed"],
-                allow_files=job["allow_files"],
+                allow_files=True,
                 progress=progress,
             )
         for t, cost in enumerate(costs):

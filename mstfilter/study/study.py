@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.files import locked, reading, sweep, writing
+from mstfilter.files import locked, sweep, writing
 from mstfilter.lazy import progress_of
 from mstfilter.processes import check_main_guard
-from mstfilter.reading import check_private, read_json
+from mstfilter.reading import check_private
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Executor, Local, Tell
@@ -58,7 +58,6 @@ def run_study(
     executor: Executor | None = None,
     overrides: Sequence[str] = (),
     *,
-    allow_files: bool = True,
     cache: Path | None = None,
     progress: bool | Callable[[StudyProgress], None] = False,
 ) -> StudyResult:
@@ -72,8 +71,6 @@ def run_study(
         Default: one process for each core of this machine.
     overrides : sequence of str
         Applied to every arm; a comma makes a grid.
-    allow_files : bool
-        Whether components may come from ``./file.py:Class``.
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. Default: the user's cache folder.
     progress : bool or callable
@@ -89,13 +86,12 @@ def run_study(
     executor = executor or Local(logs=path / "logs")
     if isinstance(executor, Local):
         check_main_guard("run_study")
-    plan = make_plan(study, overrides, allow_files=allow_files)
-    recalibration = _read_recalibration(plan)
+    plan = make_plan(study, overrides)
     cache = (cache or cache_folder()).absolute()
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
-        _prepare(folder, cache, {**_description(plan), "recalibration": recalibration})
+        _prepare(folder, cache, _description(plan))
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
-        call = _Call(plan, folder, cache, executor, report, allow_files)
+        call = _Call(plan, folder, cache, executor, report)
         failed = call.record_scenes(waiting)
         failed |= call.filter_scenes([run for run in waiting if run.name not in failed], len(failed))
         folder = StudyFolder.open(path)
@@ -126,7 +122,6 @@ class _Call:
     cache: Path
     executor: Executor
     report: Callable[[StudyProgress], None]
-    allow_files: bool
 
     def record_scenes(self, runs: Sequence[StudyRun]) -> dict[str, JobOutcome]:
         """Simulate the recordings that are missing; name of a run that lacks its recording -> why."""
@@ -182,7 +177,6 @@ class _Call:
             "config": {**run.arm.config, "description": run.arm.name},
             "seed": run.seed,
             "keep": plan.config.keep,
-            "allow_files": self.allow_files,
             "recordings": str(self.cache / "recordings"),
             "work": work if plan.config.cache_gb and run.arm.known_code else None,
         }
@@ -231,28 +225,6 @@ def _check_free_space(folder: Path) -> None:
             f"{folder}: the disk has {free_gb:.2g} GB free, expected at least {_LEAST_FREE_GB} GB",
             'free disk space, choose another folder, or set keep = "tables" in the study',
         )
-
-
-def _read_recalibration(plan: Plan) -> dict[str, Any] | None:
-    """What another study fitted, of the families and arms of this one; None if the study names none."""
-    if not plan.config.recalibration:
-        return None
-    path = plan.config.folder / plan.config.recalibration
-    with reading(path, "a recalibration", "name the recalibration.json of a study of the same families and arms"):
-        found = read_json(path, "a recalibration")
-        groups, arms = {scene.group for scene in plan.scenes}, {arm.name for arm in plan.arms}
-        missing = [f"{arm} on {group}" for group in sorted(groups) for arm in sorted(arms) if arm not in found[group]]
-        fitted = {s for group in groups for arm in arms for s in found[group].get(arm, {}).get("scenes", ())}
-    if missing:
-        raise InputError(
-            f"recalibration {path} has no fit of {', '.join(missing[:5])}", "add these arms to that study"
-        )
-    if again := sorted(fitted & {scene.name for scene in plan.scenes}):
-        raise InputError(
-            f"recalibration {path} was fitted to {again[0]}, a scene of this study",
-            "forecasts are recalibrated on other scenes: leave the field out, or name a study of other scenes",
-        )
-    return {group: {arm: found[group][arm] for arm in arms} for group in groups}
 
 
 def _description(plan: Plan) -> dict[str, Any]:

@@ -145,8 +145,9 @@ class Summary:
         for one in self.differences:
             if one.metric in ENDPOINTS and (one.family, one.arm) == (family, arm) and one.adjusted:
                 d = one.difference
-                limits = np.array([d.low, d.low_bootstrap, d.high, d.high_bootstrap])
-                lead = np.nanmin(-ENDPOINTS[one.metric] * limits)  # of the reference, at least
+                limits = [d.low, d.low_bootstrap, d.high, d.high_bootstrap]
+                # The least lead of the reference. It is NaN, and no claim is made, if no interval is known.
+                lead = np.fmin.reduce(-ENDPOINTS[one.metric] * np.array(limits))
                 found.append((lead > 0 and d.p_holm < 1 - LEVEL, lead > -NOT_WORSE and d.n >= CLAIM))
         better, not_worse = zip(*found, strict=True) if found else ((), ())
         return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
