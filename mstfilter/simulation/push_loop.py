@@ -24,7 +24,7 @@ from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.scene import Clip, Frame, Recording, VoxelGrid
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.recorder import SimulatedScene, stream
-from mstfilter.simulation.world import FingerPush, PushEffect, draw_push, is_clear, play_push
+from mstfilter.simulation.world import FingerPush, PushEffect, draw_push, is_clear
 
 _LISTS = ("_frames", "_instances", "_truths", "_pauses", "_times", "effects")
 
@@ -115,14 +115,6 @@ class PushLoop:
         times = tuple(self._times[first:])
         self.clip = Clip(tuple(self._frames[first:]), self.grid, self.n_pushes, times)
         return self.clip
-
-    def effect(self, push: FingerPush) -> PushEffect:
-        """What a push would do; the scene is left unchanged. For oracles: a policy cannot know it."""
-        saved = self._scene.world.save()
-        try:
-            return play_push(self._scene.world, push, self.family)
-        finally:
-            self._scene.world.restore(saved)
 
     def save(self) -> LoopState:
         """The present state, for `restore`: to try several pushes from it."""

@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.open3d_import import import_open3d
 from mstfilter.scene import Camera, depth_sigma, look_at
+from mstfilter.simulation.lighting import Stage
+from mstfilter.simulation.recorder import POSE_TOLERANCE
 from mstfilter.simulation.renderer import Renderer
 from mstfilter.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.simulation.shapes import Shape, draw_shape
@@ -264,3 +266,21 @@ def test_the_colour_sensor_keeps_grey_and_order():
     assert image.dtype == np.uint8
     assert (np.diff(levels) > 0).all() and levels[0] < 12 and levels[-1] > 240
     assert np.abs(image.mean(axis=(0, 1)) - image.mean()).max() < 1
+
+
+def test_rendered_poses_are_within_the_tolerance():
+    shape = draw_shape(np.random.default_rng(0), "carton")
+    world = PhysicsWorld([shape])
+    stage, pose = Stage(world, POSE_TOLERANCE), world.poses()[0]
+    rng = np.random.default_rng(0)
+    corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * shape.half
+    moved = 0
+    for _ in range(60):
+        pose[:3, 3] += rng.normal(0, 3e-5, 3)
+        world.place(0, pose[:3, 3], pose[:3, :3])
+        before = stage.poses[0]
+        stage.follow()
+        moved += (stage.poses[0] != before).any()
+        shown, true = (p[:3, :3] @ corners.T + p[:3, 3:] for p in (stage.poses[0], world.poses()[0]))
+        assert np.linalg.norm(shown - true, axis=0).max() <= POSE_TOLERANCE
+    assert 2 < moved < 40
