@@ -80,7 +80,14 @@ def test_contents_of_the_page(finished):
     text, page = read(path)
     assert "two boxes" in page.text and "seed 7" in page.text
     assert "3 hypotheses" in page.text and "after 3 pauses" in page.text
-    for words in ("motions.static", "nothing moved", "sampler.acceptance", "transition", "one blob", "Genealogy"):
+    for words in (
+        "motions.static",
+        "nothing moved",
+        "sampler.acceptance",
+        "transition",
+        "one blob",
+        "effective sample size",
+    ):
         assert words in page.text
     assert "connected components" in page.text and "own.py:Stay" in page.text
     # One picture of the camera a pause, used by every card of it; truth and heaviest are drawn at the top too.
@@ -136,7 +143,7 @@ def test_kinds_of_runs(kind, tmp_path):
     if not kind.get("truth", True):
         assert "no ground truth" in page.text and "one blob" not in page.text and "Truth" not in page.text
     if kind.get("pauses") == 1:
-        assert "after 1 pause," in page.text and "Genealogy" not in page.text
+        assert "after 1 pause," in page.text
     if kind.get("empty"):
         assert "with 0 objects" in page.text
 

@@ -1,4 +1,4 @@
-"""Scenes in three dimensions: the page, seen by a headless browser, and the file of rerun."""
+"""Scenes in three dimensions: the page, seen by a headless browser."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ import json
 import re
 import shutil
 import subprocess
-import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError
 from mstfilter.report import recording_page, run_page, viewer
 from mstfilter.report.pictures import colour
 from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
@@ -150,9 +148,9 @@ def test_a_browser_draws_every_object_of_a_hypothesis(tmp_path):
 @needs_browser
 def test_a_browser_draws_a_run(run, tmp_path, capsys):
     """The command writes one page; image, voxels and time line are drawn without network."""
-    page = tmp_path / "run.html"
-    code, out, _ = call("view", run.path, "--html", page, capsys=capsys)
-    assert code == 0 and "run.html" in out
+    code, out, _ = call("view", run.path, capsys=capsys)
+    page = run.path / "view.html"
+    assert code == 0 and str(page) in out
     text = browse(page, tmp_path, "--dump-dom", size="1000,800")
     last = data_of(run_page(run))["pauses"][-1]["views"]
     assert text.count("<circle") == 2 * sum(len(p["views"]) for p in data_of(run_page(run))["pauses"])
@@ -178,50 +176,3 @@ def test_the_help_names_what_the_time_line_has(tmp_path, truth):
     assert ("Each ring is the truth." in text) is truth and ("ring" in text) is truth
     text = help_of(recording_page(recording(truth=truth)), tmp_path)
     assert f"Each ring is the {'truth' if truth else 'surface'}." in text and "disc" not in text
-
-
-def test_files_of_rerun_hold_every_entity(run, tmp_path, capsys):
-    rerun = pytest.importorskip("rerun")
-    rerun.set_strict_mode(True)
-    code, out, _ = call("view", run.path, "--save", tmp_path / "run.rrd", capsys=capsys)
-    assert code == 0 and "run.rrd" in out
-    viewer.save_rerun(replace(recording(), name="two boxes"), tmp_path / "recording.rrd")
-    for name, wanted in (
-        (
-            "run",
-            ("/world/hypothesis_0", "/world/truth", "/world/camera/image/hypothesis_0", "/weight/", "/genealogy"),
-        ),
-        ("recording", ("/world/truth", "/world/camera/image/depth")),
-    ):
-        command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(tmp_path / f"{name}.rrd")]
-        shown = subprocess.run(
-            command, capture_output=True, check=True, timeout=600, env={"CI": "1", "HOME": str(tmp_path)}
-        )
-        for entity in wanted:
-            assert entity in shown.stdout.decode(), entity
-
-
-def test_the_viewer_listens_on_this_machine_only_and_sends_no_analytics(run, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("rerun")
-    calls = []
-    monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
-    monkeypatch.setattr(
-        viewer.subprocess,
-        "run",
-        lambda *command, **named: calls.append((*command, named)) or subprocess.CompletedProcess("", 0),
-    )
-    assert call("view", run.path, capsys=capsys)[0] == 0
-    ((command, named),) = calls
-    assert command[command.index("--bind") + 1] == "127.0.0.1"
-    assert named["env"]["CI"] and "FORCE_RERUN_ANALYTICS" not in named["env"]
-
-
-def test_without_rerun_one_error_says_what_to_install(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    for arguments in ((), ("--save", tmp_path / "run.rrd")):
-        code, _, error = call("view", run.path, *arguments, capsys=capsys)
-        assert code == 2 and error.count("error:") == 1
-        assert "rerun-sdk" in error and "mstfilter[viewer]" in error and "--html" in error
-    with pytest.raises(MissingLibraryError):
-        viewer.save_rerun(run, tmp_path / "run.rrd")
-    assert call("view", run.path, "--html", tmp_path / "run.html", capsys=capsys)[0] == 0
