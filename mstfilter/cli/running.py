@@ -146,7 +146,7 @@ def report(
     run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
     export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
-    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply, obj or glb.")] = "ply",
+    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply or obj.")] = "ply",
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
