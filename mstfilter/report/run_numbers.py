@@ -124,19 +124,9 @@ class RunNumbers:
     steps: Sequence[PauseNumbers] = field(default_factory=tuple)
 
     @property
-    def title(self) -> str:
-        """Name of the recording."""
-        return str(self.description["recording"]["name"])
-
-    @property
     def status(self) -> str:
         """Status of the run: running, interrupted, failed, done."""
         return str(self.description["status"])
-
-    @property
-    def truth_users(self) -> list[str]:
-        """Classes of the components that use the ground truth."""
-        return list(self.description["uses_truth"])
 
     @cached_property
     def slots(self) -> list[str]:

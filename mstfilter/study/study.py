@@ -242,15 +242,8 @@ def _description(plan: Plan) -> dict[str, Any]:
         "scenes": [asdict(scene) for scene in plan.scenes],
         "seeds": study.seeds,
         "runs": [
-            {
-                "name": run.name,
-                "folder": run.folder,
-                "identity": run.identity,
-                "arm": run.arm.name,
-                "scene": run.scene.name,
-                "group": run.scene.group,
-                "seed": run.seed,
-            }
+            {name: getattr(run, name) for name in ("name", "folder", "identity", "seed")}
+            | {"arm": run.arm.name, "scene": run.scene.name, "group": run.scene.group}
             for run in plan.runs
         ],
     }

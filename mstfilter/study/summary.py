@@ -234,12 +234,16 @@ def summarise(
         for arm in arms
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
     ]
+    return Summary(families, arms, names, reference, metrics, _adjust(differences))
+
+
+def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
+    """Adjust the p values of both endpoints together; those of arms that are only reported become NaN."""
     p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
-    differences = [
+    return tuple(
         replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one
         for one, q in zip(differences, p, strict=True)
-    ]
-    return Summary(families, arms, names, reference, metrics, tuple(differences))
+    )
 
 
 _Values = dict[tuple[str, str, str], dict[str, float]]

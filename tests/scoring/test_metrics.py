@@ -70,7 +70,7 @@ def test_pairs_of_hypotheses(world, seed):
     expected = [[weighted_coverage(a, b) for b in labels] for a in labels]
     np.testing.assert_allclose(pairwise_quality(labels), expected)
     pairs = [1 - weighted_coverage(a, b) for a, b in itertools.combinations(labels, 2)]
-    assert diversity(labels) == pytest.approx(np.mean(pairs) if pairs else math.nan, nan_ok=True)
+    assert diversity(pairwise_quality(labels)) == pytest.approx(np.mean(pairs) if pairs else math.nan, nan_ok=True)
     losses = [sum(w * (1 - q) for w, q in zip(weights, row, strict=True)) for row in expected]
     assert losses[least_loss(labels, weights)] == pytest.approx(min(losses))
 
