@@ -14,9 +14,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.report import recording_page, run_page, viewer
-from mstfilter.report.pictures import colour
 from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
-from mstfilter.testing import scene_example
 from tests.report.pages import check_html
 from tests.report.runs import GRID, make_run, recording, truth_at
 from tests.test_cli import call
@@ -140,21 +138,6 @@ def test_an_empty_scene_has_a_page():
 
 
 @needs_browser
-def test_a_browser_finds_the_open_faces(tmp_path):
-    text = browse(SMALL.show().save(tmp_path / "scene.html"), tmp_path, "--dump-dom")
-    assert int(re.search(r'data-faces="(\d+)"', text)[1]) == open_faces(LABELS)
-
-
-@needs_browser
-def test_a_browser_draws_every_object_of_a_hypothesis(tmp_path):
-    hypothesis = scene_example(np.random.default_rng(0), 5)[0].particles[0]
-    page = hypothesis.show().save(tmp_path / "scene.html")
-    browse(page, tmp_path, f"--screenshot={tmp_path / 'scene.png'}")
-    for k in range(hypothesis.n_objects):
-        assert pixels_of(tmp_path / "scene.png", colour(k)) > 500
-
-
-@needs_browser
 def test_a_browser_draws_a_run(run, tmp_path):
     """Image, voxels and time line are drawn without network."""
     page = run_page(run).save(tmp_path / "run.html")
@@ -168,18 +151,3 @@ def test_a_browser_draws_a_run(run, tmp_path):
     for one in last[0]["objects"]:
         rgb = [int(one["colour"][k : k + 2], 16) for k in (1, 3, 5)]
         assert pixels_of(tmp_path / "run.png", rgb) > 200
-
-
-def help_of(page, tmp_path) -> str:
-    text = browse(page.save(tmp_path / "page.html"), tmp_path, "--dump-dom")
-    return re.search(r'id="help">(.*?)</p>', text)[1]
-
-
-@needs_browser
-@pytest.mark.parametrize("truth", [True, False])
-def test_the_help_names_what_the_time_line_has(tmp_path, truth):
-    text = help_of(run_page(make_run(tmp_path / "run", truth=truth)), tmp_path)
-    assert "Each disc is a hypothesis" in text
-    assert ("Each ring is the truth." in text) is truth and ("ring" in text) is truth
-    text = help_of(recording_page(recording(truth=truth)), tmp_path)
-    assert f"Each ring is the {'truth' if truth else 'surface'}." in text and "disc" not in text

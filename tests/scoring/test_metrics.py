@@ -75,15 +75,6 @@ def test_pairs_of_hypotheses(world, seed):
     assert losses[least_loss(labels, weights)] == pytest.approx(min(losses))
 
 
-def test_known_errors():
-    """A row of cells: one object split in two, two merged into one, one missed, one invented."""
-    truth = np.array([1] * 6 + [2] * 3 + [3] * 3 + [4] * 3 + [0] * 3)
-    found = np.array([5] * 3 + [6] * 3 + [7] * 6 + [0] * 3 + [8] * 3)
-    errors = {"split": 1, "merged": 1, "missed": 1, "invented": 1}
-    volumes = {"occupancy": 12 / 18, "volume_missed": 3 / 15, "volume_invented": 3 / 15}
-    assert object_metrics(overlap(found, truth)) == {**errors, **volumes, "object_f": 0.0}
-
-
 def test_metrics_of_a_population():
     truth = np.zeros((6, 6, 3), int)
     truth[:2], truth[3:5], truth[5] = 1, 2, 3

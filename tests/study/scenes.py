@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mstfilter.files import read_csv
 from mstfilter.formats import RecordingWriter
 from mstfilter.scene import scene_cache
 from mstfilter.study import Executor
@@ -21,6 +22,17 @@ def slide(path, seed=0, pauses=3):
             if index % 2 == 0:
                 writer.add_voxels(labels)
     return path
+
+
+def table(path, name="runs.csv"):
+    """The rows of a table of a study."""
+    return read_csv(path / name)
+
+
+def metrics(path):
+    """The table of runs without time and memory."""
+    cost = ("core_seconds", "seconds", "peak_mb")
+    return [{k: v for k, v in row.items() if not k.startswith(cost)} for row in table(path)]
 
 
 class InProcess(Executor):

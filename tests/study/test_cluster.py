@@ -11,8 +11,8 @@ from mstfilter.study.cluster import Cluster
 from mstfilter.study.executors import Local
 from mstfilter.study.plan import make_plan
 from mstfilter.study.study import run_study
-from tests.study.scenes import slide
-from tests.study.test_failures import LimitHanging, metrics, study, table
+from tests.study.scenes import metrics, slide, table
+from tests.study.test_failures import LimitHanging, study
 
 dask = pytest.importorskip("dask", reason="dask absent: pip install -e '.[dask]'")
 distributed = pytest.importorskip("distributed", reason="dask absent: pip install -e '.[dask]'")

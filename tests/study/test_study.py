@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import shutil
 import sqlite3
@@ -19,7 +18,7 @@ from mstfilter.study.config import SceneEntry, load_study, split_grid, study_of
 from mstfilter.study.jobs import perform
 from mstfilter.study.plan import make_plan
 from mstfilter.study.study import run_study
-from tests.study.scenes import InProcess, slide
+from tests.study.scenes import InProcess, metrics, slide
 
 BASE = """
 description = "test"
@@ -45,19 +44,12 @@ def folder(tmp_path_factory):
     return path
 
 
-def table(path, costs=False):
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    kept = [k for k in rows[0] if costs or not k.startswith(("seconds", "core_seconds", "peak_mb"))]
-    return [{k: row[k] for k in kept} for row in rows]
-
-
 def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     study = load_study(folder / "base.toml")
     first = run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache", progress=True)
     assert (first.done, first.repeated, first.failed) == (8, 0, ())
     assert "8/8" in capsys.readouterr().err
-    rows = table(tmp_path / "out" / "runs.csv")
+    rows = metrics(tmp_path / "out")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
         "floor_components resampler=systematic",
@@ -127,7 +119,7 @@ def test_a_larger_study_runs_new_runs_only(folder, tmp_path):
     larger = study.model_copy(update={"seeds": (*study.seeds, 7)})
     more = run_study(larger, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
     assert (more.done, more.repeated) == (8, 4)
-    assert {r["seed"] for r in table(tmp_path / "out" / "runs.csv")} == {str(seed) for seed in larger.seeds}
+    assert {r["seed"] for r in metrics(tmp_path / "out")} == {str(seed) for seed in larger.seeds}
 
 
 def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
@@ -138,7 +130,7 @@ def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
         run_study(chosen, tmp_path / keep, InProcess(), cache=tmp_path / "cache")
         runs = list((tmp_path / keep / "runs").iterdir())
         assert runs and all((path / "pauses").exists() == (keep == "all") for path in runs)
-    assert table(tmp_path / "all" / "runs.csv") == table(tmp_path / "tables" / "runs.csv")
+    assert metrics(tmp_path / "all") == metrics(tmp_path / "tables")
 
 
 def test_a_worker_with_other_code_refuses():
@@ -170,7 +162,7 @@ def test_shared_work_changes_no_result(folder, tmp_path):
                 path.write_bytes(path.read_bytes()[:-40])
         study = study_of({**data, "cache_gb": 0 if case == "none" else 1})
         run_study(study, tmp_path / case, InProcess(), cache=cache)
-        found[case] = (tmp_path / case / "runs.csv").read_text() and table(tmp_path / case / "runs.csv")
+        found[case] = metrics(tmp_path / case)
         assert (cache / "work").exists() == (case != "none")
     with contextlib.closing(sqlite3.connect(cache / "work" / "cache.db")) as database:
         stored = {name for (name,) in database.execute("SELECT DISTINCT tag FROM Cache")}
