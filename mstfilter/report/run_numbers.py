@@ -1,7 +1,7 @@
-"""The numbers of a run and what they say, in sentences: for its report and the command line.
+"""The numbers of a run: for its report and the command line.
 
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
->>> numbers.summary, numbers.steps[-1].mean
+>>> numbers.value_of_the_past, numbers.steps[-1].mean
 
 They are read from the run folder alone, of a finished or an interrupted run.
 """
@@ -174,53 +174,6 @@ class RunNumbers:
             f"{quality[1]:.3f} from each image alone (higher is better); log loss is {loss[0]:.3f} and {loss[1]:.3f} "
             "nats (lower is better)."
         ]
-
-    @property
-    def summary(self) -> list[str]:
-        """The run in one to six sentences."""
-        planned = len(self.description["recording"]["pauses"])
-        done = len(self.steps)
-        sentences = []
-        if self.status != "done":
-            verbs = {"running": "has not ended", "interrupted": "was interrupted", "failed": "failed"}
-            sentences.append(f"The run {verbs[self.status]}: {done} of {planned} pauses are complete.")
-        if not done:
-            return sentences or ["The run has no pauses."]
-        sentences += self.value_of_the_past
-        last = self.steps[-1]
-        n = len(last.weights)
-        same = "" if last.n_distinct == n else f" ({last.distinct_text})"
-        objects = sorted(set(last.objects))
-        count = _count(objects[0], "object") if len(objects) == 1 else f"{objects[0]} to {objects[-1]} objects"
-        truth = "" if last.true_objects is None else f"; the ground truth has {last.true_objects}"
-        hypotheses = _count(n, "hypothesis", "hypotheses")
-        sentences.append(f"{hypotheses}{same} after {_count(done, 'pause')}, with {count}{truth}.")
-        if last.mean is not None:
-            others = [f"{name} {value:.2f}" for name, value in last.compared.items()]
-            baselines = [f"{name} {value:.2f}" for name, value in last.baselines.items()]
-            beside = f" Beside it: {', '.join(others)}." if others else ""
-            sentences.append(
-                f"Their mean quality is {last.mean:.2f} of 1.{beside} Trivial baselines: {', '.join(baselines)}."
-            )
-            if last.mean <= max(last.baselines.values()) + 0.005:
-                sentences.append("That is no better than the baselines.")
-        if last.image_score is not None:
-            one = last.image_score
-            sentences.append(
-                f"In the image, where hidden parts do not count, their mean quality is {one.mean:.2f} of 1. Trivial "
-                f"baselines: one blob {one.one_blob:.2f}, connected components {one.components:.2f}."
-            )
-        if last.belief is not None:
-            sentences.append(
-                "Asked whether two voxels belong to one object, the weighted set has a log loss of "
-                f"{last.belief.row['log_loss']:.2f} nats; a forecast that knows only "
-                f"how often the answer is yes has {last.belief.base_rate_loss:.2f}."
-            )
-        return sentences
-
-
-def _count(n: int, one: str, several: str = "") -> str:
-    return f"{n} {one if n == 1 else several or one + 's'}"
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:

@@ -180,7 +180,7 @@ def measure_pause(
     row : dict
         Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
         ``qualities`` and ``energy_noise`` are lists, which tables leave out.
-    counts : (r, 1001, 7) int32, or None without ground truth
+    counts : (r, 1001, 2) int32, or None without ground truth
         As in `BeliefScore`.
     """
     labels = [h.labels for h in hypotheses]
@@ -192,7 +192,7 @@ def measure_pause(
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
     status = object_status(recording, t) if known else {}
     found, q = pause_metrics(labels, weights, truth, status)
-    belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth, status)
+    belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth)
     return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
 

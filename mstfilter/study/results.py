@@ -35,7 +35,7 @@ from mstfilter.files import write_csv
 from mstfilter.forecasts import ForecastTable
 from mstfilter.reading import read_arrays, read_model
 from mstfilter.runs import write_json
-from mstfilter.scoring import NO_COUNTS, forecast_table, leave_one_out
+from mstfilter.scoring import LOG_LOSS, NO_COUNTS, forecast_table, leave_one_out
 from mstfilter.study.summary import Summary, summarise
 
 STUDY_FORMAT = 2
@@ -205,7 +205,7 @@ class StudyFolder:
         return rows
 
     def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Add the recalibrated log loss, its splits and ``energy_floor`` to rows, in place.
+        """Add the recalibrated log loss and ``energy_floor`` to rows, in place.
 
         The forecasts of a scene are recalibrated on the other scenes of its family and arm, and so is the rate of
         noise for the floor of the energy score. Filter seeds of one scene are never on both sides.
@@ -221,11 +221,11 @@ class StudyFolder:
             for row in own:
                 scene, of_run = row["scene"], counts.get((row["scene"], row["seed"]))
                 if scene in fits and of_run is not None:
-                    row.update(fits[scene].row(of_run[row["pause"]]))
+                    row[LOG_LOSS] = fits[scene].log_loss(of_run[row["pause"]])
                     row["energy_floor"] = row["energy_noise"][best[scene]]
 
     def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
-        """Counts (T, r, 1001, 7) of the forecasts of every run of an arm that has them, by scene and seed."""
+        """Counts (T, r, 1001, 2) of the forecasts of every run of an arm that has them, by scene and seed."""
         found = {}
         for run in self.description["runs"]:
             path = self.run(run["folder"]) / FORECASTS
@@ -272,7 +272,7 @@ class StudyFolder:
 
 
 def _sum_by_scene(counts: Mapping[tuple[str, Any], np.ndarray]) -> dict[str, np.ndarray]:
-    """Counts (r, 1001, 7) of each scene, summed over seeds and pauses t >= 1."""
+    """Counts (r, 1001, 2) of each scene, summed over seeds and pauses t >= 1."""
     found: dict[str, np.ndarray] = {}
     for (scene, _), one in counts.items():
         found[scene] = found.get(scene, 0) + one[1:].sum(axis=0, dtype=np.int64)

@@ -10,8 +10,6 @@ import pytest
 from mstfilter.errors import InputError
 from mstfilter.forecasts import ForecastTable, energy_score, is_negative_type
 from mstfilter.scoring import (
-    CATEGORIES,
-    LOG_LOSS,
     NOISE_RATES,
     FittedForecasts,
     Questions,
@@ -59,22 +57,16 @@ def test_with_the_pair_distance_the_energy_score_is_the_brier_score():
     assert score_belief(questions, labels, weights, truth).row["brier"] == pytest.approx(brier, abs=1e-9)
 
 
-def test_counts_hold_the_forecasts_of_every_category():
+def test_counts_hold_the_forecasts_and_outcomes():
     truth, questions = scene(1)
     labels = guesses(truth, np.random.default_rng(1))
-    score = score_belief(questions, labels, np.full(5, 0.2), truth, {1: "visible", 2: "hidden"})
-    assert (score.counts.sum(axis=(1, 2)) == len(questions)).all()
-    a, b = (truth.flat[k] for k in (questions.first, questions.second))
-    total = dict(zip(CATEGORIES, score.counts[0].sum(axis=0), strict=True))
-    assert total["free"] == ((a == 0) | (b == 0)).sum()
-    assert total["same visible"] == ((a == 1) & (b == 1)).sum()
-    assert total["different hidden"] == ((a > 0) & (b > 0) & (a != b)).sum()
+    score = score_belief(questions, labels, np.full(5, 0.2), truth)
+    yes = questions.outcomes(truth).sum()
+    assert (score.counts.sum(axis=1) == (len(questions) - yes, yes)).all()
     for k, rate in enumerate(NOISE_RATES):
         p = questions.forecasts(labels, np.full(5, 0.2), NOISE_RATES)[k]
         table, direct = forecast_table(score.counts[k]), ForecastTable.of(p, questions.outcomes(truth))
         assert table.brier == pytest.approx(direct.brier, abs=1e-3), rate
-    same = forecast_table(score.counts[0], CATEGORIES[:3])
-    assert same.no.sum() == 0 and same.yes.sum() == questions.outcomes(truth).sum()
 
 
 def test_without_questions_scores_are_unknown():
@@ -131,11 +123,6 @@ def test_leave_one_out_uses_the_other_scenes_only():
         rest = FittedForecasts.fit(sum(counts[k].astype(int) for k in counts if k != seed))
         assert fits[seed].rate == rest.rate
         assert fits[seed].log_loss(counts[seed]) == rest.log_loss(counts[seed])
-    row = fits[0].row(counts[0])
-    parts = [forecast_table(counts[0][0], names).n for names in (CATEGORIES[:3], CATEGORIES[3:6], ("free",))]
-    split = [row[f"{LOG_LOSS}_{name}"] for name in ("same", "different", "free")]
-    known = [(n, x) for n, x in zip(parts, split, strict=True) if n]
-    assert row[LOG_LOSS] == pytest.approx(sum(n * x for n, x in known) / sum(parts))
 
 
 # A world that can be enumerated: which of four voxels in a row belong together, free voxels included.
