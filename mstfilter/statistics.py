@@ -213,13 +213,6 @@ def holm(p: Sequence[float]) -> np.ndarray:
     return out
 
 
-def adjusted(differences: Sequence[Difference]) -> list[Difference]:
-    """The differences of one table with p values adjusted together."""
-    return [
-        replace(d, p_holm=float(p)) for d, p in zip(differences, holm([d.p_claim for d in differences]), strict=True)
-    ]
-
-
 def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Difference]:
     """Every arm minus the reference, with p values adjusted together.
 
@@ -237,8 +230,9 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")
-    others = [arm for arm in table if arm != reference]
-    return dict(zip(others, adjusted([compare(table[arm], table[reference]) for arm in others]), strict=True))
+    found = {arm: compare(values, table[reference]) for arm, values in table.items() if arm != reference}
+    p = holm([d.p_claim for d in found.values()])
+    return {arm: replace(d, p_holm=float(q)) for (arm, d), q in zip(found.items(), p, strict=True)}
 
 
 def slope(times: np.ndarray, values: np.ndarray) -> float:

@@ -116,7 +116,7 @@ def _write_study(path: Path) -> None:
 
 
 def _read_study(path: Path) -> None:
-    check_arm_names(load_study(path / "mine.toml"), allow_files=False)
+    check_arm_names(load_study(path / "mine.toml"))
 
 
 def _write_study_folder(path: Path) -> None:

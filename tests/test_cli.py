@@ -70,7 +70,7 @@ WRITERS = {
     "train": ("border", "--out"),
     "report": ("none", "--out"),
     "report, meshes": ("none", "--export"),
-    "view": ("none", "--html"),
+    "view": ("none", "--out"),
     "quality": ("none", "none", "--csv"),
 }
 

@@ -65,10 +65,12 @@ def test_a_run_states_its_machine_and_warns_if_it_is_resumed_on_another(tmp_path
 def test_a_matplotlibrc_of_the_user_does_not_change_a_figure():
     import matplotlib
 
-    from mstfilter.report.figures import health_figure
+    from mstfilter.report.figures import quality_figure
 
     def drawn() -> str:
-        return health_figure({"a": [(1.0, 3), None, (2.0, 3)]})
+        return quality_figure(
+            [0, 1], [[0.1, 0.5], [0.4, 0.6]], [[0.5, 0.5], [0.2, 0.8]], {}, {"one blob": [0.1, 0.2]}
+        )
 
     expected = drawn()
     with matplotlib.rc_context(

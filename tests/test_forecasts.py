@@ -34,27 +34,6 @@ def test_wrong_forecasts_are_named(p, y, message):
         ForecastTable.of(p, y)
 
 
-def test_theory_of_simple_forecasters():
-    """A constant, a random, and a perfectly informed forecaster of an event of probability .3."""
-    rng = np.random.default_rng(0)
-    y = rng.random(200_000) < 0.3
-    constant = ForecastTable.of(np.full(len(y), 0.3), y)
-    uninformed = ForecastTable.of(np.round(rng.random(len(y)), 3), y)
-    informed = ForecastTable.of(y.astype(float), y)
-    # 4 standard errors of the means: 1 false alarm in 15,000 for each
-    assert constant.brier == pytest.approx(0.3 * 0.7, abs=4 * 0.4 * 0.46 / np.sqrt(len(y)))
-    assert constant.log_loss() == pytest.approx(
-        -0.3 * np.log(0.3) - 0.7 * np.log(0.7), abs=4 * 0.39 / np.sqrt(len(y))
-    )
-    assert uninformed.brier == pytest.approx(1 / 3, abs=4 * 0.3 / np.sqrt(len(y)))
-    assert (informed.brier, informed.log_loss()) == (0, 0)
-    # What a random forecaster says carries nothing: after recalibration it equals the constant one.
-    entropy = constant.log_loss()
-    assert Recalibration.fit(uninformed).log_loss(uninformed) == pytest.approx(entropy, abs=1e-3)
-    assert Recalibration.fit(constant).log_loss(constant) == pytest.approx(entropy)
-    assert Recalibration.fit(informed).log_loss(informed) == pytest.approx(-np.log(0.999))  # clipped
-
-
 def test_reliability_of_a_calibrated_and_an_overconfident_forecaster():
     rng = np.random.default_rng(1)
     p = rng.choice(np.linspace(0, 1, 41), size=100_000)
@@ -85,16 +64,6 @@ def test_recalibration_is_the_best_monotone_map(pairs):
         ]
     )
     np.testing.assert_allclose(values, m, atol=1e-9)
-
-
-def test_recalibration_of_a_monotone_transform_is_the_same():
-    """The recalibrated log loss does not depend on how sure the forecasts are, only on what they tell apart."""
-    rng = np.random.default_rng(2)
-    p = rng.integers(1, 20, 5000) / 20
-    y = rng.random(len(p)) < p
-    plain, bold = ForecastTable.of(p, y), ForecastTable.of(p**3 / (p**3 + (1 - p) ** 3), y)
-    assert bold.log_loss() > plain.log_loss() + 0.05
-    assert Recalibration.fit(bold).log_loss(bold) == pytest.approx(Recalibration.fit(plain).log_loss(plain))
 
 
 def expected_score(honest, forecast, D):

@@ -98,7 +98,7 @@ def steps(smoke: bool) -> list[Step]:
         ]
     for kind in ("evidence",) if smoke else starter_kinds("scenes"):
         found.append(plan("every kind", f"mstfilter new {kind} my_{kind}.py"))
-    found.append(plan("viewer", "mstfilter view runs/mine --html run.html"))
+    found.append(plan("viewer", "mstfilter view runs/mine --out run.html"))
     for name in ("comparing",) if smoke else NOTEBOOKS:
         found.append(Step("notebook", ["-c", NOTEBOOK, str(DOCS / f"{name}.md")], f"docs/{name}.md"))
     return found

@@ -35,7 +35,6 @@ _TIMES = (
     "summary.csv",
     "differences.csv",
     "report.html",
-    "recalibration.json",
 )
 
 

@@ -124,7 +124,7 @@ def report(
     run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
     export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
-    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply, obj or glb.")] = "ply",
+    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply or obj.")] = "ply",
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
@@ -149,33 +149,25 @@ def report(
 @app.command()
 def view(
     source: Annotated[Path, typer.Argument(help="Run folder, or recording of any format.")],
-    html: Annotated[Path | None, typer.Option(help="Write a page that any browser opens, without rerun.")] = None,
-    save: Annotated[Path | None, typer.Option(help="Write a file of rerun (.rrd) and do not open it.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file. Default: view.html in the run, NAME.html here.")
+    ] = None,
     format: FormatOption = "",
     option: Options = None,
     pauses: Pauses = "",
 ) -> None:
-    """Look at a run or a recording: time line, image, voxels, weights, genealogy, truth. Opens rerun by default."""
-    import tempfile
-
-    from mstfilter.report import viewer
+    """Write a page that any browser opens: time line, image, voxels, weights, genealogy, truth."""
+    from mstfilter.report import recording_page, run_page
     from mstfilter.runs import RunFolder
 
-    for path in (html, save):
-        if path is not None:
-            check_output(path)
-    if html is None or save is not None:
-        viewer.import_rerun()
-    known = (source / "run.json").is_file()
-    chosen = RunFolder.open(source) if known else read_source(source, format, option, pauses)
-    if html is not None:
-        page = viewer.run_page(chosen) if isinstance(chosen, RunFolder) else viewer.recording_page(chosen)
-        print(f"page        {page.save(html)}")
-    if save is not None:
-        print(f"rerun       {viewer.save_rerun(chosen, save)}")
-    if html is None and save is None:
-        with tempfile.TemporaryDirectory() as folder:
-            viewer.show_rerun(viewer.save_rerun(chosen, Path(folder) / "scenes.rrd"))
+    if out is not None:
+        check_output(out)
+    if (source / "run.json").is_file():
+        page, default = run_page(RunFolder.open(source)), source / "view.html"
+    else:
+        recording = read_source(source, format, option, pauses)
+        page, default = recording_page(recording), Path(f"{recording.name}.html")
+    print(f"page        {page.save(out or default)}")
 
 
 @app.command()

@@ -28,6 +28,4 @@ from mstfilter.report.study_report import write_study_report as write_study_repo
 from mstfilter.report.viewer import (
     recording_page as recording_page,
     run_page as run_page,
-    save_rerun as save_rerun,
-    show_rerun as show_rerun,
 )

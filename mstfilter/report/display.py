@@ -32,7 +32,7 @@ from mstfilter.report.pictures import (
     voxel_picture,
 )
 from mstfilter.scene import Clip, Frame, Hypothesis, Recording
-from mstfilter.smc import Candidates, Info, Infos, ParticleFilter, Population, State, as_matrix
+from mstfilter.smc import Candidates, Population, State, as_matrix
 
 _MOST_PICTURES = 6
 
@@ -130,108 +130,66 @@ def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
 
 
 def to_html(value: Any) -> str:
-    """What a notebook shows for an object of the package: its text, and pictures or a table."""
-    return f'<div style="max-width:60em"><pre style="margin:0">{html.escape(repr(value))}</pre>{_more(value)}</div>'
+    """What a notebook shows for an object of the package: its text and pictures."""
+    text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
+    style = "display:inline-block;margin:4px 8px 4px 0"
+    cells = [
+        f'<figure style="{style}"><img alt="{html.escape(words)}" height="{height}" src="{uri}">'
+        f"<figcaption>{html.escape(words)}</figcaption></figure>"
+        for uri, words, height in _pictures(value)
+    ]
+    return f'<div style="max-width:60em">{text}<div>{"".join(cells)}</div></div>'
+
+
+#: Data URI, caption and height in pixels.
+_Picture = tuple[str, str, int]
 
 
 @singledispatch
-def _more(value: Any) -> str:
-    return ""
+def _pictures(value: Any) -> list[_Picture]:
+    return []
 
 
-def _images(pictures: Sequence[tuple[bytes, str, str]], height: int = 150) -> str:
-    """A row of image files with captions: (bytes, format, caption)."""
-    cells = [
-        f'<figure style="display:inline-block;margin:4px 8px 4px 0"><img alt="{html.escape(text)}" height="{height}" '
-        f'src="{data_uri(data, kind)}"><figcaption>{html.escape(text)}</figcaption></figure>'
-        for data, kind, text in pictures
-    ]
-    return f"<div>{''.join(cells)}</div>"
-
-
-def _photo(frame: Frame, text: str) -> tuple[bytes, str, str]:
+def _photo(frame: Frame, text: str) -> _Picture:
     step = max(1, frame.camera.width // 320)
-    return jpeg_bytes(np.ascontiguousarray(frame.rgb[::step, ::step])), "jpeg", text
+    return data_uri(jpeg_bytes(np.ascontiguousarray(frame.rgb[::step, ::step])), "jpeg"), text, 150
 
 
-@_more.register
-def _(value: Frame) -> str:
-    return _images([_photo(value, "colour")])
+@_pictures.register
+def _(value: Frame) -> list[_Picture]:
+    return [_photo(value, "colour")]
 
 
-@_more.register
-def _(value: Clip) -> str:
+@_pictures.register
+def _(value: Clip) -> list[_Picture]:
     frames = [(value.before, "before"), (value.after, "after")]
-    return _images([_photo(*pair) for pair in (frames if len(value) > 1 else frames[1:])])
+    return [_photo(*pair) for pair in (frames if len(value) > 1 else frames[1:])]
 
 
-@_more.register
-def _(value: Recording) -> str:
-    chosen = _evenly(range(len(value.pauses)), 4)
-    return _images([_photo(value.frames[value.pauses[t]], f"pause {t}") for t in chosen])
+@_pictures.register
+def _(value: Recording) -> list[_Picture]:
+    return [_photo(value.frames[value.pauses[t]], f"pause {t}") for t in _evenly(range(len(value.pauses)), 4)]
 
 
-@_more.register
-def _(value: Hypothesis) -> str:
+@_pictures.register
+def _(value: Hypothesis) -> list[_Picture]:
     view = viewpoint([value], width=480, height=360)
-    picture = png_bytes(voxel_picture(value.labels, value.grid, view, colours_of(value)))
-    return _images([(picture, "png", ".show() can be rotated")], 240)
+    picture = voxel_picture(value.labels, value.grid, view, colours_of(value))
+    return [(data_uri(png_bytes(picture)), ".show() can be rotated", 240)]
 
 
-@_more.register
-def _(value: Population) -> str:
-    if not isinstance(value.particles, Candidates) and isinstance(value.best, Hypothesis):
-        return _images([(png_bytes(picture), "png", text) for picture, text in _voxel_pictures(value)])
-    return ""
+@_pictures.register
+def _(value: Population) -> list[_Picture]:
+    if isinstance(value.particles, Candidates) or not isinstance(value.best, Hypothesis):
+        return []
+    return [(data_uri(png_bytes(picture)), text, 150) for picture, text in _voxel_pictures(value)]
 
 
-@_more.register
-def _(value: Belief) -> str:
-    return _more(value.population)
-
-
-@_more.register
-def _(value: State) -> str:
-    return "" if value.population is None else _more(value.population)
-
-
-@_more.register
-def _(value: Info) -> str:
-    return _more(Infos([value]))
-
-
-@_more.register
-def _(value: Infos) -> str:
-    rows = value.rows()
-    return _table(list(rows[0]), [[_number(v) for v in row.values()] for row in rows]) if rows else ""
-
-
-@_more.register
-def _(value: ParticleFilter) -> str:
-    slots = {name: getattr(value, name) for name in value.__dataclass_fields__}
-    return _table(["slot", "component"], [[name, _short(part)] for name, part in slots.items() if part is not None])
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def cells(tag: str, row: Sequence[str]) -> str:
-        style = "text-align:left;padding:1px 8px"
-        return "".join(f'<{tag} style="{style}">{html.escape(str(cell))}</{tag}>' for cell in row)
-
-    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div style="overflow-x:auto"><table><tr>{cells("th", head)}</tr>{body}</table></div>'
-
-
-def _number(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _short(part: Any) -> str:
-    text = str(part)
-    return text if len(text) <= 160 else f"{text[:157]}..."
+@_pictures.register
+def _(value: Belief | State) -> list[_Picture]:
+    return [] if value.population is None else _pictures(value.population)
 
 
 def _evenly(values: Sequence[int], n: int) -> list[int]:
     """At most `n` of the values, evenly spaced, the first and the last among them."""
-    if len(values) <= n:
-        return list(values)
-    return [values[round(k * (len(values) - 1) / (n - 1))] for k in range(n)]
+    return [values[k] for k in np.linspace(0, len(values) - 1, min(n, len(values))).round().astype(int)]

@@ -1,7 +1,7 @@
 """Export of hypotheses for other programs: meshes, label images and a table of objects. open3d writes the meshes.
 
 >>> export_run("runs/demo", "out")                         # PLY meshes
->>> export_run("runs/demo", "out", mesh_format="glb")
+>>> export_run("runs/demo", "out", mesh_format="obj")
 >>> export_mesh(hypothesis, "scene.obj")                   # one hypothesis
 
 Layout of an exported run::
@@ -11,7 +11,7 @@ Layout of an exported run::
     pause_000/hypothesis_000.png         label of the object at each pixel, 0 for none
 
 Vertices have the colour of their object in the report. Objects share no vertices. A hypothesis without objects has
-no mesh file. In PLY and OBJ the z axis points up as in the recording; in GLB the y axis does, as glTF requires.
+no mesh file. The z axis points up as in the recording.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadec
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
 
-MESH_FORMATS = ("ply", "obj", "glb")
+MESH_FORMATS = ("ply", "obj")
 
 # Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
 _CORNERS = {
@@ -87,7 +87,7 @@ def _voxel_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
 
 
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write the mesh of a hypothesis that has objects; the ending of `path` (ply, obj, glb) chooses the format.
+    """Write the mesh of a hypothesis that has objects; the ending of `path` (ply, obj) chooses the format.
 
     `colours` are those of `hypothesis_mesh`.
     """
@@ -95,13 +95,7 @@ def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, 
     mesh = hypothesis_mesh(hypothesis, colours)
     with atomic_path(path) as partial, TemporaryDirectory(dir=partial.parent) as folder:
         work = str(Path(folder) / path.name)  # open3d writes the name into OBJ files
-        if path.suffix == ".glb":
-            # z up -> y up: (x, y, z) -> (x, z, -y). Only the tensor interface writes binary buffers.
-            mesh.rotate(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
-            written = o3d.t.io.write_triangle_mesh(work, o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-        else:
-            written = o3d.io.write_triangle_mesh(work, mesh)
-        if not written:
+        if not o3d.io.write_triangle_mesh(work, mesh):
             raise InputError(f"open3d cannot write the mesh {path}", "choose another folder")
         os.replace(work, partial)
     return path
@@ -111,7 +105,7 @@ def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = 
     """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, as laid out above.
 
     Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
-    imported. `mesh_format` is "ply", "obj" or "glb".
+    imported. `mesh_format` is "ply" or "obj".
     """
     check_choice("mesh_format", mesh_format, MESH_FORMATS)
     import_open3d()  # a missing library is reported before anything is written

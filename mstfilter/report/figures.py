@@ -14,7 +14,7 @@ import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -107,9 +107,6 @@ def _keep_font_size(match: re.Match[str]) -> str:
     return "" if size is None else f"font-size: {size[1]}px;"
 
 
-_MOST_NAMED = 24  # particles of a pause that are still named in a genealogy
-
-
 def _pause_axis(axes: Axes, times: Sequence[int]) -> None:
     axes.set_xlim(min(times) - 0.5, max(times) + 0.5)
     step = max(1, len(times) // 12)
@@ -146,100 +143,6 @@ def quality_figure(
         axes.set_title("Quality against the ground truth")
         figure.legend(loc="outside lower center", ncols=3, handlelength=2.2, columnspacing=1.4)
         return _svg_text(figure, "Quality of the hypotheses over time")
-
-
-def health_figure(values: Mapping[str, Sequence[tuple[float, int] | None]]) -> str:
-    """Panels of bars: each has (value, most possible value) for each pause, drawn as a share; None for no bar."""
-    with _style("health"):
-        figure, axes = _new_figure(6.6, 2.3, len(values))
-        for a, (title, pairs) in zip(axes, values.items(), strict=True):
-            known = [(t, *pair) for t, pair in enumerate(pairs) if pair is not None]
-            at = [t for t, _, _ in known]
-            share = [100 * value / max(most, 1) for _, value, most in known]
-            a.bar(at, 100, width=0.62, color=_LINE, lw=0, alpha=0.55)
-            a.bar(at, share, width=0.62, color=_ACCENT, lw=0, alpha=0.85)
-            _pause_axis(a, range(len(pairs)))
-            a.set_ylim(0, 122)
-            a.set_yticks([0, 50, 100], ["0", "50 %", "100 %"])
-            for (t, value, most), s in zip(known, share, strict=True):
-                if len(pairs) <= 5:
-                    text = f"{value:.2g}/{most}"
-                    a.annotate(text, (t, s), (0, 2), textcoords="offset points", ha="center", fontsize=9)
-            a.set_title(title)
-        return _svg_text(figure, " and ".join(values))
-
-
-def genealogy_figure(
-    weights: Sequence[Sequence[float]],
-    previous: Sequence[Sequence[int] | None],
-    proposed: Sequence[Sequence[int] | None],
-) -> str:
-    """Genealogy of the particles: those of a pause in a column, disc area by weight.
-
-    For each pause, `weights` has one value per particle, `previous` and `proposed` the previous particle and the
-    proposed sample of each particle; -1 for none. The lineage of the heaviest particle of the last pause is drawn in
-    colour.
-    """
-    n = max(len(w) for w in weights)
-    named = n <= _MOST_NAMED
-    line = _lineage(weights, previous)
-    with _style("genealogy"):
-        figure, (axes,) = _new_figure(6.6, float(np.clip(1.0 + 0.62 * n, 2.2, 6.2)))
-        axes.grid(visible=False)
-        for t, parents in enumerate(previous):
-            for k, parent in enumerate(parents or ()):
-                if t and 0 <= parent < len(weights[t - 1]):
-                    in_lineage = line.get(t) == k
-                    style: dict[str, Any]
-                    style = {"color": _ACCENT, "lw": 2.2} if in_lineage else {"color": _MUTED, "lw": 1, "alpha": 0.45}
-                    x, y = _curve(t - 1, parent, t, k)
-                    axes.plot(x, y, **style)
-        for t, indices in enumerate(proposed):
-            for k, index in enumerate(indices or ()):
-                if index >= 0:
-                    axes.plot([t - 0.11, t], [k - 0.26, k], color=_BASELINE, lw=1, solid_capstyle="round")
-                    if named:
-                        axes.annotate(
-                            f"p{index}",
-                            (t - 0.115, k - 0.3),
-                            ha="right",
-                            va="center",
-                            fontsize=9,
-                            color=_BASELINE,
-                        )
-        for t, w in enumerate(weights):
-            share = np.asarray(w) / np.sum(w)
-            on = np.array([line.get(t) == k for k in range(len(w))])
-            size = (18 if named else 4) + (260 if named else 60) * share
-            for mask, colour in ((~on, _INK), (on, _ACCENT)):
-                axes.scatter(np.full(mask.sum(), t), np.flatnonzero(mask), s=size[mask], color=colour, lw=0, zorder=3)
-            if named:
-                for k in range(len(w)):
-                    axes.annotate(f"#{k}", (t, k), (7, 6), textcoords="offset points", fontsize=9, color=_MUTED)
-        axes.set_ylim(n - 0.4, -0.75)
-        axes.set_yticks([])
-        _pause_axis(axes, range(len(weights)))
-        axes.set_title("Genealogy")
-        return _svg_text(figure, "Genealogy of the particles")
-
-
-def _lineage(weights: Sequence[Sequence[float]], previous: Sequence[Sequence[int] | None]) -> dict[int, int]:
-    """Pause -> particle, for the ancestors of the heaviest particle of the last pause."""
-    t, k = len(weights) - 1, int(np.argmax(weights[-1]))
-    line = {t: k}
-    while t > 0:
-        parents: Sequence[Any] = previous[t] or ()
-        if k >= len(parents) or parents[k] < 0:
-            break
-        t, k = t - 1, int(parents[k])
-        line[t] = k
-    return line
-
-
-def _curve(x0: float, y0: float, x1: float, y1: float) -> tuple[np.ndarray, np.ndarray]:
-    """A smooth line between two points, horizontal at both ends: y = y0 + (y1 - y0) (3 s^2 - 2 s^3)."""
-    s = np.linspace(0, 1, 24)
-    return x0 + (x1 - x0) * s, y0 + (y1 - y0) * (3 * s**2 - 2 * s**3)
 
 
 _MOST, _GROUP = len(SERIES), 8  # arms in a single figure, and in each of several

@@ -49,7 +49,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Bars of the parts of a study; yields the function for its events. Failures are printed above the bars."""
+    """Bars of the parts of a study; yields the function for its progress. Failures are printed above the bars."""
     tasks: dict[str, Any] = {}
     with _bars() as bars:
 
@@ -59,11 +59,9 @@ def study_bars() -> Iterator[Callable[[Any], None]]:
                 tasks[p.what] = bars.add_task(p.what, total=p.total)
             failed = f", {p.failed} failed" if p.failed else ""
             bars.update(tasks[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
-            if p.event is None:
-                return
-            if p.event.kind == "lost":
+            if p.name and p.outcome is None:
                 bars.console.print(f"a worker died in {p.name}", markup=False)
-            elif p.event.outcome is not None and p.event.outcome.status != "done":
-                bars.console.print(f"failed: {p.name}: {p.event.outcome.error}", markup=False)
+            elif p.name and p.outcome.status != "done":
+                bars.console.print(f"failed: {p.name}: {p.outcome.error}", markup=False)
 
         yield update

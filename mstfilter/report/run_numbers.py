@@ -1,7 +1,7 @@
-"""The numbers of a run and what they say, in sentences: for its report and the command line.
+"""The numbers of a run: for its report and the command line.
 
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
->>> numbers.summary, numbers.tiles, numbers.steps[-1].mean
+>>> numbers.value_of_the_past, numbers.steps[-1].mean
 
 They are read from the run folder alone, of a finished or an interrupted run.
 """
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.report.page import seconds_text
 from mstfilter.runs import RunFolder
 from mstfilter.scene import project, render
 from mstfilter.scoring import (
@@ -125,19 +124,9 @@ class RunNumbers:
     steps: Sequence[PauseNumbers] = field(default_factory=tuple)
 
     @property
-    def title(self) -> str:
-        """Name of the recording."""
-        return str(self.description["recording"]["name"])
-
-    @property
     def status(self) -> str:
         """Status of the run: running, interrupted, failed, done."""
         return str(self.description["status"])
-
-    @property
-    def truth_users(self) -> list[str]:
-        """Classes of the components that use the ground truth."""
-        return list(self.description["uses_truth"])
 
     @cached_property
     def slots(self) -> list[str]:
@@ -185,115 +174,6 @@ class RunNumbers:
             f"{quality[1]:.3f} from each image alone (higher is better); log loss is {loss[0]:.3f} and {loss[1]:.3f} "
             "nats (lower is better)."
         ]
-
-    @property
-    def summary(self) -> list[str]:
-        """The run in one to six sentences."""
-        planned = len(self.description["recording"]["pauses"])
-        done = len(self.steps)
-        sentences = []
-        if self.status != "done":
-            verbs = {"running": "has not ended", "interrupted": "was interrupted", "failed": "failed"}
-            sentences.append(f"The run {verbs[self.status]}: {done} of {planned} pauses are complete.")
-        if not done:
-            return sentences or ["The run has no pauses."]
-        sentences += self.value_of_the_past
-        last = self.steps[-1]
-        n = len(last.weights)
-        same = "" if last.n_distinct == n else f" ({last.distinct_text})"
-        objects = sorted(set(last.objects))
-        count = _count(objects[0], "object") if len(objects) == 1 else f"{objects[0]} to {objects[-1]} objects"
-        truth = "" if last.true_objects is None else f"; the ground truth has {last.true_objects}"
-        hypotheses = _count(n, "hypothesis", "hypotheses")
-        sentences.append(f"{hypotheses}{same} after {_count(done, 'pause')}, with {count}{truth}.")
-        if last.mean is not None:
-            others = [f"{name} {value:.2f}" for name, value in last.compared.items()]
-            baselines = [f"{name} {value:.2f}" for name, value in last.baselines.items()]
-            beside = f" Beside it: {', '.join(others)}." if others else ""
-            sentences.append(
-                f"Their mean quality is {last.mean:.2f} of 1.{beside} Trivial baselines: {', '.join(baselines)}."
-            )
-            if last.mean <= max(last.baselines.values()) + 0.005:
-                sentences.append("That is no better than the baselines.")
-        if last.image_score is not None:
-            one = last.image_score
-            sentences.append(
-                f"In the image, where hidden parts do not count, their mean quality is {one.mean:.2f} of 1. Trivial "
-                f"baselines: one blob {one.one_blob:.2f}, connected components {one.components:.2f}."
-            )
-        if last.belief is not None:
-            sentences.append(
-                "Asked whether two voxels belong to one object, the weighted set has a log loss of "
-                f"{last.belief.row['log_loss']:.2f} nats; a forecast that knows only "
-                f"how often the answer is yes has {last.belief.base_rate_loss:.2f}."
-            )
-        return sentences
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why the quality of the last pause with ground truth is what it is, in sentences."""
-        if not self.with_truth:
-            return []
-        step = self.steps[self.with_truth[-1]]
-        m, mean = step.metrics, step.mean
-        assert m is not None and mean is not None
-        percent = {name: f"{100 * m[f'volume_{name}']:.0f} %" for name in ("missed", "invented")}
-        sentences = [
-            "Quality is the volume that a hypothesis and the truth share: the intersection over union of each object "
-            "with its best match, weighted by volume, in both directions. Parts that no image shows count as much as "
-            "visible ones.",
-            f"In the image the outlines overlap with a quality of {step.in_image:.2f}; in the volume it is "
-            f"{mean:.2f}. An image shows only the front of an object; the rest is completed. Compared with the true "
-            f"volume, {percent['missed']} is missed and {percent['invented']} is invented.",
-            "Small errors of shape cost much: a cube of ten voxels that is one voxel too large on each side has "
-            "(10 / 12)³ = .58.",
-        ]
-        kinds = {"visible": "visible", "hidden": "hidden, seen before", "unseen": "never seen"}
-        parts = [f"{m[f'n_{k}']:.0f} {text} {m[f'quality_{k}']:.2f}" for k, text in kinds.items() if m[f"n_{k}"]]
-        if len(parts) > 1:
-            sentences.append(f"Coverage of the true objects by what the camera shows: {', '.join(parts)}.")
-        counts = [(m[name], name) for name in ("split", "merged", "missed", "invented") if m[name] >= 0.05]
-        wrong = ", ".join(f"{n:.1f} {name}" for n, name in counts)
-        end = f"objects on average: {wrong}." if wrong else "no object is split, merged, missed or invented."
-        return [*sentences, f"Wrong {end}" if wrong else f"Beyond shape, {end}"]
-
-    @property
-    def tiles(self) -> list[tuple[str, str, str]]:
-        """Key numbers of the last pause: name, value, remark."""
-        if not self.steps:
-            return []
-        last = self.steps[-1]
-        n = len(last.weights)
-        truth = "" if last.true_objects is None else f", true {last.true_objects}"
-        tiles = [
-            ("hypotheses", str(n), last.distinct_text),
-            ("objects", f"{last.mean_objects:.1f}", f"mean{truth}"),
-        ]
-        if last.mean is not None:
-            tiles.append(
-                ("mean quality", f"{last.mean:.3f}", f"best {last.best:.3f}, in the image {last.in_image:.3f}")
-            )
-        if last.image_score is not None:
-            one = last.image_score
-            tiles.append(("quality in the image", f"{one.mean:.3f}", f"best {one.best:.3f}"))
-        if last.belief is not None:
-            row = last.belief.row
-            remark = (
-                f"nats; base rate {last.belief.base_rate_loss:.3f}; calibration error {row['calibration_error']:.3f}"
-            )
-            tiles.append(("log loss", f"{row['log_loss']:.3f}", remark))
-        remark = f"of {last.info['n_candidates']} candidates; {last.n_distinct} of {n} kept are distinct"
-        tiles.append(("effective sample size", f"{last.info['ess']:.3g}", remark))
-        if len(self.steps) > 1:
-            tiles.append(("unique ancestors", str(last.info["unique_ancestors"]), f"of {n} particles"))
-        seconds = [step.step_seconds for step in self.steps]
-        slowest = f"slowest {seconds_text(max(seconds))}"
-        tiles.append(("time per step", seconds_text(float(np.mean(seconds))), slowest))
-        return tiles
-
-
-def _count(n: int, one: str, several: str = "") -> str:
-    return f"{n} {one if n == 1 else several or one + 's'}"
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:

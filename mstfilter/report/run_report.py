@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.report.figures import genealogy_figure, health_figure, quality_figure, reliability_figure
+from mstfilter.report.figures import quality_figure, reliability_figure
 from mstfilter.report.page import (
     fill_template,
     flatten,
@@ -143,23 +143,7 @@ def _figures(numbers: RunNumbers) -> dict[str, Any]:
     beliefs = [step.belief.counts[0].astype(np.int64) for step in steps if step.belief is not None]
     if beliefs:
         found["reliability"] = Markup(reliability_figure({"all pauses": forecast_table(sum(beliefs))}))
-    if len(steps) <= 1:
-        return found
-    health = health_figure(
-        {
-            "Effective sample size": [(step.info["ess"], step.info["n_candidates"]) for step in steps],
-            "Distinct hypotheses": [(step.n_distinct, step.info["n"]) for step in steps],
-            "Ancestors": [
-                (step.info["unique_ancestors"], step.info["n"]) if t else None for t, step in enumerate(steps)
-            ],
-        }
-    )
-    genealogy = genealogy_figure(
-        [step.weights for step in steps],
-        [step.parents("previous") for step in steps],
-        [step.parents("proposed") for step in steps],
-    )
-    return {**found, "health": Markup(health), "genealogy": Markup(genealogy)}
+    return found
 
 
 def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:

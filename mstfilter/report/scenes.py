@@ -1,4 +1,4 @@
-"""What is shown at the pauses of a run or a recording: for the report, the page that can be rotated, and rerun.
+"""What is shown at the pauses of a run or a recording: for the report and the page that can be rotated.
 
 >>> scenes = scenes_of_run(RunFolder.open("runs/demo"))
 >>> view = scenes[-1].views[0]                        # the heaviest hypothesis of the last pause

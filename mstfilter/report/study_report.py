@@ -77,7 +77,7 @@ def _page(study: StudyFolder) -> str:
         "range": _range,
     }
     records, failures = study.records(), study.failures()
-    summary = study.summary_of(records)
+    summary = study.summary(records)
     scenes: dict[str, list[str]] = defaultdict(list)
     for scene in study.description["scenes"]:
         scenes[scene["group"]].append(scene["name"])

@@ -1,8 +1,7 @@
-"""Scenes in three dimensions: pages that any browser opens, and files of the viewer rerun.
+"""Scenes in three dimensions: pages that any browser opens.
 
 >>> run_page("runs/demo").save("run.html")             # one file: time line, image, voxels, weights, genealogy, truth
 >>> recording_page(recording).save("recording.html")   # images and truth, or the surface that the camera sees
->>> save_rerun(RunFolder.open("runs/demo"), "run.rrd") # the same for rerun (extra `viewer`)
 
 `Hypothesis.show`, the report of a run and ``mstfilter view`` use the same page. A page loads nothing from a network.
 """
@@ -11,10 +10,6 @@ from __future__ import annotations
 
 import html
 import json
-import os
-import subprocess
-import sys
-import uuid
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,12 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, missing_library
-from mstfilter.files import atomic_path, check_output, write_text
-from mstfilter.report.pictures import colour, data_uri, hexadecimal, jpeg_bytes
+from mstfilter.files import check_output, write_text
+from mstfilter.report.pictures import data_uri, hexadecimal, jpeg_bytes
 from mstfilter.report.scenes import ShownHypothesis, ShownPause, scenes_of_recording, scenes_of_run
 from mstfilter.runs import RunFolder
-from mstfilter.scene import Camera, Hypothesis, Recording, occupied_box, project
+from mstfilter.scene import Hypothesis, Recording, occupied_box
 
 
 @dataclass(frozen=True)
@@ -152,157 +146,3 @@ def encode_runs(labels: np.ndarray) -> np.ndarray:
     rows = np.repeat(np.column_stack([flat[starts], np.full(len(starts), most)]), pieces, axis=0)
     rows[last, 1] = lengths - most * (pieces - 1)
     return rows.astype("<u2")
-
-
-def save_rerun(source: RunFolder | Recording, path: str | Path) -> Path:
-    """Write a run or a recording as a file of rerun (.rrd), with the arrangement of its views.
-
-    Raises MissingLibraryError without the library rerun-sdk, InputError if the file cannot be written.
-    """
-    rr = import_rerun()
-    check_output(Path(path))
-    scenes = scenes_of_run(source.check()) if isinstance(source, RunFolder) else scenes_of_recording(source)
-    with atomic_path(path) as partial:
-        name = source.description["recording"]["name"] if isinstance(source, RunFolder) else source.name
-        with rr.RecordingStream(f"mstfilter {name}", recording_id=uuid.uuid4(), send_properties=False) as stream:
-            stream.save(partial, default_blueprint=_blueprint(scenes))
-            _log_scenes(stream, scenes)
-            if isinstance(source, Recording):
-                _log_frames(stream, source)
-            stream.flush()
-            stream.disconnect()
-    return Path(path)
-
-
-def show_rerun(path: str | Path) -> None:
-    """Open a file in the viewer of rerun, and wait until its window is closed.
-
-    The viewer listens on 127.0.0.1 only, on a free port. Its analytics are off: rerun sends none where the variable
-    ``CI`` is set, which is set for the viewer alone.
-    """
-    import_rerun()
-    environment = {k: v for k, v in os.environ.items() if k != "FORCE_RERUN_ANALYTICS"} | {"CI": "1"}
-    # -P: the module is not searched in the working folder, which may hold unknown files.
-    command = [sys.executable, "-P", "-m", "rerun_cli", str(path), "--bind", "127.0.0.1", "--port", "auto"]
-    done = subprocess.run(command, env=environment)
-    if done.returncode:
-        raise InputError(
-            f"the viewer of rerun ended with exit code {done.returncode}",
-            "it needs a display and a graphics driver; --html FILE writes a page that any browser opens",
-        )
-
-
-def import_rerun() -> Any:
-    """The library rerun."""
-    try:
-        import rerun
-        import rerun.blueprint  # noqa: F401
-    except ImportError as error:
-        hint = "--html FILE writes a page that any browser opens, without rerun"
-        raise missing_library(error, "the viewer", hint, library="rerun-sdk") from error
-    return rerun
-
-
-def _entities(scene: ShownPause) -> dict[str, ShownHypothesis]:
-    """Name of the entity of each view: hypotheses are numbered from heavy to light."""
-    return {(view.name if view.weight is None else f"hypothesis_{v}"): view for v, view in enumerate(scene.views)}
-
-
-def _log_scenes(stream: Any, scenes: Sequence[ShownPause]) -> None:
-    """Images, labels in the image, voxels, weights and quality at the pauses; the genealogy."""
-    rr = import_rerun()
-    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    identities = {i for scene in scenes for view in scene.views for i in view.identity.values()}
-    classes = [rr.AnnotationInfo(id=0, color=(0, 0, 0, 0))]  # free pixels are transparent
-    classes += [rr.AnnotationInfo(id=i + 1, label=str(i + 1), color=colour(i)) for i in sorted(identities)]
-    stream.log("world", rr.AnnotationContext(classes), static=True)
-    names = dict.fromkeys(name for scene in scenes for name in _entities(scene))
-    for t, scene in enumerate(scenes):
-        stream.set_time("pause", sequence=t)
-        stream.set_time("time", duration=scene.time)
-        views, camera = _entities(scene), scene.camera
-        if camera is not None and scene.image is not None:
-            _log_camera(stream, camera)
-            stream.log("world/camera/image", rr.Image(scene.image).compress(jpeg_quality=92))
-        for name in names:
-            if name not in views:
-                stream.log(f"world/{name}", rr.Clear(recursive=True))
-                stream.log(f"world/camera/image/{name}", rr.Clear(recursive=True))
-                continue
-            view = views[name]
-            labels, grid = view.hypothesis.labels, view.hypothesis.grid
-            voxels = np.argwhere((labels > 0) & ~_enclosed(labels))
-            of_voxel = labels[tuple(voxels.T)]
-            colours = {k: view.colour(k) for k in view.hypothesis.volumes()}
-            boxes = rr.Boxes3D(
-                centers=grid.centre_of(voxels),
-                half_sizes=np.full((len(voxels), 3), grid.voxel_size / 2),
-                colors=np.array([colours[k] for k in of_voxel.tolist()], np.uint8).reshape(-1, 3),
-                fill_mode="solid",
-            )
-            stream.log(f"world/{name}", boxes)
-            if camera is not None and view.identity:
-                table = np.zeros(int(labels.max(initial=0)) + 1, np.uint16)
-                for label, identity in view.identity.items():
-                    table[label] = identity + 1
-                seen = rr.SegmentationImage(table[project(view.hypothesis, camera)], opacity=0.6)
-                stream.log(f"world/camera/image/{name}", seen)
-            for what in ("weight", "quality"):
-                value = getattr(view, what)
-                if value is not None:
-                    stream.log(f"{what}/{name}", rr.Scalars(value))
-    nodes = [(t, v, view) for t, scene in enumerate(scenes) for v, view in enumerate(scene.views) if view.weight]
-    graph = rr.GraphNodes(
-        [f"{t}/{v}" for t, v, _ in nodes],
-        positions=np.array([(160 * t, 60 * v) for t, v, _ in nodes], float).reshape(-1, 2),
-        labels=[f"{t}: {view.name}" for t, _, view in nodes],
-        radii=[4 + 16 * np.sqrt(view.weight or 0) for _, _, view in nodes],
-    )
-    edges = [(f"{t - 1}/{a}", f"{t}/{b}") for t, scene in enumerate(scenes) for a, b in scene.links]
-    stream.log("genealogy", graph, rr.GraphEdges(edges, graph_type="directed"), static=True)
-
-
-def _log_camera(stream: Any, camera: Camera) -> None:
-    rr = import_rerun()
-    pose = rr.Transform3D(translation=camera.position, mat3x3=camera.pose.rotation.as_matrix())
-    lens = rr.Pinhole(image_from_camera=camera.K, resolution=[camera.width, camera.height])
-    stream.log("world/camera", pose)
-    stream.log("world/camera/image", lens)
-
-
-def _log_frames(stream: Any, recording: Recording) -> None:
-    """Colour and depth of all frames."""
-    rr = import_rerun()
-    stream.reset_time()
-    for time, frame in zip(recording.times, recording.frames, strict=True):
-        stream.set_time("time", duration=time)
-        _log_camera(stream, frame.camera)
-        stream.log("world/camera/image", rr.Image(frame.rgb).compress(jpeg_quality=92))
-        depth = rr.DepthImage(np.nan_to_num(frame.depth), meter=1.0)
-        stream.log("world/camera/image/depth", depth)
-
-
-def _enclosed(labels: np.ndarray) -> np.ndarray:
-    """Voxels (X, Y, Z) bool whose six neighbours belong to the same object."""
-    padded = np.pad(labels, 1)
-    inside = np.ones(labels.shape, bool)
-    for axis in range(3):
-        for step in (-1, 1):
-            inside &= np.roll(padded, step, axis)[1:-1, 1:-1, 1:-1] == labels
-    return inside
-
-
-def _blueprint(scenes: Sequence[ShownPause]) -> Any:
-    """The image with the heaviest hypothesis, a view of each hypothesis, weights, genealogy."""
-    rrb = import_rerun().blueprint
-    names = list(dict.fromkeys(name for scene in scenes for name in _entities(scene)))
-    first, image = names[0], "world/camera/image"
-    boxes = [
-        rrb.Spatial3DView(origin="world", contents=["world/camera", f"world/{name}"], name=name) for name in names
-    ]
-    photo = rrb.Spatial2DView(origin=image, contents=[image, f"{image}/{first}"], name=f"image, {first}")
-    rows = [rrb.Horizontal(photo, rrb.Grid(*boxes), column_shares=[2, 3])]
-    if any(view.weight is not None for scene in scenes for view in scene.views):
-        series = [rrb.TimeSeriesView(origin=what, name=what) for what in ("weight", "quality")]
-        rows.append(rrb.Horizontal(*series, rrb.GraphView(origin="genealogy", name="genealogy")))
-    return rrb.Blueprint(rrb.Vertical(*rows, row_shares=[3, 1][: len(rows)]), collapse_panels=True)

@@ -67,7 +67,7 @@ from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
 _PAUSE_FILES = rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
-_TABLES = rf"(run\.json|metrics\.csv|report\.html|result\.json|forecasts\.npz|{SUMS})"
+_TABLES = rf"(run\.json|metrics\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
 
 

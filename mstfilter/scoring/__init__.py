@@ -5,8 +5,8 @@ knows (`questions`, `log_loss`).
 
 >>> from mstfilter.scoring import ask, object_status, pause_metrics, score_belief
 >>> truth, status = recording.truth(2), object_status(recording, 2)
->>> row, qualities = pause_metrics(labels, weights, truth, status)  # doctest: +SKIP
->>> belief = score_belief(ask(recording, 2), hypotheses, weights, truth, status)  # doctest: +SKIP
+>>> row, qualities = pause_metrics(labels, weights, truth)  # doctest: +SKIP
+>>> belief = score_belief(ask(recording, 2), hypotheses, weights, truth)  # doctest: +SKIP
 >>> row["quality"], belief.row["brier"], belief.row["energy"]  # doctest: +SKIP
 """
 

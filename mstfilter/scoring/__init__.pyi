@@ -1,8 +1,6 @@
 from mstfilter.scoring.log_loss import (
-    CATEGORIES as CATEGORIES,
     LOG_LOSS as LOG_LOSS,
     NO_COUNTS as NO_COUNTS,
-    SPLITS as SPLITS,
     BeliefScore as BeliefScore,
     FittedForecasts as FittedForecasts,
     answer_distances as answer_distances,

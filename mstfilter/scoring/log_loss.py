@@ -1,6 +1,6 @@
 """What a weighted set of hypotheses knows: scores of its answers to `questions`.
 
->>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t), object_status(recording, t))
+>>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t))
 >>> belief.row["brier"], belief.row["energy"]                  # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
@@ -19,9 +19,6 @@ little.
 
 It is proper, and it is never shown without its floor. The floor is the score of the same hypotheses with one draw of
 noise at the border of each, at the rate that is best on other scenes.
-
-Counts of forecasts and outcomes are kept by category of the question, so that losses can be split. A split is a
-description: taken alone it is no proper score, because the truth decides which questions belong to it.
 """
 
 from __future__ import annotations
@@ -35,25 +32,13 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.forecasts import SOFTENING, ForecastTable, Recalibration, energy_score
 from mstfilter.scene import Hypothesis, read_only
-from mstfilter.scoring.quality import STATUSES, Status
 from mstfilter.scoring.questions import NOISE_RATES, Questions
 
 LOG_LOSS = "recalibrated_log_loss"  # name of the score in tables
 N_LEVELS = 1001  # forecasts are counted to a thousandth
 
-#: Categories of questions. "same" and "different": the voxels belong to one true object or to two, of which the less
-#: visible one counts; "free": at least one of the voxels is free.
-CATEGORIES = (*(f"same {status}" for status in STATUSES), *(f"different {status}" for status in STATUSES), "free")
-NO_COUNTS = read_only(np.zeros((N_LEVELS, len(CATEGORIES)), np.int64))
-_SAME = np.array([name.startswith("same") for name in CATEGORIES])
-
-#: Splits of the log loss: name -> categories.
-SPLITS: dict[str, tuple[str, ...]] = {
-    "same": CATEGORIES[:3],
-    "different": CATEGORIES[3:6],
-    "free": ("free",),
-    **{status: (f"same {status}", f"different {status}") for status in STATUSES},
-}
+#: No forecasts: numbers (1001, 2) of questions by forecast and outcome, no and yes.
+NO_COUNTS = read_only(np.zeros((N_LEVELS, 2), np.int64))
 
 
 class BeliefScore(NamedTuple):
@@ -65,8 +50,8 @@ class BeliefScore(NamedTuple):
         ``brier``: mean squared error of the forecasts. ``log_loss``: mean log loss of softened forecasts, in nats.
         ``calibration_error``: on ten bins of equal numbers of questions. ``energy``: energy score.
         ``energy_noise``: list, energy score with noise of each rate of `NOISE_RATES`.
-    counts : (r, 1001, 7) int32
-        Number of questions by rate of noise, forecast in thousandths, and category.
+    counts : (r, 1001, 2) int32
+        Number of questions by rate of noise, forecast in thousandths, and outcome.
     """
 
     row: dict[str, Any]
@@ -86,7 +71,6 @@ def score_belief(
     hypotheses: Sequence[np.ndarray | Hypothesis],
     weights: np.ndarray,
     truth: np.ndarray,
-    status: Mapping[int, Status] | None = None,
 ) -> BeliefScore:
     """Score hypotheses by their answers.
 
@@ -97,8 +81,6 @@ def score_belief(
     weights : (n,) float
         Sum 1.
     truth : (X, Y, Z) int
-    status : mapping, optional
-        True label -> visible, hidden or unseen. Default: all count as visible.
     """
     weights = np.asarray(weights, dtype=np.float64)
     if len(hypotheses) != len(weights) or not len(hypotheses):
@@ -107,7 +89,7 @@ def score_belief(
     if not m:
         nan = float("nan")
         unknown = dict.fromkeys(("brier", "log_loss", "calibration_error", "energy"), nan)
-        empty = np.zeros((len(NOISE_RATES), N_LEVELS, len(CATEGORIES)), np.int32)
+        empty = np.zeros((len(NOISE_RATES), *NO_COUNTS.shape), np.int32)
         return BeliefScore({**unknown, "energy_noise": [nan] * len(NOISE_RATES)}, empty)
     outcome = questions.outcomes(truth)
     forecasts = questions.forecasts(hypotheses, weights, NOISE_RATES)
@@ -124,11 +106,10 @@ def score_belief(
         "energy": energy[0],
         "energy_noise": energy,
     }
-    category = _categories(questions, truth, status)
     level = np.rint(forecasts * (N_LEVELS - 1)).astype(np.int64)
-    code = (np.arange(len(level))[:, None] * N_LEVELS + level) * len(CATEGORIES) + category
-    counts = np.bincount(code.ravel(), minlength=len(level) * N_LEVELS * len(CATEGORIES))
-    return BeliefScore(row, counts.reshape(len(level), N_LEVELS, len(CATEGORIES)).astype(np.int32))
+    code = (np.arange(len(level))[:, None] * N_LEVELS + level) * 2 + outcome
+    counts = np.bincount(code.ravel(), minlength=len(level) * NO_COUNTS.size)
+    return BeliefScore(row, counts.reshape(len(level), *NO_COUNTS.shape).astype(np.int32))
 
 
 def answer_distances(answers: np.ndarray) -> np.ndarray:
@@ -143,24 +124,11 @@ def _root_distances(answers: np.ndarray, outcome: np.ndarray) -> tuple[np.ndarra
     return np.sqrt(np.mean(answers != outcome, axis=1)), np.sqrt(answer_distances(answers))
 
 
-def _categories(questions: Questions, truth: np.ndarray, status: Mapping[int, Status] | None) -> np.ndarray:
-    """(m,) index of the category of each question."""
-    flat = np.asarray(truth).ravel()
-    a, b = flat[questions.first], flat[questions.second]
-    rank = np.zeros(int(flat.max(initial=0)) + 1, np.int64)
-    for label, name in (status or {}).items():
-        if label < len(rank):
-            rank[label] = STATUSES.index(name)
-    worse = np.maximum(rank[a], rank[b])
-    return np.where((a == 0) | (b == 0), len(CATEGORIES) - 1, np.where(a == b, worse, len(STATUSES) + worse))
-
-
-def forecast_table(counts: np.ndarray, categories: Sequence[str] = CATEGORIES) -> ForecastTable:
-    """The forecasts and outcomes of counts (1001, 7), of all or of some categories."""
-    chosen = np.isin(CATEGORIES, categories)
-    no, yes = counts[:, chosen & ~_SAME].sum(axis=1), counts[:, chosen & _SAME].sum(axis=1)
-    kept = no + yes > 0
-    return ForecastTable(np.flatnonzero(kept) / (N_LEVELS - 1), no[kept].astype(float), yes[kept].astype(float))
+def forecast_table(counts: np.ndarray) -> ForecastTable:
+    """The forecasts and outcomes of counts (1001, 2)."""
+    kept = counts.any(axis=1)
+    no, yes = counts[kept].T.astype(float)
+    return ForecastTable(np.flatnonzero(kept) / (N_LEVELS - 1), no, yes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,24 +147,19 @@ class FittedForecasts:
 
     @classmethod
     def fit(cls, counts: np.ndarray) -> FittedForecasts:
-        """Fit to counts (r, 1001, 7): the rate of least log loss after recalibration."""
+        """Fit to counts (r, 1001, 2): the rate of least log loss after recalibration."""
         tables = [forecast_table(one) for one in counts]
         fits = [Recalibration.fit(table) for table in tables]
         best = int(np.argmin([fit.log_loss(table) for fit, table in zip(fits, tables, strict=True)]))
         return cls(NOISE_RATES[best], fits[best])
 
-    def log_loss(self, counts: np.ndarray, categories: Sequence[str] = CATEGORIES) -> float:
-        """Mean log loss in nats of counts (r, 1001, 7); NaN if there are no such questions."""
-        return self.recalibration.log_loss(forecast_table(counts[NOISE_RATES.index(self.rate)], categories))
-
-    def row(self, counts: np.ndarray) -> dict[str, float]:
-        """`LOG_LOSS` of all questions, and ``LOG_LOSS_NAME`` of each of `SPLITS`."""
-        splits = {f"{LOG_LOSS}_{name}": self.log_loss(counts, chosen) for name, chosen in SPLITS.items()}
-        return {LOG_LOSS: self.log_loss(counts), **splits}
+    def log_loss(self, counts: np.ndarray) -> float:
+        """Mean log loss in nats of counts (r, 1001, 2); NaN without questions."""
+        return self.recalibration.log_loss(forecast_table(counts[NOISE_RATES.index(self.rate)]))
 
 
 def leave_one_out(counts: Mapping[Any, np.ndarray]) -> dict[Any, FittedForecasts]:
-    """For each scene, what is fitted to all others; `counts` maps a scene to counts (r, 1001, 7).
+    """For each scene, what is fitted to all others; `counts` maps a scene to counts (r, 1001, 2).
 
     Scenes without questions in the others are left out.
     """

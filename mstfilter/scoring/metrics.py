@@ -91,7 +91,7 @@ def pause_metrics(
     # Expected quality of each hypothesis against the others, by weight: the largest is the best single answer.
     between = pairwise_quality(distinct)[np.ix_(which, which)]
     row["quality_estimate"] = float(q[int(np.argmax(between @ weights))])
-    row["diversity"] = _diversity(between)
+    row["diversity"] = diversity(between)
     return row, q
 
 
@@ -191,12 +191,8 @@ def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
     return int(np.argmax(pairwise_quality(labels) @ np.asarray(weights, dtype=np.float64)))
 
 
-def diversity(labels: Sequence[np.ndarray]) -> float:
-    """1 - mean quality over all pairs of hypotheses, equal ones included; NaN for a single hypothesis."""
-    return _diversity(pairwise_quality(labels))
-
-
-def _diversity(quality: np.ndarray) -> float:
+def diversity(quality: np.ndarray) -> float:
+    """1 - mean quality over all pairs of hypotheses, from `pairwise_quality` (n, n); NaN for a single hypothesis."""
     n = len(quality)
     return float((1 - quality).sum() / (n * (n - 1))) if n > 1 else float("nan")
 

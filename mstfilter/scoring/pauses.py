@@ -28,7 +28,7 @@ from mstfilter.files import reading
 from mstfilter.reading import read_arrays
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
 from mstfilter.scoring.log_loss import score_belief
-from mstfilter.scoring.metrics import diversity, least_loss, pause_metrics
+from mstfilter.scoring.metrics import diversity, least_loss, pairwise_quality, pause_metrics
 from mstfilter.scoring.quality import FORMS, connected_components, object_status, one_blob, weighted_coverage
 from mstfilter.scoring.questions import Questions, ask
 
@@ -180,7 +180,7 @@ def measure_pause(
     row : dict
         Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
         ``qualities`` and ``energy_noise`` are lists, which tables leave out.
-    counts : (r, 1001, 7) int32, or None without ground truth
+    counts : (r, 1001, 2) int32, or None without ground truth
         As in `BeliefScore`.
     """
     labels = [h.labels for h in hypotheses]
@@ -188,11 +188,11 @@ def measure_pause(
     row["n_objects"] = float(np.mean([h.n_objects for h in hypotheses]))
     truth = recording.truth(t)
     if truth is None:
-        return {**row, "diversity": diversity(labels)}, None
+        return {**row, "diversity": diversity(pairwise_quality(labels))}, None
     known = all(recording.instance(p) is not None for p in recording.pauses[: t + 1])
     status = object_status(recording, t) if known else {}
     found, q = pause_metrics(labels, weights, truth, status)
-    belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth, status)
+    belief = score_belief(questions or ask(recording, t), hypotheses, weights, truth)
     return {**row, **found, **belief.row, "qualities": q.tolist()}, belief.counts
 
 

@@ -16,7 +16,7 @@ The studies use the families `s1`, `s2` and `s3`. A scene can also be simulated 
 A filter that decides what is pushed next runs with a `PushLoop`.
 
 The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (what defines a scene), `world`
-(MuJoCo physics, pushes), `printing` and `textures` (appearance). Above them are `arrangement` (placement), `layers`
+(MuJoCo physics, pushes), `printing` and `textures` (appearance). Above them are `arrangement` (placement), `lighting`
 and `renderer` (images by ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
 
 The simulation lacks camera motion, glossy and transparent surfaces, light reflected between objects, articulated and

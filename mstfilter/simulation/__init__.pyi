@@ -13,7 +13,6 @@ from mstfilter.simulation.recorder import (
     cached_path as cached_path,
     cached_recording as cached_recording,
     recipe_key as recipe_key,
-    record_scene as record_scene,
     simulate_recording as simulate_recording,
 )
 from mstfilter.simulation.renderer import Renderer as Renderer

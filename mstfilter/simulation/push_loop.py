@@ -16,7 +16,7 @@ candidates depend on the family, the seed and the pushes so far.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,9 +24,16 @@ from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.scene import Clip, Frame, Recording, VoxelGrid
 from mstfilter.simulation.families import SceneFamily
 from mstfilter.simulation.recorder import SimulatedScene, stream
-from mstfilter.simulation.world import FingerPush, PushEffect, draw_push, is_clear, play_push
+from mstfilter.simulation.world import FingerPush, PushEffect, draw_push, is_clear
 
-_LISTS = ("_frames", "_instances", "_truths", "_pauses", "_times", "effects")
+
+class _Recorded(NamedTuple):
+    """A frame of a loop."""
+
+    frame: Frame
+    instance: np.ndarray
+    time: float
+    truth: np.ndarray | None  # at a pause
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +42,8 @@ class LoopState:
 
     world: np.ndarray
     stage: Any
-    lists: tuple[tuple[Any, ...], ...]
+    recorded: tuple[_Recorded, ...]
+    effects: tuple[PushEffect, ...]
     clip: Clip
 
 
@@ -58,15 +66,11 @@ class PushLoop:
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
         self._scene = SimulatedScene(family, seed)
-        self._frames: list[Frame] = []
-        self._instances: list[np.ndarray] = []
-        self._truths: list[np.ndarray] = []
-        self._pauses: list[int] = []
-        self._times: list[float] = []
+        self._recorded: list[_Recorded] = []
         self._start = self._scene.world.time
         self.effects: list[PushEffect] = []
         self._add_frame(pause=True)
-        self.clip = Clip((self._frames[0],), self.grid, 0, (0.0,))
+        self.clip = Clip((self._recorded[0].frame,), self.grid, 0, (0.0,))
 
     @property
     def grid(self) -> VoxelGrid:
@@ -80,8 +84,8 @@ class PushLoop:
     @property
     def lost(self) -> set[int]:
         """True labels of the objects of the first pause that have left the workspace."""
-        first, now = (set(np.unique(labels).tolist()) for labels in (self._truths[0], self._truths[-1]))
-        return first - now
+        truths = [one.truth for one in self._recorded if one.truth is not None]
+        return set(np.unique(truths[0]).tolist()) - set(np.unique(truths[-1]).tolist())
 
     @property
     def n_pushes(self) -> int:
@@ -109,55 +113,43 @@ class PushLoop:
     def play(self, push: FingerPush) -> Clip:
         """Play a push and record it; returns the clip from the last pause to the new one."""
         check_component("push", push, FingerPush)
-        first = len(self._frames) - 1
+        first = len(self._recorded) - 1
         self.effects.append(self._scene.play(push, self._add_frame))
         self._add_frame(pause=True)
-        times = tuple(self._times[first:])
-        self.clip = Clip(tuple(self._frames[first:]), self.grid, self.n_pushes, times)
+        frames, _, times, _ = zip(*self._recorded[first:], strict=True)
+        self.clip = Clip(frames, self.grid, self.n_pushes, times)
         return self.clip
-
-    def effect(self, push: FingerPush) -> PushEffect:
-        """What a push would do; the scene is left unchanged. For oracles: a policy cannot know it."""
-        saved = self._scene.world.save()
-        try:
-            return play_push(self._scene.world, push, self.family)
-        finally:
-            self._scene.world.restore(saved)
 
     def save(self) -> LoopState:
         """The present state, for `restore`: to try several pushes from it."""
-        kept = tuple(tuple(getattr(self, name)) for name in _LISTS)
-        return LoopState(self._scene.world.save(), self._scene.stage.save(), kept, self.clip)
+        world, stage = self._scene.world.save(), self._scene.stage.save()
+        return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 
     def restore(self, state: LoopState) -> None:
         """Return to a saved state of this loop; the same pushes then give the same images."""
         self._scene.world.restore(state.world)
         self._scene.stage.restore(state.stage)
-        for name, values in zip(_LISTS, state.lists, strict=True):
-            setattr(self, name, list(values))
-        self.clip = state.clip
+        self._recorded, self.effects, self.clip = list(state.recorded), list(state.effects), state.clip
 
     def recording(self) -> Recording:
         """Everything so far as a recording with ground truth."""
-        truths, instances = tuple(self._truths), tuple(self._instances)
+        frames, instances, times, truths = zip(*self._recorded, strict=True)
+        pauses = tuple(k for k, truth in enumerate(truths) if truth is not None)
         return Recording(
-            tuple(self._frames),
+            frames,
             self.grid,
-            tuple(self._pauses),
-            tuple(self._times),
+            pauses,
+            times,
             f"{self.family.name}-{self._scene.seed}",
-            truth=lambda t: truths[t],
+            truth=lambda t: truths[pauses[t]],
             instance=lambda index: instances[index],
         )
 
     def _add_frame(self, time: float | None = None, pause: bool = False) -> None:
-        scene, index = self._scene, len(self._frames)
-        images = scene.frame_images(index)
+        scene = self._scene
+        images = scene.frame_images(len(self._recorded))
         scale = Recording.depth_scale  # depth in whole units, as recordings store it
         depth = np.rint(np.nan_to_num(images["depth"].astype(np.float64) / scale)) * np.float32(scale)
-        self._frames.append(Frame(images["rgb"], depth, scene.camera, images["robot_mask"]))
-        self._instances.append(images["instance"])
-        self._times.append(round((scene.world.time if time is None else time) - self._start, 6))
-        if pause:
-            self._pauses.append(index)
-            self._truths.append(scene.truth())
+        frame = Frame(images["rgb"], depth, scene.camera, images["robot_mask"])
+        seconds = round((scene.world.time if time is None else time) - self._start, 6)
+        self._recorded.append(_Recorded(frame, images["instance"], seconds, scene.truth() if pause else None))

@@ -42,7 +42,7 @@ from mstfilter.reading import check_private
 from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
-from mstfilter.simulation.layers import Stage
+from mstfilter.simulation.lighting import Stage
 from mstfilter.simulation.renderer import Renderer, visible_texel
 from mstfilter.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.simulation.shapes import label_voxels
@@ -77,7 +77,7 @@ def _check_seed(seed: int) -> None:
 
 
 class SimulatedScene:
-    """A world with its textures and sensors, for use step by step; `record_scene` records it."""
+    """A world with its textures and sensors, for use step by step."""
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
         _check_seed(seed)
@@ -153,22 +153,16 @@ class SimulatedScene:
 def simulate_recording(
     family: SceneFamily, seed: int, path: str | Path, progress: _Progress | None = None
 ) -> Recording:
-    """Simulate a scene, which family and seed determine, and write its recording; see `record_scene`."""
-    return record_scene(SimulatedScene(family, seed), path, progress)
+    """Simulate a scene, which family and seed determine, write its recording and open it.
 
-
-def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | None = None) -> Recording:
-    """Simulate the actions of a scene, write the recording and open it.
-
-    The scene is at its first pause; a subclass of `SimulatedScene` can change the arrangement and the choice of
-    pushes. `path` is a folder that is empty or does not exist yet. Nothing is left behind on failure. `progress` is
-    called after each frame with frames done, frames in all, and a description. Raises InputError if the folder cannot
-    be written, or the objects cannot be arranged or pushed.
+    `path` is a folder that is empty or does not exist yet. Nothing is left behind on failure. `progress` is called
+    after each frame with frames done, frames in all, and a description. Raises InputError if the folder cannot be
+    written, or the objects cannot be arranged or pushed.
     """
-    family, world = scene.family, scene.world
+    scene = SimulatedScene(family, seed)
     report = progress or (lambda done, total, description: None)
     with RecordingWriter(path, scene.camera, scene.grid, **scene.describe()) as writer:
-        start, index = world.time, 0
+        start, index = scene.world.time, 0
         _record_pause(scene, writer, index, 0.0)
         report(1, family.n_frames, "pause 0")
         for action in range(family.n_actions):
@@ -182,7 +176,7 @@ def record_scene(scene: SimulatedScene, path: str | Path, progress: _Progress | 
             push = scene.choose_push(action)
             description = _describe_push(push, scene.play(push, record))
             index += 1
-            _record_pause(scene, writer, index, world.time - start, action=action, push=description)
+            _record_pause(scene, writer, index, scene.world.time - start, action=action, push=description)
             report(index + 1, family.n_frames, f"pause {action + 1}")
     return open_recording(path)
 

@@ -1,8 +1,7 @@
 """Colour, depth and instance images by ray casting; needs no display, GPU or OpenGL.
 
 One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
-the textures. Between frames, rays are cast only where something moved (`layers`); the images equal those of casting
-every ray.
+the textures.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mstfilter.scene import Camera
-from mstfilter.simulation.layers import SHADOW_GROUPS, UNKNOWN, LightMap, PixelRays, Stage
+from mstfilter.simulation.lighting import SHADOW_GROUPS, BodyColours, LightMap, Stage
 from mstfilter.simulation.sensor import NEIGHBOURS
 from mstfilter.simulation.textures import Atlas, Room, Skin
 from mstfilter.simulation.world import FINGER_GROUP, OBJECT_GROUP, ROOM_GROUP, TABLE, PhysicsWorld
@@ -57,35 +56,20 @@ class Renderer:
         atlas = Atlas(list(skins), visible_texel(camera))
         turn = camera.pose.as_matrix()[:3, :3]
         self._eye = np.array(camera.position)
-        rays = camera.rays().reshape(-1, 3) @ turn.T
-        self._unit = (rays / np.linalg.norm(rays, axis=1)[:, None]).astype(np.float32)
+        self._rays = camera.rays().reshape(-1, 3) @ turn.T
+        self._unit = (self._rays / np.linalg.norm(self._rays, axis=1)[:, None]).astype(np.float32)
         K = camera.K
         shifts = [np.array([du / K[0, 0], dv / K[1, 1], 0.0]) @ turn.T for dv, du in _OFFSETS]
-        self._main = PixelRays(self.stage, atlas, room, self._eye, rays, SHADOW_GROUPS)
-        everything = (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP)
-        self._further = [
-            PixelRays(self.stage, atlas, room, self._eye, rays + shift, everything)
-            for shift in (shifts if supersample else [])
-        ]
-        self._render_background(rays)
+        self._further = [self._rays + shift for shift in shifts] if supersample else []
+        self._bodies = BodyColours(self.stage, atlas, room, self._eye)
+        self._render_background()
         fine = max(0.004, 2.0 / float(K[0, 0]))
-        self._lamp_map = LightMap(fine, room.lamp, self._table_xy)
-        self._sky_map = LightMap(2 * fine, room.sky, self._table_xy)
-        self._poses, self._capsules = np.full((1, 12), np.nan), np.zeros((0, 7))
-        self.forget()
+        self._lamp_map, self._sky_map = LightMap(fine, room.lamp), LightMap(2 * fine, room.sky)
 
-    def forget(self) -> None:
-        """Cast all rays again at the next call of `render`, for the same images."""
-        # Bodies at their first poses count as moved, so a ray that cannot meet any of them meets no body.
-        self._poses = np.full_like(self._poses, np.nan)
-        self._main.geom[:] = -1
-        for rays in self._further:
-            rays.geom[:] = UNKNOWN
-
-    def _render_background(self, rays: np.ndarray) -> None:
-        """The room without objects. Between frames only the light on the table changes."""
-        geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP,))
-        points = self._eye + rays * z[:, None]
+    def _render_background(self) -> None:
+        """The room without objects. Between images only the light on the table changes."""
+        geom, z, normal = self.stage.cast(self._eye, self._rays, (ROOM_GROUP,))
+        points = self._eye + self._rays * z[:, None]
         self._room_depth = np.where(geom >= 0, z, np.nan).astype(np.float32)
         self._room_slant = self._slant(np.arange(len(z)), normal)
         self._room_normal = normal.astype(np.float32)
@@ -126,57 +110,51 @@ class Renderer:
         light = 0.5 * self.room.sky_colour + self.room.ambient + self.room.lamp_colour * cosine[:, None] * fall
         return np.nan_to_num(light).astype(np.float32)
 
-    def _table_light(self, lamp: np.ndarray, sky: np.ndarray) -> np.ndarray:
-        room = self.room
+    def _table_light(self, xy: np.ndarray) -> np.ndarray:
+        """Light (n, 3) at points (n, 2) of the table top."""
+        room, lamp, sky = self.room, self._lamp_map.sample(xy), self._sky_map.sample(xy)
         return lamp[:, None] * room.lamp_colour + sky[:, None] * room.sky_colour + room.ambient
-
-    def _moved_capsules(self) -> np.ndarray:
-        """Capsules (k, 7) of the bodies that moved since the last image, at their old and new poses."""
-        poses, capsules = self.stage.bodies()
-        moved = (poses != self._poses).any(axis=1)
-        both = np.concatenate([self._capsules[moved[: len(self._capsules)]], capsules[moved]])
-        self._poses, self._capsules = poses, capsules
-        return both
 
     def render(self) -> View:
         """Images of the world as it is now."""
         h, w = self.camera.height, self.camera.width
         self.stage.follow()
-        moved = self._moved_capsules()
-        self._lamp_map.update(self.stage, moved)
-        self._sky_map.update(self.stage, moved)
+        self._lamp_map.update(self.stage)
+        self._sky_map.update(self.stage)
         light = self._room_light.copy()
-        light[self._on_table] = self._table_light(self._lamp_map.at_pixels(), self._sky_map.at_pixels())
+        light[self._on_table] = self._table_light(self._table_xy)
         colour = self._room_albedo * light
 
-        self._main.update(np.arange(h * w), moved, self._room_depth)
-        hit = np.flatnonzero(self._main.geom >= 0)
+        geom, z, facing = self.stage.cast(self._eye, self._rays, SHADOW_GROUPS)
+        with np.errstate(invalid="ignore"):
+            geom[z > self._room_depth] = -1
+        hit = np.flatnonzero(geom >= 0)
         depth, slant, normal = self._room_depth.copy(), self._room_slant.copy(), self._room_normal.copy()
         instance = np.zeros(h * w, np.uint8)
-        instance[hit] = self._main.instance(hit)
-        depth[hit], normal[hit] = self._main.depth[hit], self._main.normal[hit]
-        slant[hit] = self._slant(hit, self._main.normal[hit])
-        colour[hit] = self._main.colour(hit)
+        instance[hit] = self.stage.world.geom_object[geom[hit]]
+        depth[hit], normal[hit] = z[hit], facing[hit]
+        slant[hit] = self._slant(hit, facing[hit])
+        points = self._eye + self._rays[hit] * z[hit, None]
+        colour[hit] = self._bodies.at(geom[hit], points, facing[hit])
         if self._further:
             edge = _edge_pixels(instance.reshape(h, w), normal.reshape(h, w, 3))
             total = np.zeros((len(edge), 3), np.float32)
             for rays in self._further:
-                rays.update(edge, moved)
-                total += self._colours(rays, edge)
+                total += self._colours(rays[edge])
             colour[edge] = (colour[edge] + total) / np.float32(1 + len(self._further))
         return View(colour.reshape(h, w, 3), depth.reshape(h, w), instance.reshape(h, w), slant.reshape(h, w))
 
-    def _colours(self, rays: PixelRays, pixels: np.ndarray) -> np.ndarray:
-        """Colours (k, 3) of pixels on bodies or on the room."""
-        result = np.empty((len(pixels), 3), np.float32)
-        body = rays.is_body(pixels)
-        result[body] = rays.colour(pixels[body])
-        rest = pixels[~body]
-        geom, points, normal = rays.geom[rest], rays.points(rest), rays.normal[rest]
+    def _colours(self, rays: np.ndarray) -> np.ndarray:
+        """Colours (k, 3) of what rays (k, 3) meet, bodies or the room."""
+        geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP))
+        points = self._eye + rays * z[:, None]
+        result = np.empty((len(rays), 3), np.float32)
+        body = (geom >= 0) & (self.stage.world.geom_object[geom] > 0)
+        result[body] = self._bodies.at(geom[body], points[body], normal[body])
+        geom, points, normal = geom[~body], points[~body], normal[~body]
         albedo, light = self._room_colours(geom, points, normal), self._unshadowed_light(points, normal)
         table = (geom == 0) & (normal[:, 2] > 0.5)
-        xy = points[table, :2]
-        light[table] = self._table_light(self._lamp_map.sample(xy), self._sky_map.sample(xy))
+        light[table] = self._table_light(points[table, :2])
         result[~body] = albedo * light
         return result
 

@@ -1,18 +1,10 @@
-"""Convex pieces of objects, and a test which rays can meet the capsules around them.
+"""Convex pieces of objects.
 
 A rigid object is a union of convex pieces. MuJoCo collides and ray-casts these pieces, and `Piece.inside` answers
 for the same solids, so images and true volumes agree.
 
 >>> from mstfilter.simulation.solids import box
 >>> box((0.02, 0.03, 0.04)).inside([[0.0, 0.0, 0.039], [0.0, 0.0, 0.041]]).tolist()
-[True, False]
-
-`may_meet` tests rays against capsules around bodies.
-
->>> import numpy as np
->>> from mstfilter.simulation.solids import may_meet
->>> ball = np.array([[0.0, 0, 1, 0, 0, 1, 0.1]])
->>> may_meet(ball, np.zeros(3), np.array([[0.0, 0.05, 1.0], [0.5, 0.0, 1.0]])).tolist()
 [True, False]
 """
 
@@ -27,7 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _TOLERANCE = 1e-9  # so that a voxel centre on the face that two pieces share lies in one of them
-_ANGLE_SLACK = 1e-4  # of the angles in `may_meet`, for single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,43 +149,3 @@ def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Pie
             corners = [(*(r * c), z) for inner, outer, z in (low, high) for r in (inner, outer) for c in (a, b)]
             wedges.append(hull(corners))
     return wedges
-
-
-def may_meet(capsules: np.ndarray, point: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Whether rays (n, 3) of any length from a point may meet one of some capsules: (n,) bool.
-
-    Capsules (k, 7) are both ends of the axis and the radius, in metres; equal ends make a ball. Seen from the point,
-    a capsule lies in a cone and, if it is long, between two planes through the point. The test is conservative: a ray
-    that fails it does not meet the capsule.
-    """
-    a, b, radius = capsules[:, :3] - point, capsules[:, 3:6] - point, capsules[:, 6]
-    along = b - a
-    square = np.maximum((along**2).sum(axis=1), 1e-30)
-    share = np.clip(-(a * along).sum(axis=1) / square, 0.0, 1.0)
-    nearest = np.linalg.norm(a + share[:, None] * along, axis=1)
-    within = nearest <= radius * 1.001  # the point is in the capsule
-    first, second = _unit(a), _unit(b)
-    spread = np.arccos(np.clip((first * second).sum(axis=1), -1.0, 1.0))
-    ratio = np.minimum(radius / np.where(within, 1.0, nearest), 1.0)
-    # Half the angle between the ends, and the angle of the radius at the nearest point of the axis.
-    angle = spread / 2 + np.arcsin(ratio) + _ANGLE_SLACK
-    cosine = np.where(within | (angle >= np.pi / 2), -2.0, np.cos(np.minimum(angle, np.pi)))
-    across = np.where((within | (spread < 1e-3))[:, None], 0.0, _unit(np.cross(a, b)))
-
-    met = np.zeros(len(rays), bool)
-    x, y, z = np.ascontiguousarray(rays.T, dtype=np.float32)
-    length = np.sqrt(x * x + y * y + z * z)
-    cones = (np.asarray(v, np.float32) for v in (_unit(first + second), cosine, across, ratio + _ANGLE_SLACK))
-    for axis, least, normal, slab in zip(*cones, strict=True):
-        inside = x * axis[0] + y * axis[1] + z * axis[2] >= least * length
-        if normal.any():
-            few = np.flatnonzero(inside)
-            off = np.abs(x[few] * normal[0] + y[few] * normal[1] + z[few] * normal[2])
-            met[few] |= off <= slab * length[few]
-        else:
-            met |= inside
-    return met
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)

@@ -33,7 +33,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fields import NonNegativeInt, PositiveInt
-from mstfilter.lazy import late, progress_of
+from mstfilter.lazy import progress_of
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.inputs import AtStep, check_observations, split_input
 from mstfilter.smc.interfaces import (
@@ -124,8 +124,6 @@ class ParticleFilter(AtStep):
         parts = {slot: type(getattr(self, slot)).__name__ for slot in _SLOTS if getattr(self, slot) is not None}
         lines = [f"ParticleFilter(n={self.n}, n_proposed={self.n_proposed}, resample={self.resample!r})"]
         return "\n  ".join([*lines, ", ".join(f"{slot} {name[:24]}" for slot, name in parts.items())])
-
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     @property
     def properly_weighted(self) -> bool:

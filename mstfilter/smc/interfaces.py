@@ -379,8 +379,6 @@ class Info:
         lines = [f"Info of step {self.t}: {self.n} of {self.n_candidates} candidates, ESS {self.ess:.1f}, {how}"]
         return "\n  ".join([*lines, f"seconds {times}"] if times else lines)
 
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
-
 
 class Infos(list[Info], Table):
     """The records of the steps of a run: a list that can be read as a table.
@@ -412,5 +410,3 @@ class Infos(list[Info], Table):
         ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
         return f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
-
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

@@ -6,7 +6,7 @@ from mstfilter.study.config import (
     load_study as load_study,
     study_of as study_of,
 )
-from mstfilter.study.executors import Event as Event, Executor as Executor, Local as Local
+from mstfilter.study.executors import Executor as Executor, Local as Local
 from mstfilter.study.jobs import (
     open_scene as open_scene,
     peak_megabytes as peak_megabytes,

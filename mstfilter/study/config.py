@@ -119,9 +119,6 @@ class StudyConfig(_Entry):
     timeout_s: Annotated[float, Field(ge=0)] = 0.0
     #: Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
     cache_gb: Annotated[float, Field(ge=0)] = 4.0
-    #: The ``recalibration.json`` of another study, relative to this file: forecasts are recalibrated by
-    #: what was fitted to its scenes. Default: by the other scenes of the family.
-    recalibration: str = ""
     smoke: dict[str, Any] = Field(default_factory=dict)  #: replaces fields of the study under ``--smoke``
     folder: Path = Path()  # relative paths start here
 
@@ -168,16 +165,16 @@ class ArmRequest:
     overrides: tuple[str, ...]
     reported_only: bool  #: reported, but not part of the comparisons
 
-    def config(self, allow_files: bool) -> dict[str, Any]:
+    def config(self) -> dict[str, Any]:
         """The configuration of this arm of the study. Unknown names of components raise InputError."""
-        return load_config(self.preset, self.overrides, allow_files=allow_files)
+        return load_config(self.preset, self.overrides)
 
 
-def check_arm_names(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files: bool = True) -> None:
+def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
     """Raise InputError if an arm names an unknown preset or component; imports no component."""
     for request in expand_arms(study, overrides):
         with naming(f"arm {request.name!r}"):
-            request.config(allow_files)
+            request.config()
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:

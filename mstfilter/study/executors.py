@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import queue
 import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from concurrent.futures import wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,25 +25,13 @@ from mstfilter.processes import available_cores, environment
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
-_POLL_S = 0.1  # of a worker's order to stop
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"),
     "1",
 )
 
-
-@dataclass(frozen=True)
-class Event:
-    """Something that happened to a job."""
-
-    #: {"started", "lost", "ended"}: "lost": its worker died or the time limit was exceeded; it is started
-    #: again if tries are left.
-    kind: str
-    job: int  #: its index in the list of jobs
-    outcome: JobOutcome | None = None  #: of a job that has ended
-
-
-Tell = Callable[[Event], None]
+#: ``tell(k, outcome)``: job `k` has ended. None: its worker died or exceeded the time limit; tries may be left.
+Tell = Callable[[int, JobOutcome | None], None]
 
 
 class Executor(Bounded, ABC):
@@ -55,7 +42,7 @@ class Executor(Bounded, ABC):
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
         Jobs are started in this order when workers are free. Jobs of one ``share`` go to the same worker if possible.
-        `tell` is called with every `Event`, in the calling thread. An exception that it raises stops all jobs.
+        `tell` is called in the calling thread. An exception that it raises stops all jobs.
         """
 
 
@@ -81,143 +68,110 @@ class Local(Executor):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         if not jobs:
             return []
-        jobs_left = _JobQueue(jobs)
-        events: queue.SimpleQueue[Event | BaseException] = queue.SimpleQueue()
         n_workers = min(self.workers or available_cores(), len(jobs))
-        workers = [_Worker(k, jobs_left, events, self.logs) for k in range(n_workers)]
-        outcomes: dict[int, JobOutcome] = {}
-        with environment(**_ONE_THREAD):  # processes inherit it when they start
+        workers = [_Worker(k, self.logs) for k in range(n_workers)]
+        try:
+            with environment(**_ONE_THREAD):  # processes inherit it when they start
+                return _LocalRun(jobs, tell).run(workers)
+        finally:
             for worker in workers:
-                worker.start()
-            try:
-                while len(outcomes) < len(jobs):
-                    event = events.get()
-                    if isinstance(event, BaseException):
-                        raise event
-                    if event.outcome is not None:
-                        outcomes[event.job] = event.outcome
-                    tell(event)
-            finally:
-                for worker in workers:
-                    worker.stopped.set()
-                for worker in workers:
-                    worker.join()
-        return [outcomes[k] for k in range(len(jobs))]
+                worker.close()
 
 
-class _JobQueue:
-    """Jobs that wait for a worker."""
+class _LocalRun:
+    """The jobs of one call: those that wait, those that run, and the outcomes of the others."""
 
-    def __init__(self, jobs: Sequence[Job]) -> None:
-        self.jobs = jobs
+    def __init__(self, jobs: Sequence[Job], tell: Tell) -> None:
+        self._jobs, self._tell = jobs, tell
         self._waiting = list(range(len(jobs)))
-        self._share_of: dict[int, str] = {}
-        self._lock = threading.Lock()
+        self._share_of: dict[_Worker, str] = {}
+        self._tries = [0] * len(jobs)
+        self._running: dict[Future[JobOutcome], tuple[_Worker, int]] = {}
+        self._outcomes: dict[int, JobOutcome] = {}
 
-    def take(self, worker: int) -> int | None:
+    def run(self, workers: Sequence[_Worker]) -> list[JobOutcome]:
+        for worker in workers:
+            self._start(worker, self._next_job(worker))
+        while self._running:
+            for future in wait(self._running, return_when=FIRST_COMPLETED).done:
+                self._finish(future)
+        return [self._outcomes[k] for k in range(len(self._jobs))]
+
+    def _next_job(self, worker: _Worker) -> int | None:
         """The next job of a worker: of its last share, else of a share that no other worker has, else the first."""
-        with self._lock:
-            if not self._waiting:
-                return None
-            other_shares = {share for w, share in self._share_of.items() if w != worker}
+        other_shares = {share for other, share in self._share_of.items() if other is not worker}
 
-            def rank(k: int) -> tuple[bool, bool]:
-                share = self.jobs[k].get("share", "")
-                return share != self._share_of.get(worker), share in other_shares
+        def rank(k: int) -> tuple[bool, bool]:
+            share = self._jobs[k].get("share", "")
+            return share != self._share_of.get(worker), share in other_shares
 
-            chosen = min(self._waiting, key=rank)
+        chosen = min(self._waiting, key=rank, default=None)
+        if chosen is not None:
             self._waiting.remove(chosen)
-            self._share_of[worker] = self.jobs[chosen].get("share", "")
-            return chosen
+            self._share_of[worker] = self._jobs[chosen].get("share", "")
+        return chosen
+
+    def _start(self, worker: _Worker, k: int | None) -> None:
+        if k is not None:
+            self._tries[k] += 1
+            self._running[worker.submit(self._jobs[k])] = worker, k
+
+    def _finish(self, future: Future[JobOutcome]) -> None:
+        """Record the outcome of a job and start the next one, or start the job again if its worker died."""
+        from pebble import ProcessExpired
+
+        worker, k = self._running.pop(future)
+        job, tries = self._jobs[k], self._tries[k]
+        try:
+            outcome = replace(future.result(), tries=tries)
+        except (TimeoutError, ProcessExpired, BrokenProcessPool) as error:
+            worker.close()
+            self._tell(k, None)
+            if tries < int(job.get("tries", 1)):
+                self._start(worker, k)
+                return
+            outcome = worker.failure(error, job, tries)
+        self._outcomes[k] = outcome
+        self._tell(k, outcome)
+        self._start(worker, self._next_job(worker))
 
 
-class _Worker(threading.Thread):
-    """The thread that gives jobs to one process and reports their events."""
+class _Worker:
+    """One process, which is started for the first job and after it has died."""
 
-    def __init__(
-        self,
-        number: int,
-        jobs_left: _JobQueue,
-        events: queue.SimpleQueue[Event | BaseException],
-        logs: Path | None,
-    ) -> None:
-        super().__init__(daemon=True)
-        self.stopped = threading.Event()
-        self._number, self._queue, self._events = number, jobs_left, events
+    def __init__(self, number: int, logs: Path | None) -> None:
         self._log = None if logs is None else logs / f"worker-{number}.log"
         self._pool: Any = None
 
-    def run(self) -> None:
-        try:
-            while not self.stopped.is_set():
-                k = self._queue.take(self._number)
-                if k is None:
-                    return
-                outcome = self._do(k)
-                if outcome is not None:
-                    self._events.put(Event("ended", k, outcome=outcome))
-        except BaseException as error:
-            self._events.put(error)
-        finally:
-            self._close_pool()
-
-    def _do(self, k: int) -> JobOutcome | None:
-        """Run a job up to ``tries`` times; None if the worker is stopped."""
-        from pebble import ProcessExpired
-
-        job = self._queue.jobs[k]
-        tries = int(job.get("tries", 1))
-        reason = ""
-        for attempt in range(1, tries + 1):
-            self._events.put(Event("started", k))
-            try:
-                outcome = self._try(job)
-            except TimeoutError:
-                reason = f", the last time because it took longer than {job['timeout_s']:g} s"
-            except ProcessExpired as error:
-                code = error.exitcode
-                reason = f", the last time {f'by signal {-code}' if code < 0 else f'with exit code {code}'}"
-            except BrokenProcessPool:
-                reason = ", the last time before it began"
-            else:
-                return None if outcome is None else replace(outcome, tries=attempt)
-            self._close_pool()
-            self._events.put(Event("lost", k))
-        log_hint = [] if self._log is None else [f"log: {self._log}"]
-        hints = ("if memory ran out: use fewer workers or a smaller scene", *log_hint)
-        return JobOutcome("failed", f"its worker died {times(tries)}{reason}", hints, tries=tries)
-
-    def _try(self, job: Job) -> JobOutcome | None:
-        """Run a job once; None if the worker is stopped.
-
-        Raises TimeoutError, ProcessExpired or BrokenProcessPool if the process took too long or died.
-        """
-        if self._pool is None:
-            self._open_pool()
-        future = self._pool.schedule(perform, args=(dict(job),), timeout=job.get("timeout_s") or None)
-        while not self.stopped.is_set():
-            if wait([future], _POLL_S).done:
-                outcome: JobOutcome = future.result()
-                return outcome
-        return None
-
-    def _open_pool(self) -> None:
+    def submit(self, job: Job) -> Future[JobOutcome]:
         from pebble import ProcessPool
 
-        context = multiprocessing.get_context("spawn")
-        log = os.devnull if self._log is None else str(self._log)
-        self._pool = ProcessPool(1, initializer=_initialise, initargs=(log,), context=context)
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            log = os.devnull if self._log is None else str(self._log)
+            self._pool = ProcessPool(1, initializer=_initialise, initargs=(log,), context=context)
+        future: Future[JobOutcome] = self._pool.schedule(
+            perform, args=(dict(job),), timeout=job.get("timeout_s") or None
+        )
+        return future
 
-    def _close_pool(self) -> None:
+    def failure(self, error: Exception, job: Job, tries: int) -> JobOutcome:
+        """The outcome of a job whose process died at every try, the last time by `error`."""
+        reason = "before it began"
+        if isinstance(error, TimeoutError):
+            reason = f"because it took longer than {job['timeout_s']:g} s"
+        elif code := getattr(error, "exitcode", 0):
+            reason = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+        hints = ["if memory ran out: use fewer workers or a smaller scene"]
+        hints += [] if self._log is None else [f"log: {self._log}"]
+        times = f"{tries} time{'s' if tries > 1 else ''}"
+        return JobOutcome("failed", f"its worker died {times}, the last time {reason}", tuple(hints), tries=tries)
+
+    def close(self) -> None:
         if self._pool is not None:
             self._pool.stop()
             self._pool.join()
         self._pool = None
-
-
-def times(n: int) -> str:
-    """``1 time``, ``2 times``."""
-    return f"{n} time{'s' if n > 1 else ''}"
 
 
 # In the worker process:

@@ -74,7 +74,8 @@ def _check_code(expected: str) -> None:
     """
     if code_version() != expected:
         raise InputError(
-            "the code has changed since the study began", "the same command starts these runs with the new code"
+            "this process has other code of mstfilter than the study began with",
+            "after a change of the code, repeat the command; install the same version on all machines of a cluster",
         )
     for package in PACKAGES:
         for name in package.__all__:
@@ -103,7 +104,7 @@ def _run(job: Job) -> None:
                 job["config"],
                 work,
                 job["seed"],
-                allow_files=job["allow_files"],
+                allow_files=True,
                 progress=progress,
             )
         for t, cost in enumerate(costs):

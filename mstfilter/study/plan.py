@@ -92,21 +92,20 @@ class Plan:
         return self.config.reference or self.arms[0].name
 
 
-def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files: bool = True) -> Plan:
+def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after those of the arm; a comma makes a grid. `allow_files` says whether
-    components may come from ``./file.py:Class``. Raises InputError if an arm is invalid, two arms are the same, there
-    are no runs, or a recording cannot be read.
+    `overrides` are applied to every arm after those of the arm; a comma makes a grid. Raises InputError if an arm is
+    invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()
-    arms = tuple(_arm(request, versions, code, allow_files) for request in expand_arms(study, overrides))
+    arms = tuple(_arm(request, versions, code) for request in expand_arms(study, overrides))
     for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
         if not found:
             raise InputError(f"study {study.name} has no {what}, so there is nothing to run")
     _check_unique("arms", [(arm.name, arm.key) for arm in arms])
-    scenes = _unique_names([scene for entry in study.scenes for scene in _scenes(entry, study.folder, allow_files)])
+    scenes = _unique_names([scene for entry in study.scenes for scene in _scenes(entry, study.folder)])
     _check_unique("scenes", [(scene.name, scene.key) for scene in scenes])
     if len(set(study.seeds)) < len(study.seeds):
         raise InputError(f"study {study.name} names a seed twice: {list(study.seeds)}")
@@ -123,9 +122,9 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = (), *, allow_files:
     return Plan(study, code, arms, scenes, runs)
 
 
-def _arm(request: ArmRequest, versions: dict[str, str], code: str, allow_files: bool) -> Arm:
+def _arm(request: ArmRequest, versions: dict[str, str], code: str) -> Arm:
     with naming(f"arm {request.name!r}"):
-        filter = build_filter(request.config(allow_files), allow_files=allow_files)
+        filter = build_filter(request.config(), allow_files=True)
         files = component_files(filter)
     config = as_json(describe_filter(filter))
     known_code = all(type(part).__module__.startswith("mstfilter") for part in nested_components(filter))
@@ -133,7 +132,7 @@ def _arm(request: ArmRequest, versions: dict[str, str], code: str, allow_files: 
     return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
 
 
-def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[StudyScene]:
+def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
     if entry.family:
         from mstfilter.simulation import recipe_key, scene_family
 
@@ -152,7 +151,7 @@ def _scenes(entry: SceneEntry, folder: Path, allow_files: bool) -> Iterator[Stud
         for path in paths:
             source = {"path": str(Path(path).resolve()), "format": entry.format, "pauses": entry.pauses}
             source |= {"options": list(entry.options)}
-            recording = open_recording(Path(path), entry.format, entry.options, entry.pauses, allow_files=allow_files)
+            recording = open_recording(Path(path), entry.format, entry.options, entry.pauses)
             # Metrics and oracles depend on the ground truth.
             key = content_key(recording.key, recording.truth_key).hex()
             yield StudyScene(Path(path).name, entry.group or "recordings", source, key)

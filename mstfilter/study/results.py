@@ -15,13 +15,12 @@ Layout::
 
     differences.csv  every arm minus the reference: paired differences, intervals, p values, conclusions
     failures.csv     runs that failed, and why
-
-    recalibration.json  of each family and arm, fitted to all its scenes; for studies of other scenes
     logs/            output of the workers
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,8 +35,7 @@ from mstfilter.files import write_csv
 from mstfilter.forecasts import ForecastTable
 from mstfilter.reading import read_arrays, read_model
 from mstfilter.runs import write_json
-from mstfilter.scoring import NO_COUNTS, forecast_table
-from mstfilter.study.recalibration import add_log_loss, fit_recalibration
+from mstfilter.scoring import LOG_LOSS, NO_COUNTS, forecast_table, leave_one_out
 from mstfilter.study.summary import Summary, summarise
 
 STUDY_FORMAT = 2
@@ -203,11 +201,31 @@ class StudyFolder:
             named = {"family": run["group"], "scene": run["scene"], "arm": run["arm"], "seed": run["seed"]}
             for row, cost in zip(result["rows"], result["costs"], strict=True):
                 rows.append({**named, **row, **cost})
-        add_log_loss(rows, self._counts, self.description.get("recalibration"))
+        self._add_log_loss(rows)
         return rows
 
+    def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Add the recalibrated log loss and ``energy_floor`` to rows, in place.
+
+        The forecasts of a scene are recalibrated on the other scenes of its family and arm, and so is the rate of
+        noise for the floor of the energy score. Filter seeds of one scene are never on both sides.
+        """
+        groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+        for row in rows:
+            if row.get("energy_noise"):
+                groups[row["family"], row["arm"]].append(row)
+        for of_arm, own in groups.items():
+            counts = self._counts(*of_arm)
+            fits = leave_one_out(_sum_by_scene(counts))
+            best = {scene: _best_noise([row for row in own if row["scene"] != scene]) for scene in fits}
+            for row in own:
+                scene, of_run = row["scene"], counts.get((row["scene"], row["seed"]))
+                if scene in fits and of_run is not None:
+                    row[LOG_LOSS] = fits[scene].log_loss(of_run[row["pause"]])
+                    row["energy_floor"] = row["energy_noise"][best[scene]]
+
     def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
-        """Counts (T, r, 1001, 7) of the forecasts of every run of an arm that has them, by scene and seed."""
+        """Counts (T, r, 1001, 2) of the forecasts of every run of an arm that has them, by scene and seed."""
         found = {}
         for run in self.description["runs"]:
             path = self.run(run["folder"]) / FORECASTS
@@ -231,13 +249,9 @@ class StudyFolder:
         """One row per pause and finished run, in the order of the study: metrics, time and memory."""
         return _without_lists(self.records())
 
-    def summary(self) -> Summary:
-        """Means and differences of the runs that are done."""
-        return self.summary_of(self.records())
-
-    def summary_of(self, records: Sequence[Mapping[str, Any]]) -> Summary:
-        """`summary` of records that have been read already."""
-        rows = _without_lists(records)
+    def summary(self, records: Sequence[Mapping[str, Any]] | None = None) -> Summary:
+        """Means and differences of the runs that are done; `records` if they have been read already."""
+        rows = _without_lists(self.records() if records is None else records)
         return summarise(rows, self.description["reference"], cost_columns(rows), self.reported_only)
 
     def write_tables(self) -> None:
@@ -246,7 +260,7 @@ class StudyFolder:
         rows = _without_lists(records)
         costs = cost_columns(rows)
         columns = [*(c for c in _columns(rows) if c not in costs), *costs]
-        found = self.summary_of(rows)
+        found = self.summary(records)
         failed = [{"run": f["name"], **f, "hints": "; ".join(f["hints"] or ())} for f in self.failures()]
         for name, table, names in (
             ("runs", rows, columns),
@@ -255,8 +269,20 @@ class StudyFolder:
             ("failures", failed, _FAILURE_COLUMNS),
         ):
             write_csv(self.path / f"{name}.csv", table, names, float_format=".6g")
-        arms = list(dict.fromkeys((row["family"], row["arm"]) for row in rows))
-        write_json(self.path / "recalibration.json", fit_recalibration(records, self._counts, arms))
+
+
+def _sum_by_scene(counts: Mapping[tuple[str, Any], np.ndarray]) -> dict[str, np.ndarray]:
+    """Counts (r, 1001, 2) of each scene, summed over seeds and pauses t >= 1."""
+    found: dict[str, np.ndarray] = {}
+    for (scene, _), one in counts.items():
+        found[scene] = found.get(scene, 0) + one[1:].sum(axis=0, dtype=np.int64)
+    return found
+
+
+def _best_noise(rows: Sequence[Mapping[str, Any]]) -> int:
+    """Index of the rate of noise with the lowest mean energy score over pauses t >= 1."""
+    energies = [row["energy_noise"] for row in rows if row["pause"] >= 1 and row.get("energy_noise")]
+    return int(np.argmin(np.nansum(np.array(energies), axis=0)))
 
 
 def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

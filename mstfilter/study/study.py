@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.files import locked, reading, sweep, writing
+from mstfilter.files import locked, sweep, writing
 from mstfilter.lazy import progress_of
 from mstfilter.processes import check_main_guard
-from mstfilter.reading import check_private, read_json
+from mstfilter.reading import check_private
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
-from mstfilter.study.executors import Event, Executor, Local, Tell
+from mstfilter.study.executors import Executor, Local, Tell
 from mstfilter.study.plan import Plan, StudyRun, StudyScene, make_plan
 from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
 
@@ -35,8 +35,8 @@ class StudyProgress:
     """Progress of a study."""
 
     what: str  #: {"recordings", "runs"}
-    event: Event | None  #: the last event; None at the beginning of a part
-    name: str  #: of the job that the event belongs to
+    name: str  #: the job that has ended or lost its worker; empty at the beginning of a part
+    outcome: JobOutcome | None  #: how the job ended; None if its worker died
     done: int  #: jobs of this part; `done` includes those of earlier calls
     failed: int
     total: int
@@ -58,7 +58,6 @@ def run_study(
     executor: Executor | None = None,
     overrides: Sequence[str] = (),
     *,
-    allow_files: bool = True,
     cache: Path | None = None,
     progress: bool | Callable[[StudyProgress], None] = False,
 ) -> StudyResult:
@@ -72,12 +71,10 @@ def run_study(
         Default: one process for each core of this machine.
     overrides : sequence of str
         Applied to every arm; a comma makes a grid.
-    allow_files : bool
-        Whether components may come from ``./file.py:Class``.
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. Default: the user's cache folder.
     progress : bool or callable
-        True shows progress bars; a function is called with every event.
+        True shows progress bars; a function is called whenever a job ends or loses its worker.
 
     Raises
     ------
@@ -89,13 +86,12 @@ def run_study(
     executor = executor or Local(logs=path / "logs")
     if isinstance(executor, Local):
         check_main_guard("run_study")
-    plan = make_plan(study, overrides, allow_files=allow_files)
-    recalibration = _read_recalibration(plan)
+    plan = make_plan(study, overrides)
     cache = (cache or cache_folder()).absolute()
     with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
-        _prepare(folder, cache, {**_description(plan), "recalibration": recalibration})
+        _prepare(folder, cache, _description(plan))
         waiting = [run for run in plan.runs if not _is_done(run, folder)]
-        call = _Call(plan, folder, cache, executor, report, allow_files)
+        call = _Call(plan, folder, cache, executor, report)
         failed = call.record_scenes(waiting)
         failed |= call.filter_scenes([run for run in waiting if run.name not in failed], len(failed))
         folder = StudyFolder.open(path)
@@ -126,7 +122,6 @@ class _Call:
     cache: Path
     executor: Executor
     report: Callable[[StudyProgress], None]
-    allow_files: bool
 
     def record_scenes(self, runs: Sequence[StudyRun]) -> dict[str, JobOutcome]:
         """Simulate the recordings that are missing; name of a run that lacks its recording -> why."""
@@ -149,13 +144,12 @@ class _Call:
         jobs = [self._run_job(run) for run in runs]
         count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
 
-        def tell(event: Event) -> None:
-            run = runs[event.job]
-            if event.kind == "lost":
-                sweep(self.folder.path / "runs", run.folder)
-            if event.outcome is not None and event.outcome.status != "done":
-                _write_failure(self.folder, run, event.outcome)
-            count(event)
+        def tell(k: int, outcome: JobOutcome | None) -> None:
+            if outcome is None:
+                sweep(self.folder.path / "runs", runs[k].folder)
+            elif outcome.status != "done":
+                _write_failure(self.folder, runs[k], outcome)
+            count(k, outcome)
 
         outcomes = self.executor.run(jobs, tell)
         failed = [(run, outcome) for run, outcome in zip(runs, outcomes, strict=True) if outcome.status != "done"]
@@ -183,23 +177,22 @@ class _Call:
             "config": {**run.arm.config, "description": run.arm.name},
             "seed": run.seed,
             "keep": plan.config.keep,
-            "allow_files": self.allow_files,
             "recordings": str(self.cache / "recordings"),
             "work": work if plan.config.cache_gb and run.arm.known_code else None,
         }
         return self._job("run", run.name, run.scene, more)
 
     def _counter(self, what: str, jobs: Sequence[Job], done: int, total: int, failed: int) -> Tell:
-        """A function that turns the events of jobs into progress."""
+        """A function that turns the outcomes of jobs into progress."""
 
-        def count(event: Event) -> None:
+        def count(k: int, outcome: JobOutcome | None) -> None:
             nonlocal done, failed
-            if event.outcome is not None:
-                done += event.outcome.status == "done"
-                failed += event.outcome.status != "done"
-            self.report(StudyProgress(what, event, jobs[event.job]["name"], done, failed, total))
+            if outcome is not None:
+                done += outcome.status == "done"
+                failed += outcome.status != "done"
+            self.report(StudyProgress(what, jobs[k]["name"], outcome, done, failed, total))
 
-        self.report(StudyProgress(what, None, "", done, failed, total))
+        self.report(StudyProgress(what, "", None, done, failed, total))
         return count
 
 
@@ -234,28 +227,6 @@ def _check_free_space(folder: Path) -> None:
         )
 
 
-def _read_recalibration(plan: Plan) -> dict[str, Any] | None:
-    """What another study fitted, of the families and arms of this one; None if the study names none."""
-    if not plan.config.recalibration:
-        return None
-    path = plan.config.folder / plan.config.recalibration
-    with reading(path, "a recalibration", "name the recalibration.json of a study of the same families and arms"):
-        found = read_json(path, "a recalibration")
-        groups, arms = {scene.group for scene in plan.scenes}, {arm.name for arm in plan.arms}
-        missing = [f"{arm} on {group}" for group in sorted(groups) for arm in sorted(arms) if arm not in found[group]]
-        fitted = {s for group in groups for arm in arms for s in found[group].get(arm, {}).get("scenes", ())}
-    if missing:
-        raise InputError(
-            f"recalibration {path} has no fit of {', '.join(missing[:5])}", "add these arms to that study"
-        )
-    if again := sorted(fitted & {scene.name for scene in plan.scenes}):
-        raise InputError(
-            f"recalibration {path} was fitted to {again[0]}, a scene of this study",
-            "forecasts are recalibrated on other scenes: leave the field out, or name a study of other scenes",
-        )
-    return {group: {arm: found[group][arm] for arm in arms} for group in groups}
-
-
 def _description(plan: Plan) -> dict[str, Any]:
     """The content of study.json."""
     study = plan.config
@@ -271,15 +242,8 @@ def _description(plan: Plan) -> dict[str, Any]:
         "scenes": [asdict(scene) for scene in plan.scenes],
         "seeds": study.seeds,
         "runs": [
-            {
-                "name": run.name,
-                "folder": run.folder,
-                "identity": run.identity,
-                "arm": run.arm.name,
-                "scene": run.scene.name,
-                "group": run.scene.group,
-                "seed": run.seed,
-            }
+            {name: getattr(run, name) for name in ("name", "folder", "identity", "seed")}
+            | {"arm": run.arm.name, "scene": run.scene.name, "group": run.scene.group}
             for run in plan.runs
         ],
     }

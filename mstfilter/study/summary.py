@@ -145,8 +145,9 @@ class Summary:
         for one in self.differences:
             if one.metric in ENDPOINTS and (one.family, one.arm) == (family, arm) and one.adjusted:
                 d = one.difference
-                limits = np.array([d.low, d.low_bootstrap, d.high, d.high_bootstrap])
-                lead = np.nanmin(-ENDPOINTS[one.metric] * limits)  # of the reference, at least
+                limits = [d.low, d.low_bootstrap, d.high, d.high_bootstrap]
+                # The least lead of the reference. It is NaN, and no claim is made, if no interval is known.
+                lead = np.fmin.reduce(-ENDPOINTS[one.metric] * np.array(limits))
                 found.append((lead > 0 and d.p_holm < 1 - LEVEL, lead > -NOT_WORSE and d.n >= CLAIM))
         better, not_worse = zip(*found, strict=True) if found else ((), ())
         return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
@@ -233,12 +234,16 @@ def summarise(
         for arm in arms
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
     ]
+    return Summary(families, arms, names, reference, metrics, _adjust(differences))
+
+
+def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
+    """Adjust the p values of both endpoints together; those of arms that are only reported become NaN."""
     p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
-    differences = [
+    return tuple(
         replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one
         for one, q in zip(differences, p, strict=True)
-    ]
-    return Summary(families, arms, names, reference, metrics, tuple(differences))
+    )
 
 
 _Values = dict[tuple[str, str, str], dict[str, float]]

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from unittest import mock
 
 import pytest
 
 from mstfilter.cli import main
-from mstfilter.errors import InputError
 from mstfilter.files import read_csv
 from mstfilter.scoring import LOG_LOSS
 from mstfilter.simulation import FIRST_REPORTED_SEED
-from mstfilter.study import SceneEntry, load_study, make_plan, run_study
+from mstfilter.study import load_study, make_plan
 from tests.experiments.scripts import EXPERIMENTS, run_script
 from tests.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
 FUSION = EXPERIMENTS / "fusion"
-SMALL = {"width": 160, "height": 120, "n_actions": 1, "voxel_size": 0.02}
-ONE_SCENE = (SceneEntry(family="demo", seeds=(0,), set=SMALL),)
 
 
 def run_small(tmp_path, config, *overrides):
@@ -62,7 +58,7 @@ def test_studies_run_in_their_small_form(tmp_path, name):
 
 
 def test_log_loss_of_a_study_in_its_small_form(tmp_path):
-    """Two scenes: each is scored with what the other one says, and the fit serves a third study."""
+    """Two scenes: each is scored with what the other one says."""
     folder = run_small(tmp_path, EXPERIMENTS / "information/study.toml")
     make_plan(load_study(EXPERIMENTS / "information/study.toml"))
     rows = read_csv(folder / "runs.csv")
@@ -75,23 +71,6 @@ def test_log_loss_of_a_study_in_its_small_form(tmp_path):
     invented = {row["arm"]: row for row in pauses if row["metric"] == "volume_invented"}
     own = [float(row["volume_invented"]) for row in rows if row["pause"] == "1" and row["arm"] == "mst"]
     assert float(invented["mst"]["pause_1"]) == pytest.approx(sum(own) / len(own), abs=1e-4)
-    rates = {
-        arm: fit["energy_rate"]
-        for arm, fit in json.loads((folder / "recalibration.json").read_text())["demo"].items()
-    }
-    assert rates["mst"] > 0
-    fitted = load_study(EXPERIMENTS / "information/study.toml", smoke=True).model_copy(
-        update={"recalibration": "recalibration.json", "folder": folder, "scenes": ONE_SCENE}
-    )
-    with pytest.raises(InputError, match="was fitted to demo-0, a scene of this study"):
-        run_study(fitted, tmp_path / "same", InProcess())
-    other = tuple(entry.model_copy(update={"seeds": (2,)}) for entry in ONE_SCENE)
-    result = run_study(fitted.model_copy(update={"scenes": other}), tmp_path / "third", InProcess())
-    third = result.folder.rows()
-    assert {(r["arm"], r["pause"]) for r in third} == {
-        (r["arm"], int(r["pause"])) for r in rows if r["scene"] == "demo-0"
-    }
-    assert all(0 < r[LOG_LOSS] < 1 and r["energy_floor"] < r["energy"] for r in third if r["arm"] == "mst")
 
 
 def test_number_of_hypotheses(tmp_path):

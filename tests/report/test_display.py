@@ -104,7 +104,7 @@ def test_the_texts_of_components_name_changed_fields():
 
 
 def test_the_front_door_names_classes_that_can_be_shown():
-    for name in ("Recording", "Clip", "Frame", "Hypothesis", "Population", "Belief", "ParticleFilter"):
+    for name in ("Recording", "Clip", "Frame", "Hypothesis", "Population", "Belief"):
         assert name in exported(mstfilter.__file__)
         assert callable(getattr(mstfilter, name)._repr_html_)
 

@@ -1,4 +1,4 @@
-"""Scenes in three dimensions: the page, seen by a headless browser, and the file of rerun."""
+"""Scenes in three dimensions: the page, seen by a headless browser."""
 
 from __future__ import annotations
 
@@ -8,17 +8,13 @@ import json
 import re
 import shutil
 import subprocess
-import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import InputError
 from mstfilter.report import recording_page, run_page, viewer
-from mstfilter.report.pictures import colour
 from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
-from mstfilter.testing import scene_example
 from tests.report.pages import check_html
 from tests.report.runs import GRID, make_run, recording, truth_at
 from tests.test_cli import call
@@ -115,6 +111,15 @@ def test_the_page_of_a_run(run):
     assert all(p["photo"] is None for p in data_of(run_page(run, photos=False))["pauses"])
 
 
+def test_the_command_writes_a_file_of_the_run(run, tmp_path, capsys):
+    code, out, _ = call("view", run.path, capsys=capsys)
+    assert code == 0 and str(run.path / "view.html") in out
+    assert (run.path / "view.html").read_text() == run_page(run).text
+    run.check_replaceable()
+    assert call("view", run.path, "--out", tmp_path / "page.html", capsys=capsys)[0] == 0
+    assert (tmp_path / "page.html").is_file()
+
+
 def test_the_page_of_a_recording():
     """The truth, or the measured surface where there is none."""
     (view,) = data_of(recording_page(recording()))["pauses"][1]["views"]
@@ -133,26 +138,9 @@ def test_an_empty_scene_has_a_page():
 
 
 @needs_browser
-def test_a_browser_finds_the_open_faces(tmp_path):
-    text = browse(SMALL.show().save(tmp_path / "scene.html"), tmp_path, "--dump-dom")
-    assert int(re.search(r'data-faces="(\d+)"', text)[1]) == open_faces(LABELS)
-
-
-@needs_browser
-def test_a_browser_draws_every_object_of_a_hypothesis(tmp_path):
-    hypothesis = scene_example(np.random.default_rng(0), 5)[0].particles[0]
-    page = hypothesis.show().save(tmp_path / "scene.html")
-    browse(page, tmp_path, f"--screenshot={tmp_path / 'scene.png'}")
-    for k in range(hypothesis.n_objects):
-        assert pixels_of(tmp_path / "scene.png", colour(k)) > 500
-
-
-@needs_browser
-def test_a_browser_draws_a_run(run, tmp_path, capsys):
-    """The command writes one page; image, voxels and time line are drawn without network."""
-    page = tmp_path / "run.html"
-    code, out, _ = call("view", run.path, "--html", page, capsys=capsys)
-    assert code == 0 and "run.html" in out
+def test_a_browser_draws_a_run(run, tmp_path):
+    """Image, voxels and time line are drawn without network."""
+    page = run_page(run).save(tmp_path / "run.html")
     text = browse(page, tmp_path, "--dump-dom", size="1000,800")
     last = data_of(run_page(run))["pauses"][-1]["views"]
     assert text.count("<circle") == 2 * sum(len(p["views"]) for p in data_of(run_page(run))["pauses"])
@@ -163,65 +151,3 @@ def test_a_browser_draws_a_run(run, tmp_path, capsys):
     for one in last[0]["objects"]:
         rgb = [int(one["colour"][k : k + 2], 16) for k in (1, 3, 5)]
         assert pixels_of(tmp_path / "run.png", rgb) > 200
-
-
-def help_of(page, tmp_path) -> str:
-    text = browse(page.save(tmp_path / "page.html"), tmp_path, "--dump-dom")
-    return re.search(r'id="help">(.*?)</p>', text)[1]
-
-
-@needs_browser
-@pytest.mark.parametrize("truth", [True, False])
-def test_the_help_names_what_the_time_line_has(tmp_path, truth):
-    text = help_of(run_page(make_run(tmp_path / "run", truth=truth)), tmp_path)
-    assert "Each disc is a hypothesis" in text
-    assert ("Each ring is the truth." in text) is truth and ("ring" in text) is truth
-    text = help_of(recording_page(recording(truth=truth)), tmp_path)
-    assert f"Each ring is the {'truth' if truth else 'surface'}." in text and "disc" not in text
-
-
-def test_files_of_rerun_hold_every_entity(run, tmp_path, capsys):
-    rerun = pytest.importorskip("rerun")
-    rerun.set_strict_mode(True)
-    code, out, _ = call("view", run.path, "--save", tmp_path / "run.rrd", capsys=capsys)
-    assert code == 0 and "run.rrd" in out
-    viewer.save_rerun(replace(recording(), name="two boxes"), tmp_path / "recording.rrd")
-    for name, wanted in (
-        (
-            "run",
-            ("/world/hypothesis_0", "/world/truth", "/world/camera/image/hypothesis_0", "/weight/", "/genealogy"),
-        ),
-        ("recording", ("/world/truth", "/world/camera/image/depth")),
-    ):
-        command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(tmp_path / f"{name}.rrd")]
-        shown = subprocess.run(
-            command, capture_output=True, check=True, timeout=600, env={"CI": "1", "HOME": str(tmp_path)}
-        )
-        for entity in wanted:
-            assert entity in shown.stdout.decode(), entity
-
-
-def test_the_viewer_listens_on_this_machine_only_and_sends_no_analytics(run, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("rerun")
-    calls = []
-    monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
-    monkeypatch.setattr(
-        viewer.subprocess,
-        "run",
-        lambda *command, **named: calls.append((*command, named)) or subprocess.CompletedProcess("", 0),
-    )
-    assert call("view", run.path, capsys=capsys)[0] == 0
-    ((command, named),) = calls
-    assert command[command.index("--bind") + 1] == "127.0.0.1"
-    assert named["env"]["CI"] and "FORCE_RERUN_ANALYTICS" not in named["env"]
-
-
-def test_without_rerun_one_error_says_what_to_install(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    for arguments in ((), ("--save", tmp_path / "run.rrd")):
-        code, _, error = call("view", run.path, *arguments, capsys=capsys)
-        assert code == 2 and error.count("error:") == 1
-        assert "rerun-sdk" in error and "mstfilter[viewer]" in error and "--html" in error
-    with pytest.raises(MissingLibraryError):
-        viewer.save_rerun(run, tmp_path / "run.rrd")
-    assert call("view", run.path, "--html", tmp_path / "run.html", capsys=capsys)[0] == 0

@@ -6,14 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from miniature_filters import exact_filter
-from miniature_world import Miniature
 
 from mstfilter.errors import InputError
 from mstfilter.forecasts import ForecastTable, energy_score, is_negative_type
 from mstfilter.scoring import (
-    CATEGORIES,
-    LOG_LOSS,
     NOISE_RATES,
     FittedForecasts,
     Questions,
@@ -22,7 +18,6 @@ from mstfilter.scoring import (
     forecast_table,
     leave_one_out,
     score_belief,
-    weighted_coverage,
 )
 
 
@@ -62,22 +57,16 @@ def test_with_the_pair_distance_the_energy_score_is_the_brier_score():
     assert score_belief(questions, labels, weights, truth).row["brier"] == pytest.approx(brier, abs=1e-9)
 
 
-def test_counts_hold_the_forecasts_of_every_category():
+def test_counts_hold_the_forecasts_and_outcomes():
     truth, questions = scene(1)
     labels = guesses(truth, np.random.default_rng(1))
-    score = score_belief(questions, labels, np.full(5, 0.2), truth, {1: "visible", 2: "hidden"})
-    assert (score.counts.sum(axis=(1, 2)) == len(questions)).all()
-    a, b = (truth.flat[k] for k in (questions.first, questions.second))
-    total = dict(zip(CATEGORIES, score.counts[0].sum(axis=0), strict=True))
-    assert total["free"] == ((a == 0) | (b == 0)).sum()
-    assert total["same visible"] == ((a == 1) & (b == 1)).sum()
-    assert total["different hidden"] == ((a > 0) & (b > 0) & (a != b)).sum()
+    score = score_belief(questions, labels, np.full(5, 0.2), truth)
+    yes = questions.outcomes(truth).sum()
+    assert (score.counts.sum(axis=1) == (len(questions) - yes, yes)).all()
     for k, rate in enumerate(NOISE_RATES):
         p = questions.forecasts(labels, np.full(5, 0.2), NOISE_RATES)[k]
         table, direct = forecast_table(score.counts[k]), ForecastTable.of(p, questions.outcomes(truth))
         assert table.brier == pytest.approx(direct.brier, abs=1e-3), rate
-    same = forecast_table(score.counts[0], CATEGORIES[:3])
-    assert same.no.sum() == 0 and same.yes.sum() == questions.outcomes(truth).sum()
 
 
 def test_without_questions_scores_are_unknown():
@@ -134,11 +123,6 @@ def test_leave_one_out_uses_the_other_scenes_only():
         rest = FittedForecasts.fit(sum(counts[k].astype(int) for k in counts if k != seed))
         assert fits[seed].rate == rest.rate
         assert fits[seed].log_loss(counts[seed]) == rest.log_loss(counts[seed])
-    row = fits[0].row(counts[0])
-    parts = [forecast_table(counts[0][0], names).n for names in (CATEGORIES[:3], CATEGORIES[3:6], ("free",))]
-    split = [row[f"{LOG_LOSS}_{name}"] for name in ("same", "different", "free")]
-    known = [(n, x) for n, x in zip(parts, split, strict=True) if n]
-    assert row[LOG_LOSS] == pytest.approx(sum(n * x for n, x in known) / sum(parts))
 
 
 # A world that can be enumerated: which of four voxels in a row belong together, free voxels included.
@@ -178,101 +162,3 @@ def test_the_posterior_has_the_least_expected_scores():
         share = rng.choice([1.0, 0.5, 0.1, 0.01])
         forecast = (1 - share) * posterior + share * (other if k % 2 else np.full(52, 1 / 52))
         assert all(a >= b - 1e-12 for a, b in zip(scores(forecast), best, strict=True))
-
-
-def test_the_exact_posterior_of_the_miniature_world_has_the_least_expected_scores():
-    """All 877 states of a table of six cells after three pushes, with the law of questions that the studies use: in
-    question is what lies on or behind a depth reading, now or before, and is not seen free now. 1,000 other
-    weightings, and the posterior's own states with noise at the border."""
-    rng = np.random.default_rng(2)
-    world = Miniature(shape=(3, 2))
-    states = world.states
-    _, observations = world.simulate(rng, T=3)
-    posterior = exact_filter(world, observations).posterior[-1]
-    depth = np.array([observation.depth for observation in observations])
-    behind = np.arange(2) >= depth[..., None]
-    where = (behind.any(axis=0) & behind[-1])[..., None]
-    assert where.sum() >= 4
-    questions = draw_questions(where, 2000, rng)
-    labels = [h.labels for h in states.hypotheses]
-    answers = questions.answers(labels).astype(float)
-    chance = posterior @ answers  # that the answer to each question is yes
-
-    def loss(p):
-        p = np.clip(p, 1e-12, 1 - 1e-12)
-        return -(chance * np.log(p) + (1 - chance) * np.log(1 - p)).mean()
-
-    def energy(weights, own, to_truth):
-        return weights @ to_truth @ posterior - 0.5 * weights @ own @ weights
-
-    roots = np.sqrt(answer_distances(answers > 0))
-    best = loss(chance), energy(posterior, roots, roots)
-    likely = np.argsort(-posterior)[:60]
-    for k in range(1000):
-        chosen = likely if k % 2 else np.arange(len(posterior))
-        other = np.zeros(len(posterior))
-        other[chosen] = rng.dirichlet(np.full(len(chosen), 0.2))
-        weights = posterior + rng.choice([1.0, 0.3, 0.1, 0.01]) * (other - posterior)
-        assert loss(weights @ answers) >= best[0] - 1e-12
-        assert energy(weights, roots, roots) >= best[1] - 1e-12
-    for rate in (0.1, 0.2, 0.4):
-        noisy = questions.answers(labels, rate, rng)
-        both = np.sqrt(answer_distances(np.concatenate([noisy, answers > 0])))
-        n = len(noisy)
-        assert loss(posterior @ noisy) > best[0] + 1e-6
-        assert energy(posterior, both[:n, :n], both[:n, n:]) > best[1] + 1e-6
-
-
-def test_questions_drawn_by_the_truth_are_improper():
-    """Four voxels in a row, three partitions: with equally many questions about each true object, another forecast
-    than the honest one has the lower expected Brier score."""
-    worlds = [np.array(row, np.uint16).reshape(4, 1, 1) for row in ([1, 1, 1, 2], [1, 1, 2, 2], [1, 2, 2, 2])]
-    first, second = np.triu_indices(4, 1)
-    questions = Questions((4, 1, 1), first, second)
-    answers = questions.answers(worlds).astype(float)
-    honest = np.full(3, 1 / 3)
-
-    def expected(p, by_truth):
-        total = 0.0
-        for weight, world, y in zip(honest, worlds, answers, strict=True):
-            sizes = np.bincount(world.ravel())[world.ravel()]
-            chance = 1 / (sizes[first] * sizes[second]) if by_truth else np.ones(6)
-            total += weight * (chance / chance.sum()) @ (p - y) ** 2
-        return total
-
-    p = honest @ answers
-    rng = np.random.default_rng(0)
-    others = np.clip(p + rng.normal(0, 0.1, (500, 6)), 0, 1)
-    assert min(expected(other, True) for other in others) < expected(p, True) - 1e-3
-    assert min(expected(other, False) for other in others) >= expected(p, False)
-
-
-def test_which_distances_of_partitions_are_of_negative_type():
-    """Variation of information and matched overlaps are not, on partitions of three to five voxels; the share of
-    pairs that differ, and its root, are."""
-
-    def information_distance(a, b):
-        joint = np.zeros((a.max() + 1, b.max() + 1))
-        np.add.at(joint, (a, b), 1 / len(a))
-        entropy = lambda p: -(p[p > 0] * np.log(p[p > 0])).sum()  # noqa: E731
-        return 2 * entropy(joint) - entropy(joint.sum(axis=0)) - entropy(joint.sum(axis=1))
-
-    def coverage_distance(a, b):
-        return 1 - weighted_coverage(a, b)
-
-    proper, improper = [], {"variation of information": [], "weighted coverage": []}
-    for n in (3, 4):
-        worlds = [one.ravel().astype(int) for one in partitions(n)]
-        first, second = np.triu_indices(n, 1)
-        questions = Questions((n,), first, second)
-        pairs = answer_distances(questions.answers(worlds))
-        proper += [is_negative_type(pairs), is_negative_type(np.sqrt(pairs))]
-        for name, distance in (
-            ("variation of information", information_distance),
-            ("weighted coverage", coverage_distance),
-        ):
-            rows = [[distance(a, b) for b in worlds] for a in worlds]
-            D = np.array(rows) * (1 - np.eye(len(worlds)))
-            improper[name].append(is_negative_type((D + D.T) / 2))
-    assert all(proper)
-    assert not any(found[-1] for found in improper.values()), improper

@@ -29,20 +29,11 @@ def test_studied_families_differ_only_in_their_objects():
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("n_objects_min", 0),
         ("n_objects_max", 2),
         ("n_twins", 9),
         ("n_hidden", 5),
-        ("contact", 1.5),
         ("catalogue", "mine"),
-        ("frames_per_clip", 1),
-        ("fps", 0.0),
-        ("push_speed", 9.0),
-        ("width", 0),
-        ("voxel_size", -0.01),
-        ("workspace_z", 9.0),
         ("width", 4097),
-        ("n_candidates", 0),
     ],
 )
 def test_fields_out_of_bounds(field, value):

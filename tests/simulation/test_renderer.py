@@ -7,10 +7,12 @@ from scipy.spatial.transform import Rotation
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.open3d_import import import_open3d
 from mstfilter.scene import Camera, depth_sigma, look_at
+from mstfilter.simulation.lighting import Stage
+from mstfilter.simulation.recorder import POSE_TOLERANCE
 from mstfilter.simulation.renderer import Renderer
 from mstfilter.simulation.sensor import DepthSensor, colour_reading
 from mstfilter.simulation.shapes import Shape, draw_shape
-from mstfilter.simulation.solids import box, ellipsoid
+from mstfilter.simulation.solids import ellipsoid
 from mstfilter.simulation.textures import Atlas, Skin, draw_room, draw_skin, texture_coordinates
 from mstfilter.simulation.world import FLOOR_HEIGHT, PhysicsWorld
 
@@ -45,18 +47,6 @@ def test_depth_of_a_sphere_matches_its_closed_form():
     expected = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.nan)
     np.testing.assert_array_equal(view.instance == 1, root > 0)
     np.testing.assert_allclose(view.depth[root > 0], expected[root > 0], atol=1e-5)
-
-
-def test_depth_of_a_box_from_above_and_of_the_table():
-    camera = kinect(eye=(0.0, -0.001, 1.0), target=(0.0, 0.0, 0.0))
-    view = rendered(single(box((0.1, 0.1, 0.05))), (0, 0, 0.05), camera)
-    points = camera.unproject(view.depth)
-    on = view.instance == 1
-    top = on & (points[..., 2] > 0.0999)
-    assert top.sum() > 0.9 * on.sum()
-    assert np.abs(points[top][:, :2]).max() < 0.1005
-    assert view.depth[top].max() == pytest.approx(0.9, abs=2e-3)
-    np.testing.assert_allclose(points[~on][:, 2][np.abs(points[~on][:, 0]) < 0.4], 0.0, atol=1e-4)
 
 
 def test_depth_and_instances_agree_with_the_ray_caster_of_open3d():
@@ -264,3 +254,21 @@ def test_the_colour_sensor_keeps_grey_and_order():
     assert image.dtype == np.uint8
     assert (np.diff(levels) > 0).all() and levels[0] < 12 and levels[-1] > 240
     assert np.abs(image.mean(axis=(0, 1)) - image.mean()).max() < 1
+
+
+def test_rendered_poses_are_within_the_tolerance():
+    shape = draw_shape(np.random.default_rng(0), "carton")
+    world = PhysicsWorld([shape])
+    stage, pose = Stage(world, POSE_TOLERANCE), world.poses()[0]
+    rng = np.random.default_rng(0)
+    corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T * shape.half
+    moved = 0
+    for _ in range(60):
+        pose[:3, 3] += rng.normal(0, 3e-5, 3)
+        world.place(0, pose[:3, 3], pose[:3, :3])
+        before = stage.poses[0]
+        stage.follow()
+        moved += (stage.poses[0] != before).any()
+        shown, true = (p[:3, :3] @ corners.T + p[:3, 3:] for p in (stage.poses[0], world.poses()[0]))
+        assert np.linalg.norm(shown - true, axis=0).max() <= POSE_TOLERANCE
+    assert 2 < moved < 40

@@ -12,7 +12,7 @@ from mstfilter.simulation import printing
 from mstfilter.simulation.arrangement import draw_objects
 from mstfilter.simulation.families import scene_family
 from mstfilter.simulation.shapes import ANY, REPORTED, SHAPE_FAMILIES, TUNING, draw_shape
-from mstfilter.simulation.solids import box, capsule, cylinder, ellipsoid, frustum, hull, ring
+from mstfilter.simulation.solids import box, capsule, cylinder, ellipsoid, frustum
 from mstfilter.simulation.world import PhysicsWorld
 
 PIECES = {
@@ -35,24 +35,6 @@ def test_volume_and_bounds_match_closed_form_and_monte_carlo(name):
     share, whole = inside.mean(), float(np.prod(high - low + 0.02))
     # Five standard deviations of the share: a false alarm in a million.
     assert share * whole == pytest.approx(piece.volume, abs=5 * whole * np.sqrt(share * (1 - share) / len(points)))
-
-
-def test_wedges_fill_the_ring():
-    wedges = ring([(0.03, 0.04, 0.0), (0.03, 0.04, 0.05)], 24)
-    assert sum(w.volume for w in wedges) == pytest.approx(
-        0.05 * 24 / 2 * np.sin(2 * np.pi / 24) * (0.04**2 - 0.03**2), rel=1e-9
-    )
-    rng = np.random.default_rng(2)
-    angle, r = rng.uniform(-np.pi, np.pi, 5000), rng.uniform(0.0301, 0.0395, 5000)
-    points = np.stack([r * np.cos(angle), r * np.sin(angle), rng.uniform(0, 0.05, 5000)], axis=1)
-    assert np.any([w.inside(points) for w in wedges], axis=0).all()
-
-
-def test_hull_of_a_box_is_the_box():
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-2, 2) for z in (0, 3)]) * 0.01
-    points = np.random.default_rng(3).uniform(-0.04, 0.04, (5000, 3))
-    expected = box((0.01, 0.02, 0.015), (0, 0, 0.015)).inside(points)
-    np.testing.assert_array_equal(hull(corners).inside(points), expected)
 
 
 @pytest.mark.parametrize("family", SHAPE_FAMILIES)

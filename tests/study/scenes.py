@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from mstfilter.files import read_csv
 from mstfilter.formats import RecordingWriter
 from mstfilter.scene import scene_cache
 from mstfilter.study import Executor
-from mstfilter.study.executors import Event
 from mstfilter.study.jobs import perform
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -24,6 +24,17 @@ def slide(path, seed=0, pauses=3):
     return path
 
 
+def table(path, name="runs.csv"):
+    """The rows of a table of a study."""
+    return read_csv(path / name)
+
+
+def metrics(path):
+    """The table of runs without time and memory."""
+    cost = ("core_seconds", "seconds", "peak_mb")
+    return [{k: v for k, v in row.items() if not k.startswith(cost)} for row in table(path)]
+
+
 class InProcess(Executor):
     """Runs jobs one after another in this process.
 
@@ -35,7 +46,6 @@ class InProcess(Executor):
         scene_cache.clear()  # as in a new worker
         outcomes = []
         for k, job in enumerate(jobs):
-            tell(Event("started", k))
             outcomes.append(perform(job))
-            tell(Event("ended", k, outcome=outcomes[-1]))
+            tell(k, outcomes[-1])
         return outcomes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import subprocess
@@ -21,7 +20,7 @@ from mstfilter.study.executors import Executor, Local
 from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
 from tests.conftest import REPOSITORY
-from tests.study.scenes import InProcess, slide
+from tests.study.scenes import InProcess, metrics, slide, table
 
 BROKEN = Path(__file__).parent / "broken.py"
 FAST = "floor_components"  # a preset that needs no large library
@@ -44,17 +43,6 @@ def study(folder, *arms, **more):
         entries.append({"name": how, **succeed.get(how, {"preset": FAST, "set": rule})})
     data = {"name": "test", "folder": folder, "scenes": [{"recordings": "slide"}], "seeds": [0, 1], "arms": entries}
     return study_of({**data, **more})
-
-
-def table(path, name="runs.csv"):
-    with (path / name).open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def metrics(path):
-    """The table without time and memory."""
-    cost = ("core_seconds", "seconds", "peak_mb")
-    return [{k: v for k, v in r.items() if not k.startswith(cost)} for r in table(path)]
 
 
 def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
@@ -103,11 +91,9 @@ def test_a_failure_that_could_not_be_written_down_is_written_later(folder, tmp_p
 def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
     seen = []
     wanted = study(folder, f"exit@{tmp_path / 'once'}", seeds=[0])
-    result = run_study(
-        wanted, tmp_path / "out", Local(1), cache=tmp_path, progress=lambda p: seen.append(p.event and p.event.kind)
-    )
+    result = run_study(wanted, tmp_path / "out", Local(1), cache=tmp_path, progress=seen.append)
     assert result.failed == () and result.done == 1
-    assert seen.count("started") == 2 and seen.count("lost") == 1
+    assert [p.outcome and p.outcome.tries for p in seen if p.name] == [None, 2]
 
 
 @dataclass(frozen=True)

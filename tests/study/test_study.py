@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import shutil
 import sqlite3
@@ -19,7 +18,7 @@ from mstfilter.study.config import SceneEntry, load_study, split_grid, study_of
 from mstfilter.study.jobs import perform
 from mstfilter.study.plan import make_plan
 from mstfilter.study.study import run_study
-from tests.study.scenes import InProcess, slide
+from tests.study.scenes import InProcess, metrics, slide
 
 BASE = """
 description = "test"
@@ -28,8 +27,8 @@ seeds = [0, 1]
 recordings = "slide-*"
 group = "slide"
 [[arms]]
-preset = "mst"
-set = ["transition=identity", "update.n_views=1,2"]
+preset = "floor_components"
+set = ["resampler=systematic,residual"]
 [smoke]
 seeds = 3
 """
@@ -45,23 +44,16 @@ def folder(tmp_path_factory):
     return path
 
 
-def table(path, costs=False):
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    kept = [k for k in rows[0] if costs or not k.startswith(("seconds", "core_seconds", "peak_mb"))]
-    return [{k: row[k] for k in kept} for row in rows]
-
-
 def test_a_finished_study_repeats_no_run(folder, tmp_path, capsys):
     study = load_study(folder / "base.toml")
     first = run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache", progress=True)
     assert (first.done, first.repeated, first.failed) == (8, 0, ())
     assert "8/8" in capsys.readouterr().err
-    rows = table(tmp_path / "out" / "runs.csv")
+    rows = metrics(tmp_path / "out")
     assert len(rows) == 2 * 2 * 2 * 3
     assert {r["arm"] for r in rows} == {
-        "mst transition=identity update.n_views=1",
-        "mst transition=identity update.n_views=2",
+        "floor_components resampler=systematic",
+        "floor_components resampler=residual",
     }
     assert {(r["scene"], r["family"]) for r in rows} == {("slide-0", "slide"), ("slide-1", "slide")}
     made = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "runs").rglob("result.json")}
@@ -127,7 +119,7 @@ def test_a_larger_study_runs_new_runs_only(folder, tmp_path):
     larger = study.model_copy(update={"seeds": (*study.seeds, 7)})
     more = run_study(larger, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
     assert (more.done, more.repeated) == (8, 4)
-    assert {r["seed"] for r in table(tmp_path / "out" / "runs.csv")} == {str(seed) for seed in larger.seeds}
+    assert {r["seed"] for r in metrics(tmp_path / "out")} == {str(seed) for seed in larger.seeds}
 
 
 def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
@@ -138,12 +130,12 @@ def test_keep_tables_removes_the_hypotheses(folder, tmp_path):
         run_study(chosen, tmp_path / keep, InProcess(), cache=tmp_path / "cache")
         runs = list((tmp_path / keep / "runs").iterdir())
         assert runs and all((path / "pauses").exists() == (keep == "all") for path in runs)
-    assert table(tmp_path / "all" / "runs.csv") == table(tmp_path / "tables" / "runs.csv")
+    assert metrics(tmp_path / "all") == metrics(tmp_path / "tables")
 
 
 def test_a_worker_with_other_code_refuses():
     outcome = perform({"kind": "run", "code": "another", "folder": "unused"})
-    assert outcome.error == "the code has changed since the study began"
+    assert outcome.error == "this process has other code of mstfilter than the study began with"
 
 
 def test_arms_that_use_the_ground_truth_are_marked(folder, tmp_path):
@@ -170,7 +162,7 @@ def test_shared_work_changes_no_result(folder, tmp_path):
                 path.write_bytes(path.read_bytes()[:-40])
         study = study_of({**data, "cache_gb": 0 if case == "none" else 1})
         run_study(study, tmp_path / case, InProcess(), cache=cache)
-        found[case] = (tmp_path / case / "runs.csv").read_text() and table(tmp_path / case / "runs.csv")
+        found[case] = metrics(tmp_path / case)
         assert (cache / "work").exists() == (case != "none")
     with contextlib.closing(sqlite3.connect(cache / "work" / "cache.db")) as database:
         stored = {name for (name,) in database.execute("SELECT DISTINCT tag FROM Cache")}

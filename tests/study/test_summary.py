@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import compare
 from mstfilter.study.summary import summarise
 
@@ -86,3 +87,17 @@ def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():
 
 def test_no_rows_give_no_differences():
     assert summarise([], "ours").differences == ()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("n_scenes", "better"), [(20, True), (1, False)])
+def test_a_filter_is_better_only_with_enough_scenes(n_scenes, better):
+    """The reference leads by 0.1 to 0.2 in both endpoints. One scene has no interval, and gives no warning."""
+    rng = np.random.default_rng(1)
+    table = [
+        {"family": "f", "scene": str(k), "arm": arm, "seed": 0, "pause": 1,
+         "quality": 0.5 - lag * (1 + rng.random()), LOG_LOSS: 0.5 + lag * (1 + rng.random())}
+        for k in range(n_scenes)
+        for arm, lag in (("ours", 0.0), ("theirs", 0.1))
+    ]  # fmt: skip
+    assert summarise(table, "ours").is_better("f", "theirs") is better
