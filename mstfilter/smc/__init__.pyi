@@ -27,10 +27,8 @@ from mstfilter.smc.diagnostics import (
 from mstfilter.smc.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
-    Gamma as Gamma,
     MultivariateNormal as MultivariateNormal,
     Normal as Normal,
-    Poisson as Poisson,
     Student as Student,
     Uniform as Uniform,
     as_distribution as as_distribution,
@@ -64,7 +62,6 @@ from mstfilter.smc.history import (
     ess as ess,
     log_evidence as log_evidence,
     mean as mean,
-    n_particles as n_particles,
     resampled as resampled,
     unique_ancestors as unique_ancestors,
     weight_entropy as weight_entropy,

@@ -2,7 +2,6 @@
 
 >>> infos.to_pandas(), population.to_pandas(), chains.to_pandas(), history.to_pandas()
 >>> arviz.summary(chains.to_arviz(["rho", "sigma"]))
->>> Population.from_arviz(population.to_arviz())              # the same particles and weights
 
 A class with `columns` is a `Table`: its columns are a mapping from names to arrays with one entry per row, which
 polars takes as well. An array with several entries per row has a column for each: ``x_0``, ``x_1``, or ``x_0_1``.
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import MissingLibraryError
+from mstfilter.errors import missing_library
 
 
 class Table(ABC):
@@ -44,10 +43,8 @@ def library(name: str) -> Any:
     """An optional library; MissingLibraryError if it is not installed."""
     try:
         return import_module(name)
-    except ImportError:
-        raise MissingLibraryError(
-            f"this export needs the library {name}, which is not installed", "pip install 'mstfilter[xarray]'"
-        ) from None
+    except ImportError as error:
+        raise missing_library(error, "this export", library=name) from error
 
 
 def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:

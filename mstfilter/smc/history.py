@@ -1,7 +1,7 @@
 """Recording quantities of a run.
 
 A collector is a function ``(state, info) -> number or array``, called after every step. `ess`, `unique_ancestors`,
-`weight_entropy`, `log_evidence`, `mean`, `resampled` and `n_particles` are collectors, and
+`weight_entropy`, `log_evidence`, `mean` and `resampled` are collectors, and
 `mstfilter.smc.diagnostics.selection_distance`.
 
 >>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
@@ -54,11 +54,6 @@ def log_evidence(state: State, info: Info) -> float:
 def resampled(state: State, info: Info) -> bool:
     """Whether the step resampled."""
     return info.resampled
-
-
-def n_particles(state: State, info: Info) -> int:
-    """Particles after the step."""
-    return info.n
 
 
 def mean(state: State, info: Info) -> Any:

@@ -204,9 +204,9 @@ class Population(Table):
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. ``"mate"``: the
-        second parent of a particle that two previous ones made. A resampler adds ``"ancestor"``, the index before the
-        resampling; a population after a step has it if the step resampled after its update.
+        proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. A resampler adds
+        ``"ancestor"``, the index before the resampling; a population after a step has it if the step resampled after
+        its update.
     notes : mapping
         Values that a component records: plain numbers, strings and lists.
     """
@@ -267,20 +267,6 @@ class Population(Table):
         posterior = {name: a[None] for name, a in self._arrays().items()}
         named = {"weights": "sample_stats/log_weight"} if np.ptp(self.log_weights) else {}
         return draws_tree(posterior, {"log_weight": self.log_weights[None]}, **named)
-
-    @classmethod
-    def from_arviz(cls, tree: Any) -> Population:
-        """All draws of a ``DataTree`` or of ArviZ's ``InferenceData``, with the weights of `to_arviz` if it has them.
-
-        Particles are a mapping of arrays; an array if the only variable is called "x".
-        """
-        by_name = {
-            str(name): a.transpose("chain", "draw", ...).values for name, a in tree["posterior"].data_vars.items()
-        }
-        particles = {name: a.reshape(-1, *a.shape[2:]) for name, a in by_name.items()}
-        stats = tree["sample_stats"].data_vars if "sample_stats" in tree else {}
-        population = cls(particles["x"] if set(particles) == {"x"} else particles)
-        return population.reweighted(stats["log_weight"].values.reshape(-1)) if "log_weight" in stats else population
 
     def __len__(self) -> int:
         return len(self.log_weights)

@@ -11,7 +11,7 @@ Three smoothers of a record return a tuple with one population per time:
 - `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It has more distinct
   particles, and a bias if the state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
-  path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"`` or ``"rejection"``.
+  path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"``.
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, check_number
+from mstfilter.errors import InputError, check_integer
 from mstfilter.fields import Bounded, PositiveInt
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import check_observations, split_input
@@ -38,7 +38,7 @@ from mstfilter.smc.resampling import draw_rows, independent_draws
 from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key
 
-BackwardMethod = Literal["exact", "mcmc", "rejection"]
+BackwardMethod = Literal["exact", "mcmc"]
 #: Pairs of particles per call of `log_prob`.
 _PAIRS = 1_000_000
 
@@ -117,7 +117,6 @@ def backward_paths(
     method: BackwardMethod = "exact",
     *,
     steps: int = 1,
-    log_bound: float | None = None,
 ) -> tuple[Population, ...]:
     """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
 
@@ -128,13 +127,8 @@ def backward_paths(
     transition : DensityTransition
         That of the model, ``Dynamics(model)``. One with a proposal cannot be used: its density is that of the
         proposal.
-    method : "exact", "mcmc" or "rejection"
+    method : "exact" or "mcmc"
         "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
-
-        "rejection" (Douc, Garivier, Moulines, Olsson 2011) draws particles by weight and accepts them with
-        probability f / max f. The law is that of "exact". A path that has accepted none of N particles is drawn as by
-        "exact" (Dau and Chopin 2023). So a step takes at most about 2 n N densities, on average n times the mean of
-        max f / p(x_{t+1} | y_0 .. y_t).
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
         steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
@@ -143,11 +137,9 @@ def backward_paths(
         Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
     steps : int
         Metropolis steps of "mcmc".
-    log_bound : float
-        For "rejection": an upper bound of ``transition.log_prob``. InputError if a density exceeds it.
     """
     check_integer("n", n)
-    kernel = _Backward(transition, method, steps, log_bound)
+    kernel = _Backward(transition, method, steps)
     last = record.populations[-1].realised()
     index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
@@ -155,9 +147,23 @@ def backward_paths(
         population = record.populations[t].realised()
         parents = record.parents(t + 1)[index] if method == "mcmc" else None
         move = kernel.move(population, path[-1].particles, record.observations[t + 1], t)
-        index = kernel.draw(rng, move, parents, 1)[:, 0]
+        index = move.draw(rng, parents, 1)[:, 0]
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
+
+
+@dataclass(frozen=True)
+class _Backward(Bounded):
+    """Draws predecessors; the fields are arguments of `backward_paths`."""
+
+    transition: DensityTransition
+    method: BackwardMethod
+    steps: PositiveInt
+
+    def move(self, population: Population, later: Particles, observation: Any, t: int) -> _Move:
+        """The moves from a population at time `t` to the particles after `observation`."""
+        y, u = split_input(observation)
+        return _Move(population, later, self.transition.at_step(t + 1, u), y, t, self.steps)
 
 
 @dataclass(frozen=True)
@@ -169,8 +175,15 @@ class _Move:
     transition: DensityTransition
     y: Any
     t: int
+    steps: int  #: of a Metropolis chain between two draws
 
-    def log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def draw(self, rng: np.random.Generator, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
+        """(n, n_draws) indices of predecessors, by Metropolis steps from the `parents` (n,) if they are given."""
+        if parents is not None:
+            return self._metropolis(rng, parents, n_draws)
+        return self._exact(rng, count_particles(self.later), n_draws)
+
+    def _log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """(k,) log density of the moves from particles `index` to the later ones at `rows` (default: all)."""
         later = self.later if rows is None else take(self.later, rows)
         found = self.transition.log_prob(take(self.population.particles, index), later, self.y)
@@ -181,79 +194,31 @@ class _Move:
             raise _impossible(self.t)
         return density
 
-    def exact(self, rng: np.random.Generator, rows: np.ndarray, n_draws: int) -> np.ndarray:
-        """(k, n_draws) indices of predecessors of the later particles at `rows`."""
+    def _exact(self, rng: np.random.Generator, n: int, n_draws: int) -> np.ndarray:
         m = len(self.population)
-        index, block = np.empty((len(rows), n_draws), np.int64), max(1, _PAIRS // m)
-        for begin in range(0, len(rows), block):
-            some = rows[begin : begin + block]
-            density = self.log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
+        index, block = np.empty((n, n_draws), np.int64), max(1, _PAIRS // m)
+        for begin in range(0, n, block):
+            some = np.arange(begin, min(begin + block, n))
+            density = self._log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
             log_weights = self.population.log_weights + density.reshape(-1, m)
             for k in range(n_draws):
                 index[begin : begin + block, k] = draw_log(rng, log_weights, self.t)
         return index
 
-    def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int, n_draws: int) -> np.ndarray:
-        """(n, n_draws) states of chains that start at the parents, every `steps` steps."""
-        density = self.log_density(parents)
+    def _metropolis(self, rng: np.random.Generator, parents: np.ndarray, n_draws: int) -> np.ndarray:
+        """States of chains that start at the parents, every `steps` steps."""
+        density = self._log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
 
         def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
             index = _by_weight(rng, self.population, len(parents))
-            density = self.log_density(index)
+            density = self._log_density(index)
             return {"index": index, "density": density}, density - now["density"]
 
-        chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * n_draws)
-        draws = [state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0]
+        chain = metropolis(rng, {"index": parents, "density": density}, propose, self.steps * n_draws)
+        draws = [state["index"] for k, (state, _) in enumerate(chain, 1) if k % self.steps == 0]
         return np.stack(draws, axis=1)
-
-    def rejected(self, rng: np.random.Generator, n: int, log_bound: float) -> np.ndarray:
-        """(n,) indices of predecessors of the n later particles, by rejection."""
-        index, left, trials = np.empty(n, np.int64), np.arange(n), 0
-        while len(left) and trials < len(self.population):
-            each = max(1, n // len(left))  # a round evaluates at most n densities
-            new = _by_weight(rng, self.population, each * len(left)).reshape(len(left), each)
-            density = self.log_density(new.ravel(), np.repeat(left, each))
-            if density.max() > log_bound + 1e-9 * (1 + abs(log_bound)):
-                raise InputError(
-                    f"step {self.t}: the log density of a move is {density.max()}, more than log_bound = {log_bound}"
-                )
-            accepted = (density - log_bound > -rng.standard_exponential(len(density))).reshape(new.shape)
-            first, some = accepted.argmax(axis=1), accepted.any(axis=1)
-            index[left[some]] = new[some, first[some]]
-            left, trials = left[~some], trials + each
-        if len(left):
-            index[left] = self.exact(rng, left, 1)[:, 0]
-        return index
-
-
-@dataclass(frozen=True)
-class _Backward(Bounded):
-    """Draws predecessors of later particles; the fields are arguments of `backward_paths`."""
-
-    transition: DensityTransition
-    method: BackwardMethod
-    steps: PositiveInt
-    log_bound: float | None
-
-    def __post_init__(self) -> None:
-        if self.method == "rejection":
-            check_number("log_bound", self.log_bound)
-
-    def move(self, population: Population, later: Particles, observation: Any, t: int) -> _Move:
-        """The moves from a population at time `t` to the particles after `observation`."""
-        y, u = split_input(observation)
-        return _Move(population, later, self.transition.at_step(t + 1, u), y, t)
-
-    def draw(self, rng: np.random.Generator, move: _Move, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
-        """(n, n_draws) indices; `parents` (n,) of the later particles are for "mcmc"."""
-        if parents is not None:
-            return move.metropolis(rng, parents, self.steps, n_draws)
-        n = count_particles(move.later)
-        if self.log_bound is not None and self.method == "rejection":
-            return np.stack([move.rejected(rng, n, self.log_bound) for _ in range(n_draws)], axis=1)
-        return move.exact(rng, np.arange(n), n_draws)
 
 
 def paris(
@@ -266,7 +231,6 @@ def paris(
     method: BackwardMethod = "exact",
     *,
     steps: int = 1,
-    log_bound: float | None = None,
 ) -> Iterator[np.ndarray]:
     """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
 
@@ -284,7 +248,7 @@ def paris(
         The transition of the model, ``Dynamics(model)``.
     n_draws : int
         At least 2: with one the variance grows as that of the genealogy.
-    method, steps, log_bound
+    method, steps
         As in `backward_paths`.
 
     Yields
@@ -294,7 +258,7 @@ def paris(
     check_integer("n_draws", n_draws)
     if not filter.properly_weighted:
         raise InputError("a component of the filter is not properly weighted: its smoothed means have another limit")
-    kernel = _Backward(transition, method, steps, log_bound)
+    kernel = _Backward(transition, method, steps)
     past: Population | None = None
     statistic = np.zeros(0)
     state = filter.start(seed)
@@ -308,7 +272,7 @@ def paris(
             rng = Key(seed).child("paris", t).generator()
             parents = known_parents(now, t) if method == "mcmc" else None
             move = kernel.move(past, now.particles, observation, t - 1)
-            index = kernel.draw(rng, move, parents, n_draws).ravel()
+            index = move.draw(rng, parents, n_draws).ravel()
             later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
             statistic = statistic[index] + functional(t, take(past.particles, index), later)
             statistic = statistic.reshape(len(now), n_draws, *statistic.shape[1:]).mean(axis=1)

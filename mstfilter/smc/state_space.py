@@ -88,7 +88,7 @@ class StateSpaceModel(AtStep):
 
     @classmethod
     def of(cls, initial: Any, transition: Callable[..., Any], observation: Callable[..., Any]) -> StateSpaceModel:
-        """A model from distributions of this package, frozen ones of scipy.stats, or those of torch.
+        """A model from distributions of this package, or frozen ones of scipy.stats.
 
         `initial` is the distribution of x_0, ``transition(particles)`` that of x_t, and ``observation(particles)``
         that of y_t, one row per particle. The functions may have the further parameters ``t`` and ``u``.

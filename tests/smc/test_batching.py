@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
@@ -19,7 +20,6 @@ from mstfilter.smc import (
     Multinomial,
     Never,
     Normal,
-    Poisson,
     Program,
     RandomWalkMove,
     Reweight,
@@ -91,7 +91,7 @@ def walk(previous, y):
 
 
 def counts(d):
-    return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Poisson(np.exp(x)))
+    return StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: stats.poisson(np.exp(x)))
 
 
 CHAIN = hidden_markov([0.5, 0.5], [[0.9, 0.1], [0.2, 0.8]], lambda y: -np.square(y - np.arange(2.0)))

@@ -14,7 +14,6 @@ from mstfilter.smc import (
     Coalesced,
     EssBelow,
     EveryKth,
-    Gamma,
     Gaussian,
     Kld,
     Normal,
@@ -101,7 +100,6 @@ def decides(previous, y):
     [
         (lambda: Normal(0.0, -1.0), r"scale of a Normal is -1\.0, expected a positive number"),
         (lambda: Student(0.0), "df of a Student"),
-        (lambda: Gamma(1.0, 0), "rate of a Gamma is 0"),
         (lambda: Uniform(1.0, 1.0), r"high of a Uniform is 1\.0, expected a finite number above low"),
         (lambda: Program(3), "model is 3, expected a function"),
         (lambda: Program(decides).bootstrap(5).run([0.1], 0), "step 0, initial: the program decides by an array"),

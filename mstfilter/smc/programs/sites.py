@@ -41,7 +41,7 @@ def sample(name: str, distribution: Any) -> Any:
     name : str
         Unique within a step, except for sites in different branches of a `switch`.
     distribution : Distribution
-        Of this package, frozen of scipy.stats, or of torch; parameters have one row per particle.
+        Of this package or frozen of scipy.stats; parameters have one row per particle.
 
     Returns
     -------
