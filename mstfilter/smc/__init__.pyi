@@ -110,9 +110,7 @@ from mstfilter.smc.programs.filters import (
     ProgramMove as ProgramMove,
 )
 from mstfilter.smc.programs.sites import (
-    Trace as Trace,
     observe as observe,
-    per_particle as per_particle,
     sample as sample,
     switch as switch,
 )

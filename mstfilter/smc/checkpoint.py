@@ -7,8 +7,8 @@ renamed, so that a process that is killed leaves the state of a complete step. A
 step only, so a continued run equals an uninterrupted one. A run with another seed, filter, model or observation is
 refused; so is one with another version of Python if the filter contains functions.
 
-`ArrayCodec` stores particles that are arrays, mappings of arrays, or traces of arrays, numbers, strings and None.
-Particles of another kind need a `Codec`; stored data never import code.
+`ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another kind need a `Codec`; stored
+data never import code.
 """
 
 from __future__ import annotations
@@ -249,88 +249,26 @@ def _difference(what: str, found: Any, wanted: Any) -> tuple[str, Any, Any] | No
     return None if found == wanted else (what, found, wanted)
 
 
-_FORM = "form"
-
-
 @dataclasses.dataclass(frozen=True)
 class ArrayCodec(Codec):
-    """Arrays, mappings of arrays, and traces of programs of single particles."""
+    """Arrays, stored as ``x``, and mappings of arrays, stored as ``x/NAME``."""
 
     def encode(self, particles: Any) -> dict[str, np.ndarray]:
-        """Named arrays; ``form`` describes the particles in JSON."""
         if isinstance(particles, np.ndarray):
-            return {_FORM: _json({"kind": "array"}), "x": _storable(particles, "the particles")}
+            return {"x": _storable(particles, "the particles")}
         if isinstance(particles, Mapping):
-            arrays = {f"x/{name}": _storable(np.asarray(a), f"{name!r}") for name, a in particles.items()}
-            return {_FORM: _json({"kind": "mapping", "names": list(particles)}), **arrays}
-        return self._encode_traces(particles)
-
-    def _encode_traces(self, particles: Sequence[Any]) -> dict[str, np.ndarray]:
-        from mstfilter.smc.programs.sites import Trace  # the language of programs is imported for programs only
-
-        others = sorted({type(p).__qualname__ for p in particles if type(p) is not Trace})
-        if others:
-            raise InputError(f"particles of type {', '.join(others)} cannot be stored", _HINT)
-        # Resampled particles are references: each object is stored once.
-        distinct = {id(p): p for p in particles}
-        numbers = {key: k for k, key in enumerate(distinct)}
-        arrays = {"index": np.array([numbers[id(p)] for p in particles], np.int64)}
-        rows = []
-        for k, trace in enumerate(distinct.values()):
-            rows.append({name: _describe(value, f"{name!r}") for name, value in trace.items()})
-            for name, value in trace.items():
-                if isinstance(value, (np.ndarray, np.generic)):
-                    arrays[f"x/{k}/{name}"] = _storable(np.asarray(value), f"{name!r}")
-        return {_FORM: _json({"kind": "traces", "rows": rows}), **arrays}
+            return {f"x/{name}": _storable(np.asarray(a), f"{name!r}") for name, a in particles.items()}
+        kinds = sorted({type(p).__qualname__ for p in particles})
+        raise InputError(f"particles of type {', '.join(kinds)} cannot be stored", _HINT)
 
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        form = json.loads(str(arrays[_FORM]))
-        if form["kind"] == "array":
-            return arrays["x"]
-        if form["kind"] == "mapping":
-            return {name: arrays[f"x/{name}"] for name in form["names"]}
-        from mstfilter.smc.programs.sites import Trace
-
-        made = [
-            Trace({name: _restore(how, arrays.get(f"x/{k}/{name}")) for name, how in row.items()})
-            for k, row in enumerate(form["rows"])
-        ]
-        return tuple(made[k] for k in arrays["index"].tolist())
+        return arrays["x"] if "x" in arrays else {name.removeprefix("x/"): a for name, a in arrays.items()}
 
 
 _HINT = "pass codec=, a mstfilter.smc.Codec that stores them as arrays"
-
-
-def _describe(value: Any, what: str, in_tuple: bool = False) -> Any:
-    """A value as JSON, which keeps floats exactly; arrays and tuples are marked."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        if in_tuple:
-            raise InputError(f"{what} is a tuple that holds arrays, which cannot be stored", _HINT)
-        return {"is": "array" if isinstance(value, np.ndarray) else "number"}
-    if isinstance(value, tuple):
-        return {"is": "tuple", "of": [_describe(v, what, True) for v in value]}
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    raise InputError(f"{what} is of type {type(value).__qualname__}, which cannot be stored", _HINT)
-
-
-def _restore(described: Any, array: np.ndarray | None) -> Any:
-    if not isinstance(described, dict):
-        return described
-    if described["is"] == "tuple":
-        return tuple(_restore(v, None) for v in described["of"])
-    assert array is not None
-    if described["is"] == "number":
-        return array[()]
-    array.flags.writeable = False
-    return array
 
 
 def _storable(array: np.ndarray, what: str) -> np.ndarray:
     if array.dtype.hasobject:
         raise InputError(f"{what} is an array of Python objects, which cannot be stored", _HINT)
     return array
-
-
-def _json(value: Any) -> np.ndarray:
-    return np.array(json.dumps(value))

@@ -198,7 +198,6 @@ def pmmh(
     seed: int = 0,
     *,
     batched: bool = False,
-    paired: bool = False,
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
@@ -220,8 +219,6 @@ def pmmh(
         chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
         parameters; some are compared. If they differ, InputError, or a warning and single runs.
-    paired : bool
-        If True, `observations` are sequences of observations, one for each chain.
 
     Raises
     ------
@@ -231,10 +228,7 @@ def pmmh(
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    data = [list(ys) for ys in observations] if paired else [list(observations)]
-    if paired and len(data) != len(theta):
-        raise InputError(f"there are {len(data)} sequences of observations for {len(theta)} chains")
-    posterior = _Posterior(filter_of, data, log_prior, batched)
+    posterior = _Posterior(filter_of, list(observations), log_prior, batched)
     key = Key(seed).child("pmmh")
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:

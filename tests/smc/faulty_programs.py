@@ -10,9 +10,6 @@ from __future__ import annotations
 import itertools
 import random
 import time
-from copy import deepcopy
-from dataclasses import dataclass
-from operator import setitem
 
 import numpy as np
 from scipy import stats
@@ -29,7 +26,6 @@ from mstfilter.smc import (
     Student,
     Uniform,
     observe,
-    per_particle,
     sample,
     switch,
 )
@@ -285,7 +281,6 @@ in_likelihood(
 )
 in_likelihood(ALONE, draws_of_a_new_generator=lambda x: x + 0.3 * np.random.default_rng(0).standard_normal(len(x)))
 LAST: dict = {"x": 0.0}
-HISTORY: list = []
 
 
 @faulty(REPEATED)
@@ -367,59 +362,6 @@ def a_returned_nan(previous, y):
 
 
 # --- values that copies share, and changes in place ---------------------------------------------------------------
-@dataclass
-class Map:
-    cells: list
-
-
-def changing(expected, **cases):
-    """Particles that keep a value, given at the start, and change it in place: ``name=(value, change(value, x))``."""
-
-    def program_of(first, change):
-        def program(previous, y):
-            x = walk(previous)
-            kept = deepcopy(first) if previous is None else previous["kept"]
-            change(kept, float(x))
-            seen(x, y)
-            return {"kept": kept}
-
-        return program
-
-    named(expected, {name: program_of(*case) for name, case in cases.items()}, per_particle)
-
-
-changing(
-    "read-only",
-    a_shared_list=([], lambda kept, x: kept.append(x)),
-    a_list_in_a_tuple=((1, [0.0]), lambda kept, x: setitem(kept[1], 0, x)),
-    a_shared_array=(np.zeros(10), lambda kept, x: setitem(kept, 0, x)),
-)
-changing("does not support item assignment", a_shared_dictionary=({}, lambda kept, x: setitem(kept, len(kept), x)))
-changing("no attribute 'add'", a_shared_set=(set(), lambda kept, x: kept.add(x)))
-changing(
-    "changes a value of `previous` in place|" + REPEATED,
-    a_shared_object=(Map([]), lambda kept, x: kept.cells.append(x)),
-)
-
-
-@faulty(REPEATED)
-@per_particle
-def a_list_of_the_closure(previous, y):
-    x = walk(previous)
-    HISTORY.append(float(x))
-    seen(x + 0.01 * len(HISTORY), y)
-
-
-LANDMARKS: dict = {}
-
-
-@faulty("after the particles before it than alone", n=40)
-@per_particle
-def a_dictionary_that_all_particles_fill(previous, y):
-    x = walk(previous)
-    seen(LANDMARKS.setdefault(round(float(x)), float(x)), y)
-
-
 class Scaled:
     largest = 1e-3
 
@@ -431,12 +373,6 @@ class Scaled:
 
 FAULTY["a_running_maximum_of_an_object"] = (Program(Scaled()).bootstrap(200), YS, ALONE)
 FAULTY["a_running_maximum_of_a_method"] = (Program(Scaled().__call__).bootstrap(200), YS, ALONE)
-
-
-@faulty(REPEATED)
-@per_particle
-def other_draws_of_a_particle(previous, y):
-    seen(walk(previous) + np.random.normal(), y)
 
 
 @faulty("in place")
@@ -828,58 +764,6 @@ CALLS: list = []
 def a_log_of_calls(previous, y):
     CALLS.append(y)
     seen(walk(previous), y)
-
-
-@correct(n=30)
-@per_particle
-def immutable_use_of_containers(previous, y):
-    x = walk(previous)
-    items = [*([] if previous is None else previous["items"] + [1.0]), float(x)]
-    cells = {round(float(x))} | (set() if previous is None else previous["cells"])
-    at = {**({} if previous is None else previous["at"]), len(items): x}
-    track = np.append(np.zeros(1) if previous is None else previous["track"], x)
-    seen(np.mean(items) + 0.1 * len(cells) + 0.1 * len(at) + track[0], y)
-    return {"items": items, "cells": cells, "at": at, "track": track, "grid": Map([1])}
-
-
-@correct(n=30)
-@per_particle
-def copies_of_containers(previous, y):
-    x = walk(previous)
-    items, at = ([[]], {}) if previous is None else (deepcopy(previous["items"]), deepcopy(previous["at"]))
-    items[0].append(float(x))
-    at[len(at)] = [float(x)]
-    seen(np.mean(items[0]) + 0.1 * len(at), y)
-    return {"items": items, "at": at}
-
-
-SCALES: dict = {}
-
-
-@correct(n=30)
-@per_particle
-def a_cache_of_all_particles(previous, y):
-    x = walk(previous)
-    k = round(float(x))
-    if k not in SCALES:
-        SCALES[k] = 1.0 + abs(k)
-    observe("y", Normal(x, SCALES[k]), y)
-
-
-@correct(n=30)
-@per_particle
-def sites_that_come_and_go(previous, y):
-    x = walk(previous)
-    if x > 0:
-        x = x + sample("more", stats.gamma(2.0))
-    seen(x, y)
-
-
-@correct(n=20, kind="resample_move", trigger=Always())
-@per_particle
-def moves_of_one_particle(previous, y):
-    s = sample("s", stats.gamma(2.0))
-    seen(sample("x", Normal(0.0, s)), y)
 
 
 @correct()

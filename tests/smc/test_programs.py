@@ -29,7 +29,6 @@ from mstfilter.smc import (
     guided,
     log_mean_exp,
     observe,
-    per_particle,
     sample,
     switch,
 )
@@ -62,11 +61,6 @@ def ar1(previous, y):
 
 def best(previous, y):
     sample("x", optimal_initial(y) if previous is None else optimal(previous["x"], y))
-
-
-@per_particle
-def ar1_one_by_one(previous, y):
-    ar1(previous, y)
 
 
 def test_a_program_gives_the_numbers_of_the_hand_written_model():
@@ -107,37 +101,6 @@ def test_filters_of_a_program_agree_with_kalman(filter):
     mean, standard, _ = mean_ratio(filter, YS, EXACT, range(220))
     assert abs(mean - 1) < 4 * standard
     assert standard < 0.008
-
-
-@per_particle
-def mild_one_by_one(previous, y):
-    """Much noise, so that few particles give little spread."""
-    x = sample("x", Normal(0.0, 1.0) if previous is None else Normal(RHO * previous["x"], SIGMA))
-    observe("y", Normal(x, 2.0), y)
-
-
-def mild_guide(previous, y):
-    sample("x", Normal(0.2 * y, 1.0) if previous is None else Normal(0.8 * previous["x"] + 0.1 * y, 0.7))
-
-
-def test_a_program_that_is_run_particle_by_particle():
-    """Within 4 standard errors (false alarm 6e-5 a case); 3.5 % of bias would be seen."""
-    cov = np.array([[1.0, RHO], [RHO, RHO**2 + SIGMA**2]]) + 4.0 * np.eye(2)
-    exact_mild = float(stats.multivariate_normal(np.zeros(2), cov).logpdf(YS[:2]))
-    for make in (
-        lambda p, guide: p.bootstrap(60),
-        lambda p, guide: p.guided(guide, 30),
-        lambda p, guide: p.auxiliary(60, power=0.5),
-        lambda p, guide: p.resample_move(40, steps=1),
-    ):
-        filter = make(Program(mild_one_by_one), per_particle(mild_guide))
-        mean, standard, _ = mean_ratio(filter, YS[:2], exact_mild, range(80))
-        assert abs(mean - 1) < 4 * standard
-        assert standard < 0.008
-    state, _ = Program(ar1_one_by_one).bootstrap(5).run(YS, 0)
-    assert np.ndim(state.population.particles[0]["x"]) == 0
-    with pytest.raises(InputError, match="both be per_particle"):
-        Program(ar1_one_by_one).guided(best, 5).run(YS, 0)
 
 
 # --- a tracker that changes between two regimes -------------------------------------------------------------------
@@ -228,36 +191,6 @@ def test_a_hidden_chain_as_a_program():
     assert standard < 0.008
 
 
-@per_particle
-def births(previous, count):
-    """Objects are born and persist; each is seen as a Poisson count of its own strength."""
-    n = 0 if previous is None else int(previous["n"])
-    born = bool(sample("born", Bernoulli(0.3)))
-    n += born
-    if born:
-        sample("strength", Normal(2.0, 0.1))  # exists only where something was born
-    observe("count", stats.poisson(0.5 + 2.0 * n), count)
-    return {"n": n}
-
-
-def test_changing_structure_agrees_with_enumeration():
-    counts = [1, 1, 2]
-    total = 0.0
-    for path in product((0, 1), repeat=3):
-        n = np.cumsum(path)
-        total += np.prod([0.3 if b else 0.7 for b in path]) * stats.poisson.pmf(counts, 0.5 + 2.0 * n).prod()
-    for filter, seeds, bound in (
-        (Program(births).bootstrap(50), 180, 0.008),
-        (Program(births).resample_move(50, trigger=Always()), 54, 0.015),  # slow: a run a particle and move
-    ):
-        mean, standard, _ = mean_ratio(filter, counts, np.log(total), range(seeds))
-        assert abs(mean - 1) < 4 * standard
-        assert standard < bound
-    state, _ = Program(births).bootstrap(60).run(counts, 0)
-    names = {frozenset(p) for p in state.population.particles}
-    assert names == {frozenset({"born", "n"}), frozenset({"born", "n", "strength"})}
-
-
 def test_distributions_of_scipy_in_programs():
     def model(previous, y):
         x = sample("x", stats.norm(0.0, SD0) if previous is None else stats.norm(RHO * previous["x"], SIGMA))
@@ -325,7 +258,7 @@ def changed(x):
         # arrays of all particles used as one number
         (r"as one number .*after site 'k', line \d+ `.*float\(s.x\).*TypeError.*numpy", lambda s: float(s.x)),
         ("as one number .*after site 'k'.*numpy.exp", lambda s: math.exp(s.x)),
-        ("as one number .*after site 'k'.*per_particle", lambda s: list(range(s.k))),
+        ("as one number .*after site 'k'.*", lambda s: list(range(s.k))),
         ("as one number .*after site 'k'.*an array as table", lambda s: ["a", "b"][s.k]),
         ("as a key .*table", lambda s: {0: 1.0, 1: 2.0}[s.k]),
         ("decides by an array .*after site 'k'.*use switch", lambda s: 1 if s.x > 0 else 2),
@@ -359,8 +292,6 @@ def test_previous_names():
     assert text.startswith("step 1, transition: previous has no 'z' (after site 'x', line")
     assert "it has ['w', 'x']" in text
     assert "previous is None at the first step" in errors_of(lambda previous, y: {"x": previous["x"]})
-    text = errors_of(per_particle(model))
-    assert "previous has no 'z'" in text and "previous.get(name)" in text
 
 
 def in_branches(first, second=lambda x, y: None, probs=(0.5, 0.5), arguments=None):
@@ -613,24 +544,6 @@ def test_values_of_particles_that_look_like_a_shared_vector():
     np.testing.assert_allclose(np.diff(a.population.log_weights), np.diff(expected))
 
 
-def test_an_observation_of_one_particle_compares_shapes():
-    def of(distribution):
-        @per_particle
-        def model(previous, y):
-            x = sample("x", Normal(np.zeros((1, 2)), 1.0))
-            observe("y", distribution(x), y)
-
-        return model
-
-    assert r"observation 'y': the value has shape (), expected (2,)" in errors_of(of(lambda x: Normal(x, 1.0)))
-    assert "expected (2,)" in errors_of(of(lambda x: Normal(x[None], 1.0)))
-    assert "observation 'y': log density is nan" in errors_of(of(lambda x: Normal(x, 1.0)), y=[np.nan, 0.0])
-    state, _ = Program(of(lambda x: Normal(x, 1.0))).bootstrap(3).run([[0.1, 0.2]], 0)
-    particles = state.population.particles
-    expected = [stats.norm(p["x"], 1.0).logpdf([0.1, 0.2]).sum() for p in particles]
-    np.testing.assert_allclose(state.population.log_weights, expected)
-
-
 def test_the_mean_states_the_event_shape():
     class Pair(Distribution):
         mean = sd = np.ones((1, 2))
@@ -696,12 +609,10 @@ def test_a_program_with_time_and_inputs_is_the_state_space_model_with_both():
     np.testing.assert_array_equal(a.population.particles, b.population.particles["x"])
     assert a.log_evidence == b.log_evidence
     reference = bootstrap(exact, 20_000).run(ys, 0)[0].log_evidence
-    one_by_one = Program(per_particle(lambda previous, y, t, u=0.0: model(previous, y, t, u)))
     for filter in (
         Program(model).guided(guide, 4000),
         Program(model).auxiliary(4000, power=0.5),
         Program(model).resample_move(4000, trigger=Always()),
-        one_by_one.bootstrap(500),
     ):
         assert filter.run(ys, 1)[0].log_evidence == pytest.approx(reference, abs=0.25)
 

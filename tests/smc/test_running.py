@@ -27,11 +27,9 @@ from mstfilter.smc import (
     Multinomial,
     Normal,
     Population,
-    Program,
     State,
     StateSpaceModel,
     Tempered,
-    Trace,
     bootstrap,
     collect,
     ess,
@@ -40,11 +38,8 @@ from mstfilter.smc import (
     linear_gaussian,
     log_evidence,
     mean,
-    observe,
-    per_particle,
     resampled,
     run_many,
-    sample,
     unique_ancestors,
     weight_entropy,
 )
@@ -280,14 +275,6 @@ def test_workers_need_a_script_that_is_not_imported(tmp_path):
 
 
 # --- codecs -------------------------------------------------------------------------------------------------------
-TRACES = tuple(
-    Trace(
-        {"grid": np.arange(k + 1, dtype=np.uint16), "name": f"t{k}", "where": (k, (1.5, "a")), "x": np.float32(0.1)}
-    )
-    for k in range(3)
-)
-
-
 class Boxes(Codec):
     def encode(self, particles):
         return {"grids": np.array([box.grid for box in particles])}
@@ -301,9 +288,8 @@ class Boxes(Codec):
     [
         np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32),
         {"x": np.arange(3.0), "k": np.array([True, False, True])},
-        (TRACES[1], TRACES[0], TRACES[1], Trace({"n": 0, "x": 0.1, "none": None})),
     ],
-    ids=["array", "mapping", "traces"],
+    ids=["array", "mapping"],
 )
 def test_states_come_back_bit_for_bit(particles, tmp_path):
     n = len(next(iter(particles.values()))) if isinstance(particles, dict) else len(particles)
@@ -317,15 +303,9 @@ def test_states_come_back_bit_for_bit(particles, tmp_path):
     if isinstance(particles, np.ndarray):
         assert found.dtype == particles.dtype
         np.testing.assert_array_equal(found, particles)
-    elif isinstance(particles, dict):
+    else:
         assert {k: a.dtype for k, a in found.items()} == {k: a.dtype for k, a in particles.items()}
         np.testing.assert_array_equal(found["x"], particles["x"])
-    else:
-        for a, b in zip(found, particles, strict=True):
-            assert {name: type(v) for name, v in a.items()} == {name: type(v) for name, v in b.items()}
-            np.testing.assert_equal(dict(a), dict(b))
-        assert found[0]["grid"].dtype == np.uint16
-        assert found[0] is found[2], "shared particles are shared again"
 
 
 def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
@@ -337,11 +317,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
     with pytest.raises(InputError, match="array of Python objects"):
         save(np.array([object()]))
     with pytest.raises(InputError, match="particles of type Box cannot be stored"):
-        save((TRACES[0], Box((1,))))
-    with pytest.raises(InputError, match="'name' is of type complex"):
-        save((Trace({"name": 1j}),))
-    with pytest.raises(InputError, match="'where' is a tuple that holds arrays"):
-        save((Trace({"where": (np.zeros(1),)}),))
+        save((Box((1,)),))
     assert not list(tmp_path.iterdir()), "nothing is left behind"
     save((Box((1,)), Box((2,))), Boxes())
     assert load_state(tmp_path / "s.npz", Boxes())[0].population.particles == (Box((1,)), Box((2,)))
@@ -363,22 +339,13 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
 
 
 # --- checkpoints of runs ------------------------------------------------------------------------------------------
-@per_particle
-def walk(previous, y):
-    from mstfilter.smc import Normal
-
-    x = sample("x", Normal(0.0 if previous is None else previous["x"], 1.0))
-    observe("y", Normal(x, 1.0), y)
-
-
 @pytest.mark.parametrize(
     ("filter", "ys", "codec"),
     [
         (bootstrap(AR1, 30), YS, None),
         (bootstrap(hmm("objects"), 30), SYMBOLS, Boxes()),
-        (Program(walk).bootstrap(8), YS, None),
     ],
-    ids=["arrays", "objects", "traces"],
+    ids=["arrays", "objects"],
 )
 def test_a_run_goes_on_from_its_checkpoint(filter, ys, codec, tmp_path):
     whole, _ = filter.run(ys, 5)

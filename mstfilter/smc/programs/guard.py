@@ -9,9 +9,7 @@ fault of every third step):
    first run.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-3. Particles of a `per_particle` program run alone, too. In the first two steps, each sees the lists, dictionaries,
-   sets and arrays in the closure and the global variables of the function as before the step.
-4. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
+3. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
    the evidence must agree.
 
 The results of a filter do not depend on these checks.
@@ -19,7 +17,6 @@ The results of a filter do not depend on these checks.
 
 from __future__ import annotations
 
-import pickle
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -35,7 +32,7 @@ from mstfilter.errors import InputError, InputWarning
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
 from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler
-from mstfilter.smc.programs.sites import Call, PerParticle, ProgramRun, recorded
+from mstfilter.smc.programs.sites import Call, ProgramRun, recorded
 from mstfilter.smc.streams import child
 
 #: Numbers of the steps of one kind that are checked.
@@ -62,7 +59,7 @@ class Guard:
     ) -> None:
         self.rng, self.past, self.observation, self.model, self.guide = rng, past, observation, model, guide
         self.previous, self.count = None if past is None else past.particles, count
-        self.state, self.content = rng.bit_generator.state, self._content()
+        self.state = rng.bit_generator.state
         #: Functions that know nothing of this step.
         self.fresh = {id(f): _with_copies(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
@@ -72,30 +69,12 @@ class Guard:
             particles, gain = step()
         if self.count <= 2:
             self._repeat(step, particles, gain, runs)
-        if isinstance(self.model, PerParticle):
-            if self._content() != self.content:
-                raise InputError(
-                    "the program changes a value of `previous` in place, which copies of the particle share",
-                    "copy it first (copy.deepcopy), change the copy and return that",
-                )
-            if self.fresh and self.guide is None:
-                self._check_single(run, particles, gain)
-            return particles, gain
         for whole in runs:
             for rows in _groups(whole) if whole.n > 1 else ():
                 self._check_alone(run, whole, rows)
         if self.guide is not None and len(gain) >= 100:
             self._check_guide(run, gain)
         return particles, gain
-
-    def _content(self) -> bytes | None:
-        """The objects in the particles of a `per_particle` program, as bytes, which are compared and never read."""
-        if not isinstance(self.model, PerParticle):
-            return None
-        try:
-            return pickle.dumps(self.previous)
-        except Exception:  # an object that cannot be pickled is not checked
-            return None
 
     # --- the same random numbers ------------------------------------------------------------------------------------
     def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray, runs: list[ProgramRun]) -> None:
@@ -148,23 +127,6 @@ class Guard:
                     message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
                     raise InputError(message, *_ALONE) from again
         return few, rows
-
-    def _check_single(self, run: Run, particles: Any, gain: np.ndarray) -> None:
-        """Compare two particles of a `per_particle` program with runs that keep nothing of the other particles."""
-        self.rng.bit_generator.state, after = self.state, self.rng.bit_generator.state
-        for i in {len(gain) - 1, len(gain) // 2}:
-            previous, handler = self.previous and self.previous[i], SampleHandler(self.rng).row(i)
-            try:
-                alone = run(_with_copies(self.fresh[id(self.model)]), handler, previous, self.observation, 1, True)
-            except Exception:  # a copy may lack what another function keeps: not checked
-                continue
-            values = {**{name: a[0] for name, a in alone.values.items()}, **alone.returned}
-            if not _close(gain[i], alone.gain[0], 1e-9) or _first_difference(particles[i], values) is not None:
-                raise InputError(
-                    f"particle {i} has other values or weights after the particles before it than alone",
-                    "keep values of a particle in the particle, not in global variables or closures",
-                )
-        self.rng.bit_generator.state = after
 
     def _run_again(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
         previous = None if self.previous is None else take(self.previous, rows)
@@ -243,8 +205,8 @@ def _parts(function: Any) -> list[Any]:
 
     The models of many parameter values, as in PMMH, have the same parts.
     """
-    while isinstance(function, partial | PerParticle):
-        function = function.func if isinstance(function, partial) else function.function
+    while isinstance(function, partial):
+        function = function.func
     values = [*(getattr(function, "__defaults__", None) or ())]
     for cell in getattr(function, "__closure__", None) or ():
         with suppress(ValueError):  # an empty cell
@@ -256,8 +218,6 @@ def _with_copies(function: Any) -> Any:
     """The function with copies of the containers in its closure, defaults, globals and attributes."""
     if isinstance(function, partial):
         return partial(_with_copies(function.func), *function.args, **function.keywords)
-    if isinstance(function, PerParticle):
-        return _with_copies(function.function)
     if isinstance(function, MethodType):
         return MethodType(function.__func__, _with_copies(function.__self__))
     try:
