@@ -120,35 +120,31 @@ class _Posterior:
     """Log prior and estimated log evidence of rows of parameters."""
 
     filter_of: FilterOf
-    data: list[list[Any]]  #: one sequence of observations for all chains, or one for each
+    observations: list[Any]
     log_prior: Callable[[np.ndarray], float]
     batched: bool = False
     n_sweeps: int = 0
 
-    def __call__(
-        self, rng: np.random.Generator, theta: np.ndarray, chains: np.ndarray | None = None
-    ) -> dict[str, np.ndarray]:
-        """``theta`` (R, d) of some chains, all by default, with ``log_density`` and ``log_evidence`` (R,)."""
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """``theta`` (R, d) with ``log_density`` and ``log_evidence`` (R,)."""
         seeds = rng.integers(2**63, size=len(theta))
         log_prior = np.array([float(self.log_prior(row)) for row in theta])
         if np.isnan(log_prior).any():
             raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
         evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
         if possible.any():
-            rows = (np.arange(len(theta)) if chains is None else chains)[possible]
-            data = self.data if len(self.data) == 1 else [self.data[r] for r in rows]
-            evidence[possible] = self._estimates(theta[possible], data, seeds[possible].tolist())
+            evidence[possible] = self._estimates(theta[possible], seeds[possible].tolist())
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
-    def _estimates(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of filters in one sweep, or one by one if this is impossible."""
         if self.batched:
             try:
-                return self._in_one_sweep(thetas, data, seeds)
+                return self._in_one_sweep(thetas, seeds)
             except NotTogether as why:
                 self.batched = False
                 warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=5)
-        return self._one_by_one(thetas, data, seeds)
+        return self._one_by_one(thetas, seeds)
 
     def _filter(self, theta: np.ndarray) -> ParticleFilter:
         filter = self.filter_of(theta)
@@ -156,15 +152,15 @@ class _Posterior:
             raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
         return filter
 
-    def _one_by_one(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _one_by_one(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             with suppress(LostRunError):
-                state, _ = self._filter(theta).run(data[r % len(data)], seed)
+                state, _ = self._filter(theta).run(self.observations, seed)
                 found[r] = state.log_evidence
         return found
 
-    def _in_one_sweep(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """The estimates of a batch whose components hold the parameters of each row.
 
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
@@ -184,7 +180,7 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_together(filters, data, seeds, {"z": log_evidence}, check=check, rounding=True)
+        runs = run_together(filters, [self.observations], seeds, {"z": log_evidence}, check=check, rounding=True)
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
 
@@ -258,7 +254,7 @@ def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.n
                 f"the start {theta[r].tolist()} of chain {r} has log density {state['log_density'][r]}: {what}",
                 "start where the prior and the likelihood are positive, or take more particles",
             )
-        for name, values in posterior(key.child(attempt).generator(), theta[lost], lost).items():
+        for name, values in posterior(key.child(attempt).generator(), theta[lost]).items():
             state[name][lost] = values
     return state
 
@@ -309,7 +305,7 @@ def ensemble(
     if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
         raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, [list(observations)], log_prior, batched)
+    posterior = _Posterior(filter_of, list(observations), log_prior, batched)
     rng = Key(seed).child("ensemble").generator()
 
     def log_density(thetas: np.ndarray) -> np.ndarray:
