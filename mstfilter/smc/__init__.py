@@ -30,7 +30,7 @@
 `smoothing`             states given all observations
 `conditional`           paths of states by conditional SMC, one at a time
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
-`diagnostics`           energy distances, coalescence and variance of a run, scores against the truth
+`diagnostics`           variance of the estimates of a run, energy distances of populations
 `export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """

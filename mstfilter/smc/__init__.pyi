@@ -13,16 +13,9 @@ from mstfilter.smc.components import (
 )
 from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.diagnostics import (
-    Coalescence as Coalescence,
-    Measured as Measured,
     RunVariance as RunVariance,
-    coalescence as coalescence,
     energy_distance as energy_distance,
-    log_score as log_score,
-    pit as pit,
     run_variance as run_variance,
-    selection_distance as selection_distance,
-    set_energy_score as set_energy_score,
 )
 from mstfilter.smc.distributions import (
     Bernoulli as Bernoulli,
@@ -64,7 +57,6 @@ from mstfilter.smc.history import (
     mean as mean,
     resampled as resampled,
     unique_ancestors as unique_ancestors,
-    weight_entropy as weight_entropy,
 )
 from mstfilter.smc.inference import (
     Chains as Chains,
@@ -130,7 +122,6 @@ from mstfilter.smc.smoothing import (
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
-    paris as paris,
 )
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,

@@ -6,7 +6,6 @@ The components are called once per step with the particles of all runs, as one p
 done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
 programs). A component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its
 arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
-Observations and inputs that differ between runs are repeated for each row.
 
 This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
 compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a call for
@@ -34,12 +33,11 @@ from mstfilter.smc.population import Population, identity
 from mstfilter.smc.streams import (
     Key,
     RunGenerators,
+    RunKeys,
     by_run,
     flat,
-    generators_of_step,
     of_runs,
     resampled_runs,
-    rows_of,
     summaries,
 )
 
@@ -90,13 +88,13 @@ def check_together(filter: ParticleFilter) -> None:
 
 def run_together(
     filters: RunFilters,
-    ys: list[list[Any]],
+    ys: list[Any],
     seeds: list[int],
     collectors: Mapping[str, Collector],
     check: bool = True,
     rounding: bool = False,
 ) -> list[Collected]:
-    """The runs of some seeds; `ys` has one sequence of observations for all runs, or one for each.
+    """The runs of some seeds with the observations `ys`.
 
     Without `check`, runs are not compared with single runs; with `rounding`, differences by rounding are accepted.
 
@@ -123,7 +121,7 @@ class _Sweep:
     def __init__(
         self,
         filters: RunFilters,
-        ys: list[list[Any]],
+        ys: list[Any],
         seeds: list[int],
         collectors: Mapping[str, Collector],
         check: bool,
@@ -131,9 +129,10 @@ class _Sweep:
     ) -> None:
         self.filters, self.filter, self.seeds, self.collectors = filters, filters.one(0), seeds, collectors
         self.check, self.rounding = check, rounding
-        self.given = [[split_input(y) for y in run] for run in ys]
-        self.n_steps = len(ys[0])
+        self.given = [split_input(y) for y in ys]
+        self.n_steps = len(ys)
         self.keys = [Key(seed) for seed in seeds]
+        self.streams = RunKeys(self.keys)
         self.runs = np.arange(len(seeds))  # the run of each row
         self.particles: Any = None
         self.log_weights = self.ess = self.log_mean = np.zeros(0)  # the last two after the last update
@@ -171,42 +170,13 @@ class _Sweep:
                 self.select(t)
             if filter.transition is not None:
                 self.call(t, "transition")
-        if filter.update is not None and self.observed(t) and len(self.runs):
+        if filter.update is not None and self.given[t][0] is not None and len(self.runs):
             self.call(t, "update")
         if len(self.runs):
             top = self.top[1] if self.top[0] is self.log_weights else None
             self.ess, self.log_mean = summaries(self.log_weights, top)
         if filter.resample == "after" and len(self.runs):
             self.select(t)
-
-    # --- observations ---------------------------------------------------------------------------------------------
-    def of_run(self, t: int, row: int) -> tuple[Any, Any]:
-        """Observation and input of one run."""
-        return self.given[self.runs[row] % len(self.given)][t]
-
-    def observed(self, t: int) -> bool:
-        """Whether step t has observations."""
-        missing = {self.of_run(t, row)[0] is None for row in range(len(self.runs) if len(self.given) > 1 else 1)}
-        if len(missing) > 1:
-            raise NotTogether("observations", f"step {t}: some runs have an observation and others have none")
-        return missing == {False}
-
-    def by_row(self, rows: np.ndarray, t: int, which: int) -> Any:
-        """Observation or input of all runs, or one for each row of particles."""
-        if len(self.given) == 1:
-            return self.given[0][t][which]
-        found = [self.of_run(t, row)[which] for row in rows.tolist()]
-        if all(value is None for value in found):
-            return None
-        try:
-            values = np.stack([np.asarray(value) for value in found])
-            numbers = values.dtype.kind in "biufc"
-        except ValueError:
-            numbers = False
-        if not numbers:
-            what = ("observations", "inputs")[which]
-            raise NotTogether(what, f"step {t}: the {what} of the runs are not numbers or arrays of one shape")
-        return np.repeat(values, self.filter.n, axis=0).view(rows_of(self.filter.n))
 
     # --- calls of components --------------------------------------------------------------------------------------
     def call(self, t: int, slot: str) -> None:
@@ -239,7 +209,7 @@ class _Sweep:
     def of_rows(self, t: int, slot: str, rows: np.ndarray) -> tuple[Any, np.ndarray]:
         """Particles and log weights of a component that is called once for the given rows, in their order."""
         runs, n = self.runs[rows], self.filter.n
-        y, u = (self.by_row(rows, t, k) for k in (0, 1))
+        y, u = self.given[t]
         component = getattr(self.filters.rows(runs).at_step(t, u), slot)
         rng = RunGenerators(self.generators(t, slot, rows), n) if component.draws else None
         population, log_weights = None, self.log_weights
@@ -256,7 +226,7 @@ class _Sweep:
 
     def alone(self, t: int, slot: str, row: int) -> Population:
         """What a component returns for one run; LostRunError, or `NotTogether` if it raises another error."""
-        y, u = self.of_run(t, row)
+        y, u = self.given[t]
         component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = self.key(t, slot, row).generator() if component.draws else None
         population = None
@@ -392,7 +362,7 @@ class _Sweep:
 
     def generators(self, t: int, slot: str, rows: np.ndarray) -> list[np.random.Generator]:
         """The generators of a component that is called for some runs."""
-        return generators_of_step([self.keys[run] for run in self.runs[rows].tolist()], slot, t)
+        return self.streams.generators(slot, t, self.runs[rows])
 
     def record(self, t: int) -> None:
         """Keep what the collectors return for each run."""

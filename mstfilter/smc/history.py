@@ -1,8 +1,7 @@
 """Recording quantities of a run.
 
 A collector is a function ``(state, info) -> number or array``, called after every step. `ess`, `unique_ancestors`,
-`weight_entropy`, `log_evidence`, `mean` and `resampled` are collectors, and
-`mstfilter.smc.diagnostics.selection_distance`.
+`log_evidence`, `mean` and `resampled` are collectors.
 
 >>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
 >>> history["ess"]                                   # (T,)
@@ -35,14 +34,6 @@ def unique_ancestors(state: State, info: Info) -> int:
     """Number of particles of the previous population that have descendants."""
     assert state.population is not None
     return state.population.unique_ancestors
-
-
-def weight_entropy(state: State, info: Info) -> float:
-    """Entropy of the normalised weights in nats: log n if they are equal, 0 if one particle has all weight."""
-    assert state.population is not None
-    w = state.population.weights
-    w = w[w > 0]
-    return float(-(w @ np.log(w)))
 
 
 def log_evidence(state: State, info: Info) -> float:

@@ -180,7 +180,7 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_together(filters, [self.observations], seeds, {"z": log_evidence}, check=check, rounding=True)
+        runs = run_together(filters, self.observations, seeds, {"z": log_evidence}, check=check, rounding=True)
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
 

@@ -15,28 +15,24 @@ Three smoothers of a record return a tuple with one population per time:
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
-`paris` yields smoothed means of sums over the path while observations arrive, in constant memory.
-
 `mstfilter.smc.conditional` draws single paths, also of programs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
-from mstfilter.fields import Bounded, PositiveInt
+from mstfilter.errors import InputError, check_choice, check_component, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.population import Particles, Population, take
 from mstfilter.smc.resampling import draw_rows, independent_draws
-from mstfilter.smc.state_space import metropolis
-from mstfilter.smc.streams import Key
+from mstfilter.smc.state_space import moved
 
 BackwardMethod = Literal["exact", "mcmc"]
 #: Pairs of particles per call of `log_prob`.
@@ -139,31 +135,19 @@ def backward_paths(
         Metropolis steps of "mcmc".
     """
     check_integer("n", n)
-    kernel = _Backward(transition, method, steps)
+    check_component("transition", transition, DensityTransition)
+    check_choice("method", method, get_args(BackwardMethod))
+    check_integer("steps", steps)
     last = record.populations[-1].realised()
     index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
         population = record.populations[t].realised()
-        parents = record.parents(t + 1)[index] if method == "mcmc" else None
-        move = kernel.move(population, path[-1].particles, record.observations[t + 1], t)
-        index = move.draw(rng, parents, 1)[:, 0]
+        y, u = split_input(record.observations[t + 1])
+        move = _Move(population, path[-1].particles, transition.at_step(t + 1, u), y, t)
+        index = move.metropolis(rng, record.parents(t + 1)[index], steps) if method == "mcmc" else move.exact(rng, n)
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
-
-
-@dataclass(frozen=True)
-class _Backward(Bounded):
-    """Draws predecessors; the fields are arguments of `backward_paths`."""
-
-    transition: DensityTransition
-    method: BackwardMethod
-    steps: PositiveInt
-
-    def move(self, population: Population, later: Particles, observation: Any, t: int) -> _Move:
-        """The moves from a population at time `t` to the particles after `observation`."""
-        y, u = split_input(observation)
-        return _Move(population, later, self.transition.at_step(t + 1, u), y, t, self.steps)
 
 
 @dataclass(frozen=True)
@@ -175,13 +159,6 @@ class _Move:
     transition: DensityTransition
     y: Any
     t: int
-    steps: int  #: of a Metropolis chain between two draws
-
-    def draw(self, rng: np.random.Generator, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
-        """(n, n_draws) indices of predecessors, by Metropolis steps from the `parents` (n,) if they are given."""
-        if parents is not None:
-            return self._metropolis(rng, parents, n_draws)
-        return self._exact(rng, count_particles(self.later), n_draws)
 
     def _log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """(k,) log density of the moves from particles `index` to the later ones at `rows` (default: all)."""
@@ -194,19 +171,16 @@ class _Move:
             raise _impossible(self.t)
         return density
 
-    def _exact(self, rng: np.random.Generator, n: int, n_draws: int) -> np.ndarray:
-        m = len(self.population)
-        index, block = np.empty((n, n_draws), np.int64), max(1, _PAIRS // m)
-        for begin in range(0, n, block):
-            some = np.arange(begin, min(begin + block, n))
-            density = self._log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
-            log_weights = self.population.log_weights + density.reshape(-1, m)
-            for k in range(n_draws):
-                index[begin : begin + block, k] = draw_log(rng, log_weights, self.t)
-        return index
+    def exact(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n,) indices of predecessors, drawn from their law."""
+        m, drawn = len(self.population), []
+        for rows in np.split(np.arange(n), range(max(1, _PAIRS // m), n, max(1, _PAIRS // m))):
+            density = self._log_density(np.tile(np.arange(m), len(rows)), np.repeat(rows, m))
+            drawn.append(draw_log(rng, self.population.log_weights + density.reshape(-1, m), self.t))
+        return np.concatenate(drawn)
 
-    def _metropolis(self, rng: np.random.Generator, parents: np.ndarray, n_draws: int) -> np.ndarray:
-        """States of chains that start at the parents, every `steps` steps."""
+    def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int) -> np.ndarray:
+        """(n,) indices of predecessors after Metropolis steps that start at the parents."""
         density = self._log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
@@ -216,68 +190,8 @@ class _Move:
             density = self._log_density(index)
             return {"index": index, "density": density}, density - now["density"]
 
-        chain = metropolis(rng, {"index": parents, "density": density}, propose, self.steps * n_draws)
-        draws = [state["index"] for k, (state, _) in enumerate(chain, 1) if k % self.steps == 0]
-        return np.stack(draws, axis=1)
-
-
-def paris(
-    filter: ParticleFilter,
-    observations: Iterable[Any],
-    functional: Callable[[int, Particles | None, Particles], np.ndarray],
-    transition: DensityTransition,
-    seed: int = 0,
-    n_draws: int = 2,
-    method: BackwardMethod = "exact",
-    *,
-    steps: int = 1,
-) -> Iterator[np.ndarray]:
-    """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
-
-    After each observation it yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the last
-    population is kept, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A step
-    takes n^2 densities, with "mcmc" (1 + `steps` `n_draws`) n.
-
-    Parameters
-    ----------
-    filter : ParticleFilter
-        With proper weights.
-    functional : callable
-        ``(t, previous, particles) -> (n,) or (n, k)`` is h_t of paired rows; `previous` is None at t = 0.
-    transition : DensityTransition
-        The transition of the model, ``Dynamics(model)``.
-    n_draws : int
-        At least 2: with one the variance grows as that of the genealogy.
-    method, steps
-        As in `backward_paths`.
-
-    Yields
-    ------
-    float64 scalar or (k,)
-    """
-    check_integer("n_draws", n_draws)
-    if not filter.properly_weighted:
-        raise InputError("a component of the filter is not properly weighted: its smoothed means have another limit")
-    kernel = _Backward(transition, method, steps)
-    past: Population | None = None
-    statistic = np.zeros(0)
-    state = filter.start(seed)
-    for t, observation in enumerate(observations):
-        state, _ = filter.step(state, observation)
-        assert state.population is not None
-        now = state.population.realised()
-        if past is None:
-            statistic = np.asarray(functional(t, None, now.particles), np.float64)
-        else:
-            rng = Key(seed).child("paris", t).generator()
-            parents = known_parents(now, t) if method == "mcmc" else None
-            move = kernel.move(past, now.particles, observation, t - 1)
-            index = move.draw(rng, parents, n_draws).ravel()
-            later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
-            statistic = statistic[index] + functional(t, take(past.particles, index), later)
-            statistic = statistic.reshape(len(now), n_draws, *statistic.shape[1:]).mean(axis=1)
-        past = now
-        yield np.tensordot(now.weights, statistic, axes=1)
+        last, _ = moved(rng, {"index": parents, "density": density}, propose, steps)
+        return last["index"]
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:

@@ -17,10 +17,10 @@ from mstfilter.smc import (
     bootstrap,
     collect,
     ess,
+    mean,
     resampled,
     run_many,
     unique_ancestors,
-    weight_entropy,
 )
 from tests.smc.models import AR1, ar1_observations
 
@@ -148,13 +148,13 @@ def test_a_history_shows_itself_in_five_lines():
         "ess": ess,
         "n": lambda state, info: info.n,
         "unique": unique_ancestors,
-        "entropy": weight_entropy,
+        "mean": mean,
         "fired": resampled,
     }
     many = run_many({"a": filter}, [*ys, 1e200], [1, 2], **collectors)
     lines = repr(many).splitlines()
     assert lines[0] == "History: arm 1, seed 2, time 6, 2 runs lost" and len(lines) == 5
-    assert lines[-1] == "  also entropy, fired"
+    assert lines[-1] == "  also mean, fired"
     assert repr(collect([])) == "History: time 0"
 
 

@@ -18,7 +18,6 @@ from mstfilter.smc import (
     Always,
     DensityTransition,
     Dynamics,
-    LargestWeights,
     Population,
     Proposal,
     RandomWalkMove,
@@ -30,7 +29,6 @@ from mstfilter.smc import (
     genealogy,
     guided,
     keep,
-    paris,
     resample_move,
 )
 from tests.smc.models import (
@@ -165,45 +163,6 @@ def test_smoothers_agree_with_the_joint_gaussian(name):
     if name == "always":
         noise = [np.std(found[method], axis=0)[0, 0] for method in ("genealogy", "exact")]
         assert noise[0] > 1.3 * noise[1]
-
-
-def path_sums(t, previous, x):
-    """Terms of sum x_t, and of sum x_{t-1} x_t."""
-    return np.stack([x, np.zeros(len(x)) if previous is None else previous * x], axis=1)
-
-
-@pytest.mark.parametrize("method", ["exact", "mcmc"])
-@pytest.mark.parametrize("name", ["bootstrap", "after", "guided"])
-def test_paris_agrees_with_the_joint_gaussian(name, method):
-    """Sums over the whole path, at the end and at an earlier time (given the observations so far)."""
-    filter = replace(FILTERS[name], n=60)
-    runs = [list(paris(filter, YS, path_sums, Dynamics(AR1), seed, **METHODS[method])) for seed in range(30)]
-    runs = np.array(runs)
-    assert runs.shape == (30, T, 2)
-    mean, _, neighbours = smoothed()
-    wanted = np.array([mean.sum(), (neighbours + mean[1:] * mean[:-1]).sum()])
-    error = runs[:, -1].std(axis=0, ddof=1) / np.sqrt(30)
-    assert (np.abs(runs[:, -1].mean(axis=0) - wanted) < 5 * error + 4 / 60).all()
-    first = runs[:, 0, 0]
-    assert abs(first.mean() - kalman_ar1(YS)[0][0, 0]) < 5 * first.std(ddof=1) / np.sqrt(30) + 1 / 60
-
-
-def test_paris_has_less_variance_than_the_genealogy():
-    """With resampling at every step over 40 observations."""
-    ys, filter, sums = ar1_observations(40), bootstrap(AR1, 30, trigger=Always()), []
-    for seed in range(20):
-        *_, (total, _) = paris(filter, ys, path_sums, Dynamics(AR1), seed)
-        paths = genealogy(keep(filter, ys, seed))
-        sums.append([total, sum(p.weights @ p.particles for p in paths)])
-    variance = np.var(sums, axis=0)
-    assert variance[0] < 0.6 * variance[1]
-
-
-def test_paris_rejects():
-    with pytest.raises(InputError, match="transition is"):
-        next(paris(bootstrap(AR1, 5), YS, path_sums, AR1))
-    with pytest.raises(InputError, match="not properly weighted"):
-        next(paris(bootstrap(AR1, 5, LargestWeights()), YS, path_sums, Dynamics(AR1)))
 
 
 @pytest.mark.parametrize("kind", ["mapping", "objects"])
