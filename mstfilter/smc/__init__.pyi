@@ -98,7 +98,6 @@ from mstfilter.smc.population import (
 )
 from mstfilter.smc.programs.filters import (
     Program as Program,
-    ProgramLookahead as ProgramLookahead,
     ProgramMove as ProgramMove,
 )
 from mstfilter.smc.programs.sites import (

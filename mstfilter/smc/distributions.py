@@ -15,8 +15,8 @@ of these (`as_distribution`); they take three to six times as long. The classes 
 distribution of another library, write a `Distribution` whose `sample` draws by the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
-`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves and
-lookaheads evaluate values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
+`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves evaluate
+values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
 move rejects.
 """
 
@@ -391,10 +391,6 @@ class Bernoulli(_Independent):
     def _moments(self) -> tuple[Any, Any]:
         return self.p, np.sqrt(np.asarray(self.p) * (1 - np.asarray(self.p)))
 
-    @property
-    def centre(self) -> np.ndarray:
-        return np.asarray(self.p) > 0.5
-
 
 @dataclass(frozen=True, eq=False)
 class Categorical(Distribution):
@@ -449,10 +445,6 @@ class Categorical(Distribution):
     def sd(self) -> np.ndarray:
         numbers = np.arange(self.probs.shape[-1], dtype=np.float64)
         return np.sqrt(np.maximum(self.probs @ numbers**2 - self.mean**2, 0.0))
-
-    @property
-    def centre(self) -> np.ndarray:
-        return np.argmax(self.probs, axis=-1)
 
 
 def as_distribution(value: Any) -> Distribution:
@@ -514,11 +506,6 @@ class FromScipy(Distribution):
         if self.__dict__["_vector"]:
             return np.sqrt(np.diagonal(wrapped.cov))[None]
         return np.asarray(wrapped.std() if hasattr(wrapped, "std") else wrapped.standard_deviation())
-
-    @property
-    def centre(self) -> np.ndarray:
-        """Mean, or the median of a discrete number."""
-        return self.mean if self.__dict__["_vector"] or not self.discrete else np.asarray(self.wrapped.median())
 
 
 _PARTICLES_LAST = ("dirichlet_frozen", "wishart_frozen", "invwishart_frozen")

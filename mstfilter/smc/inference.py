@@ -36,7 +36,7 @@ from mstfilter.errors import InputError, LostRunError, check_integer, check_numb
 from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.distributions import as_distribution
-from mstfilter.smc.export import Table, draws_tree, flat_columns
+from mstfilter.smc.export import Table, flat_columns
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
@@ -72,29 +72,6 @@ class Chains(Table):
 
     def _stats(self) -> dict[str, np.ndarray]:
         return {"log_evidence": self.log_evidence, "log_density": self.log_density}
-
-    def to_arviz(self, names: Sequence[str] = (), discard: int = 0) -> Any:
-        """The chains as an ``xarray.DataTree`` for ArviZ (see `mstfilter.smc.export`).
-
-        Parameters
-        ----------
-        names : sequence of str
-            One name per parameter. Default: one variable ``theta`` (chain, draw, d).
-        discard : int
-            Iterations left out at the beginning.
-
-        Returns
-        -------
-        xarray.DataTree
-            Groups ``posterior`` and ``sample_stats`` (``log_evidence``, and ``lp`` for the log density; none of
-            `particle_gibbs`, where they are unknown). Draws are equally weighted. Paths are left out.
-        """
-        theta = self.theta[discard:].swapaxes(0, 1)
-        if names and len(names) != theta.shape[2]:
-            raise InputError(f"there are {len(names)} names for {theta.shape[2]} parameters")
-        posterior = {name: theta[..., k] for k, name in enumerate(names)} or {"theta": theta}
-        stats = {name.replace("log_density", "lp"): a[discard:].T for name, a in self._stats().items()}
-        return draws_tree(posterior, {} if np.isnan(self.log_density).all() else stats)
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.

@@ -200,7 +200,6 @@ def a_mean_if_the_observation_is_missing(previous, y):
     seen(sample("x", Normal(m, 0.6)), y)
 
 
-in_likelihood(ALONE, "auxiliary", a_mean_in_an_auxiliary_filter=np.mean)
 in_likelihood(ALONE, "resample_move", a_mean_in_a_resample_move_filter=np.mean)
 
 
@@ -639,12 +638,6 @@ def moves_of_probabilities(previous, y):
     p = sample("p", Uniform(0.0, 1.0))
     k = sample("k", Bernoulli(p))
     seen(k.astype(float), y)
-
-
-@correct(kind="auxiliary")
-def a_lookahead_at_a_scale_of_zero(previous, y):
-    x = sample("x", Uniform(-1.0, 1.0))
-    seen(sample("z", Normal(x, abs(x))), y)
 
 
 def wide(previous, y):

@@ -12,7 +12,6 @@ from mstfilter.smc import (
     Always,
     Chains,
     Infos,
-    Multinomial,
     Population,
     bootstrap,
     collect,
@@ -34,56 +33,6 @@ PARTICLES = {
 }
 
 
-def same(a, b):
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[name], b[name]) for name in a)
-    return a.dtype == b.dtype and np.array_equal(a, b)
-
-
-@pytest.mark.parametrize("kind", PARTICLES)
-def test_weighted_particles_as_a_tree(kind):
-    pytest.importorskip("xarray")
-    population = Population(PARTICLES[kind], LOG_WEIGHTS)
-    tree = population.to_arviz()
-    assert tree["posterior"].attrs["weights"] == "sample_stats/log_weight"
-    assert tree["sample_stats"]["log_weight"].dims == ("chain", "draw")
-    assert all(a.dims[:2] == ("chain", "draw") and a.shape[:2] == (1, 6) for a in tree["posterior"].values())
-    np.testing.assert_array_equal(tree["sample_stats"]["log_weight"][0], population.log_weights)
-    particles = population.particles if isinstance(population.particles, dict) else {"x": population.particles}
-    assert same({name: a.values[0] for name, a in tree["posterior"].data_vars.items()}, particles)
-
-
-def test_equally_weighted_draws_are_not_marked():
-    pytest.importorskip("xarray")
-    drawn = Multinomial().resample(RNG, Population(PARTICLES["numbers"], LOG_WEIGHTS), 8)
-    assert "weights" not in drawn.to_arviz()["posterior"].attrs
-
-
-def test_chains_as_a_tree():
-    pytest.importorskip("xarray")
-    tree = CHAINS.to_arviz(["a", "b", "c"], discard=1)
-    assert tree["posterior"].sizes == {"chain": 2, "draw": 3} and "weights" not in tree["posterior"].attrs
-    for k, name in enumerate("abc"):
-        np.testing.assert_array_equal(tree["posterior"][name].values, CHAINS.theta[1:, :, k].T)
-    np.testing.assert_array_equal(tree["sample_stats"]["lp"].values, CHAINS.log_density[1:].T)
-    np.testing.assert_array_equal(tree["sample_stats"]["log_evidence"].values, CHAINS.log_evidence[1:].T)
-    np.testing.assert_array_equal(CHAINS.to_arviz()["posterior"]["theta"], CHAINS.theta.swapaxes(0, 1))
-    unknown = Chains(CHAINS.theta, np.full((4, 2), np.nan), np.full((4, 2), np.nan), CHAINS.accepted)
-    assert list(unknown.to_arviz().children) == ["posterior"]
-    with pytest.raises(InputError, match="2 names for 3 parameters"):
-        CHAINS.to_arviz(["a", "b"])
-
-
-def test_arviz_reads_the_trees():
-    """With ArviZ 0.2x as with 1.0: the mean that it reports is that of the draws."""
-    arviz = pytest.importorskip("arviz")
-    data = CHAINS.to_arviz(["a", "b", "c"])
-    convert = getattr(getattr(arviz, "InferenceData", None), "from_datatree", lambda tree: tree)
-    data = convert(data)
-    summary = arviz.summary(data, round_to=6)
-    np.testing.assert_allclose(summary["mean"].to_numpy(float), CHAINS.theta.mean(axis=(0, 1)), atol=1e-5)
-
-
 def test_columns_of_particles():
     assert list(Population(PARTICLES["vectors"]).columns()) == ["x_0", "x_1", "weight", "log_weight"]
     mapping = Population(PARTICLES["mapping"], LOG_WEIGHTS)
@@ -93,8 +42,6 @@ def test_columns_of_particles():
     np.testing.assert_array_equal(columns["weight"], mapping.weights)
     objects = Population(("a", ("b",)))
     assert objects.columns()["particle"].tolist() == ["a", ("b",)]
-    with pytest.raises(InputError, match="str objects"):
-        objects.to_arviz()
     with pytest.raises(InputError, match="arrays called weight"):
         Population({"weight": np.zeros(2)}).columns()
 
@@ -136,7 +83,7 @@ def test_a_missing_library(monkeypatch):
     with pytest.raises(MissingLibraryError, match="this export needs pandas"):
         CHAINS.to_pandas()
     with pytest.raises(MissingLibraryError, match="this export needs xarray"):
-        CHAINS.to_arviz()
+        collect([]).to_xarray()
 
 
 def test_a_history_shows_itself_in_five_lines():

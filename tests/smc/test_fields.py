@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
+from mstfilter.fields import Bounded
 from mstfilter.smc import (
     Bins,
     ClusterStratified,
@@ -20,7 +21,6 @@ from mstfilter.smc import (
     ParticleFilter,
     Population,
     Program,
-    ProgramLookahead,
     ProgramMove,
     RandomWalkMove,
     Residual,
@@ -66,7 +66,6 @@ from tests.smc.models import AR1
         (lambda: RandomWalkMove(AR1, scale=-1.0), "scale is -1"),
         (lambda: RandomWalkMove(AR1, scale=[1.0, np.nan]), "scale is"),
         (lambda: ProgramMove(print, scale=0.0), r"scale is 0\.0"),
-        (lambda: ProgramLookahead(print, power=-1), "power is -1"),
         (lambda: bootstrap(AR1, 2.0), r"n is 2\.0"),
         (lambda: replace(bootstrap(AR1, 2), n_proposed=-1), "n_proposed is -1"),
         (lambda: bootstrap(AR1, 5, Systematic), "resampler is the class Systematic"),
@@ -132,3 +131,12 @@ def test_hints_say_what_was_meant():
     with pytest.raises(InputError) as raised:
         bootstrap(AR1, 5, Systematic)
     assert raised.value.hints == ("pass an instance: resampler=Systematic(...)",)
+
+
+def test_a_class_whose_annotations_are_unknown_is_named():
+    @dataclass(frozen=True)
+    class Local(Bounded):
+        n: "Unknown" = 1  # noqa: F821, UP037
+
+    with pytest.warns(InputWarning, match="fields of .*Local are not checked.*'Unknown' is not defined"):
+        Local(n=-1)

@@ -1,4 +1,4 @@
-"""Single-run variances against their definition and against many runs; coalescence against Wright and Fisher."""
+"""Single-run variances against their definition and against many runs."""
 
 from __future__ import annotations
 

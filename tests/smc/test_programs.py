@@ -90,11 +90,9 @@ def test_a_guide_gives_the_draws_of_the_guided_filter():
     [
         Program(ar1).bootstrap(1500, trigger=EssBelow(0.5)),
         Program(ar1).guided(best, 600, trigger=Always()),
-        Program(ar1).auxiliary(1500, trigger=EssBelow(0.5), power=0.5),
-        Program(ar1).auxiliary(600, best, trigger=Always(), power=0.5),
         Program(ar1).resample_move(1500, steps=2, scale=0.8, trigger=EssBelow(0.5)),
     ],
-    ids=["bootstrap", "guided", "auxiliary", "auxiliary guided", "resample-move"],
+    ids=["bootstrap", "guided", "resample-move"],
 )
 def test_filters_of_a_program_agree_with_kalman(filter):
     """Within 4 standard errors (false alarm 6e-5 a case); 3.5 % of bias would be seen."""
@@ -145,7 +143,7 @@ def exact_regimes(ys):
 TRACK = [0.2, 1.4, 1.1, None, 2.9]
 
 
-@pytest.mark.parametrize("kind", ["bootstrap", "guided", "auxiliary", "resample-move"])
+@pytest.mark.parametrize("kind", ["bootstrap", "guided", "resample-move"])
 def test_switch_agrees_with_enumeration(kind):
     def guide(previous, y):
         before = None if previous is None else previous["x"]
@@ -164,7 +162,6 @@ def test_switch_agrees_with_enumeration(kind):
     filter = {
         "bootstrap": program.bootstrap(3000),
         "guided": program.guided(guide, 3000),
-        "auxiliary": program.auxiliary(3000, power=0.3),
         "resample-move": program.resample_move(3000, steps=2),
     }[kind]
     exact, calm = exact_regimes(TRACK)
@@ -468,7 +465,6 @@ def test_all_distributions_in_a_branch_without_particles():
     for make in (
         lambda p: p.bootstrap(30),
         lambda p: p.guided(guide, 30),
-        lambda p: p.auxiliary(30),
         lambda p: p.resample_move(30, trigger=Always()),
     ):
         state, _ = make(Program(model)).run([0.3, -0.2], 0)
@@ -611,7 +607,6 @@ def test_a_program_with_time_and_inputs_is_the_state_space_model_with_both():
     reference = bootstrap(exact, 20_000).run(ys, 0)[0].log_evidence
     for filter in (
         Program(model).guided(guide, 4000),
-        Program(model).auxiliary(4000, power=0.5),
         Program(model).resample_move(4000, trigger=Always()),
     ):
         assert filter.run(ys, 1)[0].log_evidence == pytest.approx(reference, abs=0.25)

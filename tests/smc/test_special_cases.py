@@ -133,24 +133,3 @@ def test_children_take_each_entry_from_a_parent():
     )
     state, infos = filter.run(YS, 0)
     assert len(state.population) == 40 and infos[0].n_candidates == 40 + 40 + 20
-
-
-def test_crossing_previous_particles_records_both_parents():
-    """Every entry of a child comes from one of its two parents, also through a resampling before the prediction."""
-    model = linear_gaussian(F, 1e-18 * Q, H, R, M0, P0)
-    filter = replace(
-        bootstrap(model, 30, trigger=Always()), transition=None, update=CrossVectors(model.log_likelihood, among=True)
-    )
-    state, before = filter.start(1), None
-    for y in YS[:4]:
-        state, _ = filter.step(state, y)
-        particles, parents = state.population.particles, state.population.parents
-        if before is not None:
-            assert set(parents) >= {"previous", "mate"}
-            first, mate = before[parents["previous"]], before[parents["mate"]]
-            children = parents["mate"] >= 0
-            assert 0 < children.sum() < len(children)
-            assert ((particles == first) | (particles == mate))[children].all()
-            assert (particles == mate)[children].any()
-            assert (particles == first)[~children].all()
-        before = particles

@@ -1,4 +1,4 @@
-"""Filters from a program: bootstrap, guided, auxiliary and resample-move."""
+"""Filters from a program: bootstrap, guided and resample-move."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fields import NonNegativeFloat, PositiveFloat, PositiveInt
+from mstfilter.fields import PositiveFloat, PositiveInt
 from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import Component, Lookahead, Proposal, Rejuvenation, Transition
+from mstfilter.smc.interfaces import Component, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
-    CentreHandler,
     GuideHandler,
     ReplayHandler,
     SampleHandler,
@@ -65,10 +64,6 @@ class Program:
         is missing, the model draws.
         """
         return self._filter(guide, n, components)
-
-    def auxiliary(self, n: int, guide: Model | None = None, power: float = 1.0, **components: Any) -> ParticleFilter:
-        """Auxiliary filter with an automatic lookahead, exact for every model; see `ProgramLookahead`."""
-        return replace(self._filter(guide, n, components), lookahead=ProgramLookahead(self.model, power))
 
     def resample_move(
         self, n: int, steps: int = 1, scale: float = 0.5, guide: Model | None = None, **components: Any
@@ -146,29 +141,6 @@ def _step(
     proposed = GuideHandler(rng, n)
     run_program(guide, proposed, previous, observation, n)
     return run_program(model, ReplayHandler(proposed), previous, observation, n)
-
-
-@dataclass(frozen=True)
-class ProgramLookahead(Lookahead):
-    """Priority from a run with the mean (mode of a discrete site) instead of each draw.
-
-    It is raised to `power`; below 1 if the lookahead at the mean is too confident.
-    """
-
-    model: Model
-    power: NonNegativeFloat = 1.0
-
-    step_functions: ClassVar = {"model": 2}
-
-    def log_priority(self, population: Population, observation: Any) -> np.ndarray:
-        """(n,) log probability of the observation, bounded from below."""
-        with hypothetical():
-            _, priority = run_program(self.model, CentreHandler(), population.particles, observation, len(population))
-        # An observation that is impossible at the mean may be possible for a draw: at most 50 below the best.
-        top = priority.max()
-        if not np.isfinite(top):
-            return np.zeros(len(priority))
-        return self.power * np.maximum(np.nan_to_num(priority, nan=-np.inf), top - 50.0)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Handlers decide the values of the sites of a program.
 
-A value is a draw, a replayed draw of a guide, the mean of the distribution, or given.
+A value is a draw, a replayed draw of a guide, or given.
 """
 
 from __future__ import annotations
@@ -149,15 +149,6 @@ def check_shape(what: str, value: np.ndarray, distribution: Distribution, size: 
             f"{what} have shape {value.shape}, expected {shape} by the {type(distribution).__name__}",
             "the mean of a distribution states the event shape: it is (), (n,), (1, d) or (n, d)",
         )
-
-
-class CentreHandler(SiteHandler):
-    """Sets every site to the mean of its distribution (mode if discrete)."""
-
-    draws = False
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        return np.broadcast_to(site.distribution.centre, site.distribution.value_shape(site.size)), None
 
 
 class CopyHandler(SiteHandler):
