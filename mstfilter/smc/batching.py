@@ -8,9 +8,8 @@ programs). A component sees no axis of runs: it treats each row by itself, and t
 arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
 
 This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
-compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a call for
-them in another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if
-they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
+compared with a call for that run alone. If they differ, a component that states ``batched=True`` raises InputError.
+Otherwise, and if they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
 """
 
 from __future__ import annotations
@@ -30,19 +29,8 @@ from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence,
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import Info, State, WeightResampler
 from mstfilter.smc.population import Population, identity
-from mstfilter.smc.streams import (
-    Key,
-    RunGenerators,
-    RunKeys,
-    by_run,
-    flat,
-    of_runs,
-    resampled_runs,
-    summaries,
-)
+from mstfilter.smc.streams import Key, RunGenerators, RunKeys, each_array, of_runs, rows_of, summaries
 
-#: Runs that are compared with a call for the runs in another order.
-_MOST_COMPARED = 64
 #: Steps at which runs are compared: the Pell numbers 0, 1, 2, 5, 12, 29, 70, ... Unlike powers of two, they also find
 #: a fault of every third step.
 _COMPARED_STEPS = frozenset(round((1 + math.sqrt(2)) ** k / math.sqrt(8)) for k in range(40))
@@ -183,7 +171,7 @@ class _Sweep:
         """Call a component for all runs; those that it loses are removed."""
         rows = np.arange(len(self.runs))
         try:
-            particles, log_weights = self.of_rows(t, slot, rows)
+            particles, log_weights = self.together(t, slot)
         except NotTogether:
             raise
         except LostRunError:  # all weights of all runs are 0
@@ -206,23 +194,24 @@ class _Sweep:
             self.runs, self.resampled = self.runs[rows], self.resampled[rows]
             self.ancestors = None if self.ancestors is None else self.ancestors[rows]
 
-    def of_rows(self, t: int, slot: str, rows: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Particles and log weights of a component that is called once for the given rows, in their order."""
-        runs, n = self.runs[rows], self.filter.n
-        y, u = self.given[t]
-        component = getattr(self.filters.rows(runs).at_step(t, u), slot)
-        rng = RunGenerators(self.generators(t, slot, rows), n) if component.draws else None
-        population, log_weights = None, self.log_weights
+    def together(self, t: int, slot: str) -> tuple[Any, np.ndarray]:
+        """Particles and log weights of a component that is called once for all runs."""
+        (y, u), n = self.given[t], self.filter.n
+        component = getattr(self.filters.rows(self.runs).at_step(t, u), slot)
+        rng = RunGenerators(self.streams.generators(slot, t, self.runs), n) if component.draws else None
+        population = None
         if slot != "initial":
-            everything = len(rows) == len(self.runs) and rows[0] == 0
-            particles = self.particles if everything else of_runs(self.particles, rows)
-            log_weights = self.log_weights if everything else self.log_weights[rows]
-            population = Population.unchecked(flat(particles, n), log_weights.ravel())
-        found = _called(slot, component, rng, population, y, len(rows) * n)
-        if len(found) != len(rows) * n:
-            raise InputError(f"{len(rows) * n} particles became {len(found)}")
+            population = Population.unchecked(self.flat(self.particles), self.log_weights.ravel())
+        found = _called(slot, component, rng, population, y, len(self.runs) * n)
+        if len(found) != len(self.runs) * n:
+            raise InputError(f"{len(self.runs) * n} particles became {len(found)}")
         same = population is not None and found.log_weights is population.log_weights
-        return by_run(found.particles, n), log_weights if same else found.log_weights.reshape(-1, n)
+        particles = each_array(lambda a: np.asarray(a).reshape(-1, n, *a.shape[1:]), found.particles)
+        return particles, self.log_weights if same else found.log_weights.reshape(-1, n)
+
+    def flat(self, particles: Any) -> Any:
+        """Particles (R n, ...) of all runs."""
+        return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(self.filter.n)), particles)
 
     def alone(self, t: int, slot: str, row: int) -> Population:
         """What a component returns for one run; LostRunError, or `NotTogether` if it raises another error."""
@@ -252,32 +241,20 @@ class _Sweep:
 
     # --- checks ---------------------------------------------------------------------------------------------------
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with single runs: the first and the last, or one in turn; at first all with another order."""
+        """Compare runs with single runs: the first and the last, or one in turn."""
         last, count = self.checked.get(slot, (0, 0))
         if t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == len(rows):
             return
         self.checked[slot] = len(rows), count + 1
         for k in {count % len(rows)} if last == len(rows) else {0, len(rows) - 1}:
-            self.same_scheme(self.filters.one(int(self.runs[rows[k]])))
+            run = int(self.runs[rows[k]])
+            self.same_scheme(self.filters.one(run))
             try:
-                single = self.alone(t, slot, int(rows[k]))
+                alone = self.alone(t, slot, int(rows[k]))
             except LostRunError:
-                self.refuse(t, slot, f"all weights of run {self.runs[rows[k]]} are 0 alone, but not in the batch")
-            ours = of_runs(particles, k), log_weights[k]
-            self.agree(t, slot, rows[k], ours, (single.particles, single.log_weights), "alone")
-        if count == 0 and len(rows) > 1:
-            self.compare_order(t, slot, rows, particles, log_weights)
-
-    def compare_order(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with a call for them in another order."""
-        order = np.roll(np.arange(0, len(rows), math.ceil(len(rows) / _MOST_COMPARED)), 1)
-        try:
-            others = self.of_rows(t, slot, rows[order])
-        except Exception as error:
-            self.refuse(t, slot, f"a call for the runs in another order raises {type(error).__name__}: {error}")
-        for k, row in enumerate(rows[order].tolist()):
-            ours = of_runs(particles, order[k]), log_weights[order[k]]
-            self.agree(t, slot, row, ours, (of_runs(others[0], k), others[1][k]), "with the runs in another order")
+                self.refuse(t, slot, f"all weights of run {run} are 0 alone, but not in the batch")
+            self.agree(t, slot, run, "particles", of_runs(particles, k), alone.particles)
+            self.agree(t, slot, run, "log weights", log_weights[k], alone.log_weights)
 
     def same_scheme(self, other: ParticleFilter) -> None:
         """Make single runs if the filter of a run has another number of particles, resampler or trigger."""
@@ -285,16 +262,14 @@ class _Sweep:
             if other is not self.filter and getattr(other, name) != getattr(self.filter, name):
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
 
-    def agree(self, t: int, slot: str, row: int, ours: tuple[Any, Any], other: tuple[Any, Any], how: str) -> None:
+    def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
         """Refuse the component if a run differs."""
-        for what, a, b in (("particles", ours[0], other[0]), ("log weights", ours[1], other[1])):
-            found = _difference(a, b)
-            if found is None or (found[0] and self.rounding):
-                continue
-            if found[0]:
-                raise NotTogether(slot, f"step {t}: its {what} differ by rounding from those of single runs")
-            run = int(self.runs[row])
-            self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} {how}")
+        found = _difference(ours, alone)
+        if found is None or (found[0] and self.rounding):
+            return
+        if found[0]:
+            raise NotTogether(slot, f"step {t}: its {what} differ by rounding from those of single runs")
+        self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} alone")
 
     def refuse_error(self, t: int, slot: str, error: Exception) -> NoReturn:
         """Make single runs if one of them raises an error too; else refuse the component."""
@@ -322,13 +297,12 @@ class _Sweep:
         if not len(rows):
             return
         index, out = self.selected(t, rows)
-        self.log_weights = self.log_weights.copy()
-        self.log_weights[rows] = self.log_mean[rows, None] if out is None else out
+        self.log_weights = _with_rows(self.log_weights, rows, self.log_mean[rows, None] if out is None else out)
         if out is not None:
             self.log_mean[rows] = summaries(out)[1]
         if self.ancestors is not None:
             self.ancestors[rows] = index
-        self.particles = resampled_runs(self.particles, rows, index)
+        self.particles = each_array(lambda a: _with_rows(a, rows, a[rows[:, None], index]), self.particles)
 
     def wanted(self, t: int) -> Any:
         """(R,) bool, or one: the runs to resample."""
@@ -346,7 +320,7 @@ class _Sweep:
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
         if resampler.batched:
-            streams: Any = RunGenerators(self.generators(t, "resampler", rows))
+            streams: Any = RunGenerators(self.streams.generators("resampler", t, self.runs[rows]))
             return resampler.select(streams, self.log_weights[rows], n)
         drawn = [
             resampler.select(self.key(t, "resampler", row).generator(), self.log_weights[row], n)
@@ -359,10 +333,6 @@ class _Sweep:
     def key(self, t: int, slot: str, row: int) -> Key:
         """The key of a component of one run."""
         return self.keys[self.runs[row]].child(slot, t)
-
-    def generators(self, t: int, slot: str, rows: np.ndarray) -> list[np.random.Generator]:
-        """The generators of a component that is called for some runs."""
-        return self.streams.generators(slot, t, self.runs[rows])
 
     def record(self, t: int) -> None:
         """Keep what the collectors return for each run."""
@@ -406,6 +376,15 @@ class _Sweep:
         for t, (runs, values) in enumerate(steps):
             table[t, runs] = values
         return table
+
+
+def _with_rows(a: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A copy of an array with other values in some rows."""
+    if values.shape == a.shape:
+        return values
+    out = a.copy()
+    out[rows] = values
+    return out
 
 
 def _called(slot: str, component: Any, rng: Any, population: Population | None, y: Any, n: int) -> Population:

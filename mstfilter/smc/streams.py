@@ -280,29 +280,6 @@ def each_array(function: Callable[[np.ndarray], np.ndarray], particles: Any) -> 
     raise InputError("the particles are objects")
 
 
-def flat(particles: Any, n: int) -> Any:
-    """Particles (R n, ...) of particles (R, n, ...)."""
-    return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(n)), particles)
-
-
-def by_run(particles: Any, n: int) -> Any:
-    """Particles (R, n, ...) of particles (R n, ...)."""
-    return each_array(lambda a: np.asarray(a).reshape(-1, n, *a.shape[1:]), particles)
-
-
 def of_runs(particles: Any, row: Any) -> Any:
     """Particles of one run, or of the runs of an index."""
     return each_array(lambda a: a[row], particles)
-
-
-def resampled_runs(particles: Any, rows: np.ndarray, index: np.ndarray) -> Any:
-    """Particles after resampling some rows by (len(rows), n) ancestors."""
-
-    def chosen(a: np.ndarray) -> np.ndarray:
-        if len(rows) == len(a):
-            return a[rows[:, None], index]
-        out = a.copy()
-        out[rows] = a[rows[:, None], index]
-        return out
-
-    return each_array(chosen, particles)

@@ -276,18 +276,6 @@ def test_a_program_that_mixes_particles_is_named_by_its_first_batch():
         run_many(Program(program).bootstrap(30), [0.5, -0.3], range(5))
 
 
-def test_an_error_with_the_runs_in_another_order_is_named():
-    def ordered(x, y):  # the first run alone and first in the batch
-        if len(x) > 4 and x[0] != FIRST[0]:
-            raise ArithmeticError("order")
-        return -np.square(y - x)
-
-    filter = bootstrap(replace(GOOD, log_likelihood=ordered), 4)
-    FIRST = filter.run([None], 0)[0].population.particles
-    with pytest.raises(InputError, match="update: a call for the runs in another order raises ArithmeticError"):
-        run_many(filter, [0.5], range(5))
-
-
 @pytest.mark.parametrize("n", [3, 4])
 def test_programs_are_called_together_also_where_their_checks_are_due(n):
     """The first steps of a program are checked; in a batch, the single runs that it is compared with are."""
