@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
 from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler
 from mstfilter.smc.programs.sites import Call, ProgramRun, recorded
@@ -77,7 +78,8 @@ class Guard:
     # --- the same random numbers ------------------------------------------------------------------------------------
     def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray, runs: list[ProgramRun]) -> None:
         self.rng.bit_generator.state = self.state
-        with recorded() as repeated:
+        invalid: list[str] = []
+        with recorded() as repeated, np.errstate(invalid="call", call=lambda kind, _: invalid.append(kind)):
             try:
                 again, gain_again = step()
             except Exception as error:
@@ -88,6 +90,8 @@ class Guard:
             what = _first_call_that_differs(runs, repeated) or "log weights"
         if what is not None:
             raise InputError(f"{what} differ when the step is repeated with the same random numbers", *_REPEAT)
+        if invalid:
+            _check_returned(repeated[-1])
 
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
@@ -95,6 +99,9 @@ class Guard:
         if any(call.ambiguous for call in whole.calls or ()):
             rows = rows[:1]
         few, rows = self._run_alone(run, whole, rows)
+        for call in few.calls or ():
+            if call.distribution is not None:
+                _check_density(call.what, call.distribution, self.rng)
         alone = {(c.what, c.k): c for c in few.calls or ()}
         for call in whole.calls or ():
             _compare(call, alone.pop((call.what, call.k), None), rows)
@@ -207,6 +214,17 @@ def _copy(function: Any) -> Any:
         return deepcopy(function)
     except Exception:
         return function
+
+
+def _check_returned(run: ProgramRun) -> None:
+    """Raise if a returned value is NaN, after an invalid operation; NaN that the program writes is a mark."""
+    for name, value in run.returned.items():
+        if np.asarray(value).dtype.kind == "f" and np.isnan(value).any():
+            n = int(np.isnan(value).reshape(run.n, -1).any(axis=1).sum())
+            raise InputError(
+                f"returned {name!r} is NaN for {n} of {run.n} particles, by an operation such as log(-1) or 0/0",
+                "write numpy.nan by numpy.where(valid, value, numpy.nan) if it marks a value that is absent",
+            )
 
 
 def _groups(run: ProgramRun) -> list[np.ndarray]:
@@ -332,3 +350,52 @@ def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np
             f"{alone[i]} alone",
             *_ALONE,
         )
+
+
+# --- distributions of the user --------------------------------------------------------------------------------------
+_KNOWN: set[type] = set()
+
+
+def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
+    """Raise if draws of a user's distribution of numbers do not have its density; once for each class.
+
+    The distribution function is the integral of the density between sorted draws. Its distance from the uniform
+    distribution is below .12 for 1000 draws of the true law, with a false alarm of 1e-12 (Dvoretzky, Kiefer,
+    Wolfowitz).
+    """
+    kind = type(distribution)
+    if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:
+        return
+    n = (distribution.batch_shape or (1,))[0]
+    if n == 0:
+        return
+    generator, row = child(rng, "guard", "density"), n // 2
+    per_call = n if n > 1 else 1000
+    draws = [distribution.sample(generator, per_call) for _ in range(1000 if n > 1 else 1)]
+    x = np.sort(np.array([d[row] for d in draws]) if n > 1 else draws[0])
+
+    def density(values: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            if n == 1:
+                return np.exp(np.broadcast_to(distribution.log_prob(values), values.shape))
+            return np.array([np.exp(distribution.log_prob(np.full(n, v, values.dtype))[row]) for v in values])
+
+    if distribution.discrete:
+        values, counts = np.unique(x, return_counts=True)
+        p = density(values)
+        distance, total = float(abs(counts / len(x) - p).max()), float(p.sum())
+    else:
+        width = max(x[-1] - x[0], 1e-12)
+        x = np.concatenate([x[0] - width * np.linspace(1, 0, 50)[:-1], x, x[-1] + width * np.linspace(0, 1, 50)[1:]])
+        p = density(x)
+        mass = np.append(0.0, np.cumsum(np.diff(x) * (p[1:] + p[:-1]) / 2))
+        middle = (np.arange(1000) + 0.5) / 1000
+        distance, total = float(abs(mass[49:-49] - middle).max()), float(mass[-1])
+    if not distance < 0.12:
+        raise InputError(
+            f"{what}: draws of {kind.__qualname__} do not have its density: they differ by {distance:.2g}, "
+            f"and the density has the total {total:.3g}",
+            "sample and log_prob must be of one normalised distribution; log_prob is the log of the density, <= 0 "
+            "for a discrete one",
+        )
+    _KNOWN.add(kind)
