@@ -1,7 +1,6 @@
 """Boundary maps from colour gradients and concave depth edges, without learned weights.
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
->>> height = above_table(frame)                            # (H, W), > 0 above the table, NaN without reading
 
 Objects are mostly convex. So depth has a concave crease or a step where two objects meet and where an object meets
 the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
@@ -20,36 +19,13 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from mstfilter.results import Checked, check_array, check_type, returns
-from mstfilter.scene import BASELINE, Camera, Clip, Frame, fit_support_plane, scaled_length, table_residual
+from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Clip, Frame, above_table, scaled_length
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
 SENSOR_FOCAL = 525.0
-#: Readings up to this much above the table are table, in sensor disparity units.
-TABLE_TOLERANCE = 2.0
 _DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE Lab) of colour strength 1
-
-
-def above_table(frame: Frame) -> np.ndarray:
-    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
-
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
-    most readings.
-    """
-    return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
-
-
-def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame; without a pose, with that relative to the fitted table (`fit_support_plane`)."""
-    camera = frame.camera
-    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
-
-
-def pixels_above_table(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) with a reading above the table that is not on the robot."""
-    with np.errstate(invalid="ignore"):
-        return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
 
 
 class BoundaryModel(Checked, ABC):
