@@ -32,7 +32,9 @@ _SMALLEST = 25  # pixels of a region of readings
 _RISE = 1.75  # mean rise of a region of readings, in tolerances
 _SMALLEST_DARK = 60  # pixels of a region without readings
 _COLOUR_REACH = 40.0  # standard deviation of the surroundings that show the colour of the table, pixels
-_COLOUR_DISTANCE = 25.0  # squared Mahalanobis distance of Lab colour from the table around a pixel
+_EMPTY = 0.05  # share of readings of a row or column in the margin of the image, at most
+_TABLE_NEAR = 0.1  # share of table in these surroundings
+_COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the table; 1 % of its pixels are above
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
 _ON_TABLE = 0.4  # share of table around a region without readings
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
@@ -129,9 +131,18 @@ def _silent(frame: Frame) -> np.ndarray:
     n = np.maximum(share, 1e-6)[..., None]
     mean = _surroundings(lab * table[..., None], width) / n
     variance = np.maximum(_surroundings(lab**2 * table[..., None], width) / n - mean**2, 0) + _COLOUR_NOISE
-    other = (((lab - mean) ** 2 / variance).sum(axis=-1) > _COLOUR_DISTANCE) & (share > 1e-3)
-    silent = (_without_readings(frame) & other).astype(np.uint8)
+    other = (((lab - mean) ** 2 / variance).sum(axis=-1) > _COLOUR_DISTANCE) & (share > _TABLE_NEAR)
+    silent = (_without_readings(frame) & other & _measured_part(frame)).astype(np.uint8)
     return cv2.morphologyEx(silent, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+
+
+def _measured_part(frame: Frame) -> np.ndarray:
+    """The rectangle of the image (H, W) bool in which the sensor has readings; registered depth has empty margins."""
+    part = np.zeros(frame.depth.shape, bool)
+    rows, columns = (np.flatnonzero(frame.valid.mean(axis=axis) >= _EMPTY) for axis in (1, 0))
+    if len(rows) and len(columns):
+        part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    return part
 
 
 def _surroundings(image: np.ndarray, width: int) -> np.ndarray:
