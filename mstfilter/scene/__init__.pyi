@@ -71,6 +71,8 @@ from mstfilter.scene.support import (
     TABLE_TOLERANCE as TABLE_TOLERANCE,
     Foreground as Foreground,
     above_table as above_table,
+    fill_from_nearest as fill_from_nearest,
+    filled_above_table as filled_above_table,
     foreground as foreground,
     pixels_above_table as pixels_above_table,
     posed_camera as posed_camera,

@@ -28,6 +28,7 @@ from mstfilter.scene.voxels import VoxelGrid
 #: Readings up to this much above the table are table, in sensor disparity units.
 TABLE_TOLERANCE = 2.0
 # Areas and lengths are those of an image of 640 x 480 pixels.
+_DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _SMALLEST = 25  # pixels of a region of readings
 _RISE = 1.75  # mean rise of a region of readings, in tolerances
 _SMALLEST_DARK = 60  # pixels of a region without readings
@@ -56,6 +57,21 @@ def above_table(frame: Frame) -> np.ndarray:
     most readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
+
+
+def filled_above_table(frame: Frame) -> np.ndarray:
+    """`above_table`, filled from the nearest reading if depth has holes everywhere (sparse sensors)."""
+    height = above_table(frame)
+    beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
+    return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
+
+
+def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Depth (H, W) with the pixels of `holes` set to the nearest reading."""
+    if not holes.any() or holes.all():
+        return depth
+    rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
+    return np.asarray(depth[rows, columns])
 
 
 def posed_camera(frame: Frame) -> Camera:
@@ -100,10 +116,11 @@ def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
     """Readings (H, W) bool that form a region above the table."""
     raised = readings_above_table(frame, grid)
-    core = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
+    solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
+    core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     regions, n = ndimage.label(core)
     area = np.bincount(regions.ravel(), minlength=n + 1)
-    height = np.minimum(np.nan_to_num(above_table(frame), posinf=1e3), 1e3)
     rise = np.bincount(regions.ravel(), weights=height.ravel(), minlength=n + 1)
     kept = (area >= scaled_area(_SMALLEST, raised.size)) & (rise > _RISE * TABLE_TOLERANCE * area)
     kept[0] = False
@@ -207,15 +224,9 @@ def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
         inside = regions[box] == k
         known, missing = inside & frame.valid[box], inside & ~frame.valid[box]
         if missing.any():
-            found = _nearest(depth[box], known) if known.sum() >= _FEW else _at_base(table[box], inside)
+            found = fill_from_nearest(depth[box], ~known) if known.sum() >= _FEW else _at_base(table[box], inside)
             depth[box][missing] = np.minimum(found, table[box] - _STANDS)[missing]
     return depth
-
-
-def _nearest(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Depth (h, w) of the nearest known pixel."""
-    rows, columns = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return np.asarray(depth[rows, columns])
 
 
 def _at_base(table: np.ndarray, inside: np.ndarray) -> float:
