@@ -97,7 +97,7 @@ def judge(family: SceneFamily, seed: int) -> dict[str, float]:
     image = np.where(read, seen["instance"], 0)
     volume = scene.truth()
     proposal = TreeCutProposal(sampler=OptimalCut())
-    tree, values = proposal.tree_of(frame)
+    tree, values = proposal.tree_of(frame, scene.grid)
     labels = proposal.objects.label_image(tree, optimal_cut(tree, values), frame, scene.grid)
     own = proposal.objects.segments(tree, frame, scene.grid).object_pixels
     population = proposal.sample(np.random.default_rng(seed), Clip((frame,), scene.grid, 0), 1)

@@ -28,7 +28,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mstfilter.files import write_csv
 from mstfilter.forecasts import ForecastTable, Recalibration
-from mstfilter.scene import Camera, Frame
+from mstfilter.scene import Camera, Frame, foreground
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
     BorderTree,
@@ -142,7 +142,7 @@ class _Given(TreeBuilder):
 
     tree: Tree
 
-    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         return self.tree
 
 
@@ -164,14 +164,15 @@ def load(number: int, border: str) -> Case:
     frame = Frame(rgb, depth, Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480))
     trees: dict[float, tuple[Tree, Segments]] = {}
     learned, seen = dict(trees), dict(trees)
+    found = foreground(frame)
     for weight in COLOUR_WEIGHTS:
-        boundary = ColourDepthBoundary(colour_weight=weight).boundary(frame)
+        boundary = ColourDepthBoundary(colour_weight=weight).boundary(found.frame)
         tree = tree_of_heights(boundary)
         trees[weight] = (tree, RULE.segments(tree, frame))
         leaves = _Given(tree)
-        tree = LearnedTree(leaves).build(boundary, frame)
+        tree = LearnedTree(leaves).build(boundary, found.frame, found.pixels)
         learned[weight] = (tree, RULE.segments(tree, frame))
-        tree = BorderTree(leaves, border).build(boundary, frame)
+        tree = BorderTree(leaves, border).build(boundary, found.frame, found.pixels)
         seen[weight] = (tree, RULE.segments(tree, frame))
     truth = np.where(label >= 2, label - 1, 0)
     return Case(f"learn{number}", frame, truth, label == 0, touching(label), trees, learned, seen)

@@ -35,7 +35,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
     shot = scene.frame_images(0)
     frame = Frame(shot["rgb"], shot["depth"], scene.camera)
     proposal = mstfilter.preset("mst").proposal
-    tree, w = proposal.tree_of(frame)
+    tree, w = proposal.tree_of(frame, family.grid())
     found = proposal.objects.segments(tree, frame, family.grid())
     drawn = proposal.sampler.sample(np.random.default_rng(0), tree, w, 50)
     best = optimal_cut(tree, w)

@@ -62,7 +62,7 @@ def main(out: Path, smoke: bool, border: str) -> None:
             for arm, proposal in arms.items():
                 n = 1 if isinstance(proposal.sampler, OptimalCut) else N
                 population = proposal.sample(np.random.default_rng(seed), clip, n)
-                tree, w = proposal.tree_of(pause.frame)
+                tree, w = proposal.tree_of(pause.frame, pause.grid)
                 image = np.nan
                 if n == 1:
                     labels = proposal.objects.label_image(tree, optimal_cut(tree, w), pause.frame, pause.grid)

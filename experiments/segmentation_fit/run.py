@@ -23,6 +23,7 @@ from scenes import FITTED, FITTED_SEEDS, first_pause, small
 from scipy.optimize import minimize
 
 from mstfilter.resources import models_folder
+from mstfilter.scene import foreground
 from mstfilter.segmentation import (
     FEATURES,
     PAIR_FEATURES,
@@ -58,10 +59,10 @@ def measured(
             except RuntimeError as error:  # no room for that many objects
                 print(family.name, seed, error)
                 continue
-            boundary = ColourDepthBoundary().boundary(pause.frame)
-            tree, regions = builder.regions(boundary, pause.frame)
+            seen = foreground(pause.frame, pause.grid)
+            regions = builder.regions(ColourDepthBoundary().boundary(seen.frame), seen.frame, seen.pixels)
             n, k = len(regions.sums), int(pause.image.max()) + 1
-            code = regions.of_leaf[tree.leaves] * k + pause.image
+            code = regions.image * k + pause.image
             pixels = np.bincount(code.ravel(), minlength=n * k).reshape(n, k).astype(np.float64)
             pixels[:, 0] += 0.1  # no region is empty
             found.append((regions, pixels, pause.frame.camera.width / 640))

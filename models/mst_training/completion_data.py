@@ -162,7 +162,7 @@ def _masks(rng: np.random.Generator, frame: Frame, instance: np.ndarray) -> list
             mask = (cv2.dilate if change > 0 else cv2.erode)(mask, np.ones((3, 3), np.uint8))
         true.append(mask > 0)
     proposal = TreeCutProposal()
-    tree, w = proposal.tree_of(frame)
+    tree, w = proposal.tree_of(frame, _GRID)
     segments = proposal.objects.segments(tree, frame, _GRID)
     sampler = MetropolisHastingsCuts(temperature=float(rng.choice([1.0, 4.0])), burn_in=300, thinning=100)
     cuts = sampler.sample(rng, tree, w, 3).cuts

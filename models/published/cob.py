@@ -186,7 +186,7 @@ class CobTree(TreeBuilder):
     tolerance: float = 1.5
     max_leaves: PositiveInt = 501
 
-    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         """The tree of a frame; raises InputError without a frame or weights."""
         if frame is None:
             raise InputError("CobTree needs the frame of the boundary map", "tree.build(boundary, frame)")

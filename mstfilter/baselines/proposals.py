@@ -65,8 +65,8 @@ class Floor(Proposal):
 
     def occupied(self, rng: np.random.Generator, clip: Clip) -> np.ndarray:
         """Labels (X, Y, Z), 1 in the completed space above the table."""
-        own = self.objects.object_pixels(clip.after, clip.grid)
-        completed = self.completer.complete(child(rng, "completion"), clip.after, [own], clip.grid)
+        found = self.objects.foreground(clip.after, clip.grid)
+        completed = self.completer.complete(child(rng, "completion"), found.frame, [found.pixels], clip.grid)
         return hypothesis_of(completed, clip.grid, clip.index, self.threshold).labels
 
 
@@ -98,7 +98,9 @@ class ImageComponents(Floor):
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         frame, grid = observation.after, observation.grid
-        labels = self.label_image(frame, self.objects.object_pixels(frame, grid))
+        found = self.objects.foreground(frame, grid)
+        observation = Clip((found.frame,), grid, observation.index)
+        labels = self.label_image(found.frame, found.pixels)
         segments = np.arange(1, int(labels.max(initial=0)) + 1)
         particles, _ = complete_segments(
             rng, observation, [segments] * n, lambda k: labels == k, self.completer, self.threshold

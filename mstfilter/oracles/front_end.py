@@ -42,7 +42,7 @@ _REACH = 4.0  # distance to a true border up to which strength is kept, in pixel
 class TrueMasks(UsesTruth, Proposal):
     """Hypotheses from the true masks of the clip's last frame, all equal.
 
-    `objects` says which pixels can belong to an object (only its `object_pixels` is used); completed voxels of
+    `objects` says which pixels can belong to an object (only its `foreground` is used); completed voxels of
     probability `threshold` or more are occupied.
     """
 
@@ -59,7 +59,7 @@ class TrueMasks(UsesTruth, Proposal):
         counts = np.bincount(image.ravel())
         enough = counts >= scaled_area(MIN_PIXELS, image.size)
         enough[0] = False
-        return np.where(enough[image] & self.objects.object_pixels(frame, clip.grid), image, 0).astype(np.int32)
+        return np.where(enough[image] & self.objects.foreground(frame, clip.grid).pixels, image, 0).astype(np.int32)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """`n` equal hypotheses about the scene at the end of the clip."""
@@ -128,7 +128,7 @@ class TrueCompletion(UsesTruth, Completer):
     ) -> list[Completion]:
         """Complete several masks of a frame at a pause; views are not used."""
         t = self.truth.pause_of(frame)
-        owner = np.where(self.objects.object_pixels(frame, grid), self.truth.instance(t), 0).ravel()
+        owner = np.where(self.objects.foreground(frame, grid).pixels, self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(
             "true_pixels",
             (frame.key, grid.key, self.bound_key),
@@ -176,7 +176,7 @@ class TrueCompletion(UsesTruth, Completer):
         from scipy.spatial import cKDTree
 
         labels, image = self.truth.labels(t), self.truth.instance(t)
-        object_pixels = self.objects.object_pixels(frame, grid)
+        object_pixels = self.objects.foreground(frame, grid).pixels
         found, pixels = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
         for k in np.unique(labels):
             shown = image == k

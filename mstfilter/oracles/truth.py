@@ -22,7 +22,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.fields import bound_to
 from mstfilter.registry import nested_components
-from mstfilter.scene import Frame, Recording
+from mstfilter.scene import Frame, Recording, foreground
 
 Need = Literal["voxels", "instance", "poses"]
 _WORDS: dict[Need, str] = {"voxels": "true voxels", "instance": "instance image", "poses": "true poses"}
@@ -84,7 +84,10 @@ class RecordingTruth:
     def _pauses(self) -> dict[bytes, int]:
         """The first pause with each frame, by the key of the frame."""
         frames = self.recording.frames
-        return {frames[index].key: t for t, index in reversed(list(enumerate(self.recording.pauses)))}
+        found = {}
+        for t, index in reversed(list(enumerate(self.recording.pauses))):
+            found[frames[index].key] = found[foreground(frames[index], self.recording.grid).frame.key] = t
+        return found
 
     def pause_of(self, frame: Frame) -> int:
         """The pause at which a frame was taken, found by its content."""

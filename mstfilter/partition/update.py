@@ -53,6 +53,7 @@ from mstfilter.scene import (
     ObjectView,
     Projection,
     check_grids,
+    foreground,
     log_quality,
 )
 from mstfilter.smc import Population, Systematic, Update, child
@@ -119,6 +120,8 @@ class PartitionUpdate(Update):
         Views that an object keeps, at most: the latest ones.
     threshold : float
         Smallest probability of an occupied voxel.
+    mend : bool
+        Whether missing readings of objects are estimated, as in `ObjectRule`.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -131,6 +134,7 @@ class PartitionUpdate(Update):
     reach: NonNegativeFloat = 1.5
     n_views: NonNegativeInt = 4
     threshold: Share = 0.5
+    mend: bool = True
 
     properly_weighted: ClassVar[bool] = False
 
@@ -140,11 +144,12 @@ class PartitionUpdate(Update):
         """Candidates. Without a proposal, the predictions after free-space projection."""
         check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
         check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
-        readings = Readings.of(observation.after, observation.grid)
+        clip = self._mended(observation)
+        readings = Readings.of(clip.after, clip.grid)
         if predicted is None:
             assert proposed is not None
             candidates = [_new_objects(segments) for segments in _segments(proposed, readings)]
-            built = self._complete(rng, candidates, readings, observation)
+            built = self._complete(rng, candidates, readings, clip)
             return self._weigh(built, observation, proposed.log_weights, proposed.parents, {})
         projected = self._project(predicted, observation)
         if proposed is None:
@@ -152,14 +157,18 @@ class PartitionUpdate(Update):
         predictions = self._predictions(predicted, projected, readings)
         n = self.n_candidates or (4 if self.evidence else 1) * len(predicted)
         drawn = Systematic().select(child(rng, "predicted"), projected.log_weights, n)[0]
-        partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, observation, n)
+        partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, clip, n)
         candidates = [
             self._associate(child(rng, "hidden", c), segments, predictions[j], readings)
             for c, (segments, j) in enumerate(zip(partitions, drawn.tolist(), strict=True))
         ]
-        built = self._complete(rng, candidates, readings, observation)
+        built = self._complete(rng, candidates, readings, clip)
         parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[drawn]}
         return self._weigh(built, observation, np.zeros(n), parents, projected.notes)
+
+    def _mended(self, clip: Clip) -> Clip:
+        """The last frame of a clip, with estimates of missing readings of objects. Free space is only measured."""
+        return Clip((foreground(clip.after, clip.grid).frame,), clip.grid, clip.index) if self.mend else clip
 
     # 1. Free-space projection -----------------------------------------------------------------------------------
 

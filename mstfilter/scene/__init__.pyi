@@ -67,6 +67,17 @@ from mstfilter.scene.rendering import (
     render as render,
     render_hypothesis as render_hypothesis,
 )
+from mstfilter.scene.support import (
+    TABLE_TOLERANCE as TABLE_TOLERANCE,
+    Foreground as Foreground,
+    above_table as above_table,
+    fill_from_nearest as fill_from_nearest,
+    filled_above_table as filled_above_table,
+    foreground as foreground,
+    pixels_above_table as pixels_above_table,
+    posed_camera as posed_camera,
+    readings_above_table as readings_above_table,
+)
 from mstfilter.scene.voxels import (
     MAX_LABEL as MAX_LABEL,
     Crop as Crop,

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mstfilter.scene import BASELINE, Camera, Frame
-from mstfilter.segmentation.boundary import SENSOR_FOCAL, TABLE_TOLERANCE, fill_from_nearest, posed_camera
+from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, fill_from_nearest, posed_camera
+from mstfilter.segmentation.boundary import SENSOR_FOCAL
 from mstfilter.segmentation.regions import SeenBorders
 from mstfilter.trained import TrainedModel, calibrated_network, open_model
 

@@ -1,7 +1,6 @@
 """Boundary maps from colour gradients and concave depth edges, without learned weights.
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
->>> height = above_table(frame)                            # (H, W), > 0 above the table, NaN without reading
 
 Objects are mostly convex. So depth has a concave crease or a step where two objects meet and where an object meets
 the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
@@ -17,39 +16,22 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from mstfilter.results import Checked, check_array, check_type, returns
-from mstfilter.scene import BASELINE, Camera, Clip, Frame, fit_support_plane, scaled_length, table_residual
+from mstfilter.scene import (
+    BASELINE,
+    TABLE_TOLERANCE,
+    Clip,
+    Frame,
+    fill_from_nearest,
+    filled_above_table,
+    scaled_length,
+)
 
 #: Focal length in pixels that defines the sensor's disparity unit: 1/8 pixel of a 640 x 480 Kinect, whatever the
 #: size of the image. The noise (0.58 units) and all thresholds then stay the same when an image is resized.
 SENSOR_FOCAL = 525.0
-#: Readings up to this much above the table are table, in sensor disparity units.
-TABLE_TOLERANCE = 2.0
-_DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE Lab) of colour strength 1
-
-
-def above_table(frame: Frame) -> np.ndarray:
-    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
-
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
-    most readings.
-    """
-    return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
-
-
-def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame; without a pose, with that relative to the fitted table (`fit_support_plane`)."""
-    camera = frame.camera
-    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
-
-
-def pixels_above_table(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) with a reading above the table that is not on the robot."""
-    with np.errstate(invalid="ignore"):
-        return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
 
 
 class BoundaryModel(Checked, ABC):
@@ -98,9 +80,7 @@ class ColourDepthBoundary(BoundaryModel):
             missing = cv2.GaussianBlur((~frame.valid).astype(np.float32), (0, 0), _blur(resize))
             edges = np.maximum(edges, concave * (1 - missing))
         if self.quiet_table >= 0 and frame.valid.any():
-            height = above_table(frame)
-            if _share_beside(frame.valid) < _DENSE:
-                height = fill_from_nearest(height, ~frame.valid)
+            height = filled_above_table(frame)
             with np.errstate(invalid="ignore"):
                 object_like = (height > TABLE_TOLERANCE).astype(np.uint8)
             # Single pixels above the table are noise; blocks of 3 x 3 are not.
@@ -113,11 +93,6 @@ class ColourDepthBoundary(BoundaryModel):
             inside = cv2.erode(robot, np.ones((3, 3), np.uint8), borderValue=1)
             edges = np.where(inside > 0, 0, np.where(robot > 0, 1, edges))
         return np.clip(edges, 0, 1).astype(np.float32)
-
-
-def _share_beside(valid: np.ndarray) -> float:
-    """Mean share of readings in the 3 x 3 pixels around a reading; `valid` (H, W) bool."""
-    return float(cv2.blur(valid.astype(np.float32), (3, 3))[valid].mean())
 
 
 def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
@@ -170,11 +145,3 @@ def _blur(resize: float) -> float:
 def _eigenvalues(xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and half the difference of the eigenvalues of the symmetric matrices [[xx, xy], [xy, yy]]."""
     return (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-
-
-def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Depth (H, W) with the pixels of `holes` set to the nearest reading."""
-    if not holes.any():
-        return depth
-    rows, columns = distance_transform_edt(holes, return_distances=False, return_indices=True)
-    return depth[rows, columns]

@@ -25,8 +25,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.fields import PositiveFloat
 from mstfilter.results import Checked, check_array, check_list, check_type, returns
-from mstfilter.scene import Frame, scaled_area
-from mstfilter.segmentation.boundary import pixels_above_table
+from mstfilter.scene import Frame, pixels_above_table, scaled_area
 from mstfilter.segmentation.tree import Tree
 
 # Constants of `SceneCutObjectness`.

@@ -29,8 +29,16 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.reading import read_json
 from mstfilter.resources import models_folder
-from mstfilter.scene import Frame, scaled_length
-from mstfilter.segmentation.regions import BORDER, HEIGHT_BIN, REGION, Regions, SeenBorders, measure_regions
+from mstfilter.scene import Frame, pixels_above_table, scaled_length
+from mstfilter.segmentation.regions import (
+    BORDER,
+    HEIGHT_BIN,
+    REGION,
+    Regions,
+    SeenBorders,
+    measure_regions,
+    object_leaves,
+)
 from mstfilter.segmentation.tree import Tree, TreeBuilder, UcmTree
 
 if TYPE_CHECKING:
@@ -263,7 +271,7 @@ class Agglomeration:
 class MergedTree(TreeBuilder):
     """Best-first merging of watershed regions, the leaves of the tree of `leaves`, by learned log odds.
 
-    The table is one leaf. Only the root merges it with other regions.
+    The table is one leaf, with all else that is no object. Only the root merges it with other regions.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
@@ -286,25 +294,25 @@ class MergedTree(TreeBuilder):
         """What is cached depends on the weights."""
         return self.weights_key.encode()
 
-    def regions(self, boundary: np.ndarray, frame: Frame) -> tuple[Tree, Regions]:
-        """The initial tree and its measured leaves."""
-        tree = self.leaves.build(boundary, frame)
-        return tree, measure_regions(tree.leaves, frame, boundary, self.look(frame))
+    def regions(self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray) -> Regions:
+        """The measured leaves; `pixels` (H, W) bool are those of objects."""
+        leaves = object_leaves(self.leaves.build(boundary, frame).leaves, pixels)
+        return measure_regions(leaves, frame, boundary, self.look(frame))
 
-    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         """Build the tree. `odds` are the log odds of each merge, `start` the maximum of their probabilities below."""
         if frame is None:
             raise InputError(
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
             )
         named, _ = self.model()
-        tree, regions = self.regions(boundary, frame)
+        regions = self.regions(boundary, frame, pixels_above_table(frame) if pixels is None else pixels)
         weights, scale = np.array(list(named.values())), scaled_length(1, frame.camera.width)
         growing = Agglomeration(
             regions, lambda a, b, ab, at, bt: pair_features(a, b, ab, at, bt, scale, named) @ weights
         )
         growing.merge_all()
-        return tree_of_merges(regions.of_leaf[tree.leaves], len(regions.sums), growing.merges)
+        return tree_of_merges(regions.image, len(regions.sums), growing.merges)
 
 
 @dataclass(frozen=True)

@@ -25,16 +25,19 @@ import numpy as np
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.scene import (
     Clip,
+    Foreground,
     Frame,
     Hypothesis,
     ObjectRecord,
     VoxelGrid,
     component_key,
+    foreground,
     memo,
+    readings_above_table,
     scaled_area,
     scaled_length,
 )
-from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary, pixels_above_table
+from mstfilter.segmentation.boundary import BoundaryModel, ClipBoundary, ColourDepthBoundary
 from mstfilter.segmentation.cuts import CutSampler, CutValue, MergeLogOdds, optimal_cut
 from mstfilter.segmentation.learned_tree import LearnedTree
 from mstfilter.segmentation.mh import MetropolisHastingsCuts
@@ -54,9 +57,7 @@ _MIN_READINGS = 0.004  # fraction of a region's pixels with a depth reading (the
 class Segments:
     """Object pixels of an image, and the nodes of its tree that are objects."""
 
-    #: (H, W) bool, pixels that can belong to an object: a depth reading above the table and in the workspace, not the
-    #: robot.
-    object_pixels: np.ndarray
+    object_pixels: np.ndarray  #: (H, W) bool, pixels that can belong to an object
     is_object: np.ndarray  #: (N,) bool, whether the node is an object if it is part of a cut
 
 
@@ -67,20 +68,27 @@ class ObjectRule:
     A region is background if most of its readings are on the table, behind it or outside the workspace, or if fewer
     than `min_points` readings remain. These are for an image of 640 x 480 pixels, and scaled by the area of the
     image.
+
+    Parameters
+    ----------
+    min_points : int
+        Readings of the smallest object.
+    mend : bool
+        Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If not,
+        every reading above the table can belong to an object, as published.
     """
 
     min_points: int = 60
+    mend: bool = True
 
-    def object_pixels(self, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-        """Pixels that can belong to an object, (H, W) bool, as `Segments.object_pixels`."""
-        pixels = pixels_above_table(frame)
-        if grid is not None:
-            pixels &= grid.contains(grid.index_of(frame.points))
-        return pixels
+    def foreground(self, frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
+        """The pixels that can belong to an object, and the frame with their depth."""
+        return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
         """Test every node of a tree. Without a grid the workspace is everything above the table."""
-        pixels = self.object_pixels(frame, grid)
+        found = self.foreground(frame, grid)
+        pixels, frame = found.pixels, found.frame
         readings = tree.accumulate_pixels(frame.valid)
         points = tree.accumulate_pixels(pixels)
         core = _core(tree, pixels, max(1, round(scaled_length(_CORE_RADIUS, frame.camera.width))))
@@ -148,28 +156,30 @@ class TreeCutProposal(Proposal):
 
     properly_weighted: ClassVar[bool] = False
 
-    def tree_of(self, frame: Frame) -> tuple[Tree, np.ndarray]:
-        """The tree of a frame and its node values (N,). Cached by content."""
+    def tree_of(self, frame: Frame, grid: VoxelGrid | None = None) -> tuple[Tree, np.ndarray]:
+        """The tree of a frame in a workspace and its node values (N,). Cached by content."""
 
         def compute() -> tuple[Tree, np.ndarray]:
-            tree = self.tree.build(self.boundary.boundary(frame), frame)
-            return tree, self.value.values(tree, frame)
+            found = self.objects.foreground(frame, grid)
+            tree = self.tree.build(self.boundary.boundary(found.frame), found.frame, found.pixels)
+            return tree, self.value.values(tree, found.frame)
 
-        key = (frame.key, component_key((self.boundary, self.tree, self.value)))
+        parts = component_key((self.boundary, self.tree, self.value, self.objects))
+        key = (frame.key, None if grid is None else grid.key, parts)
         return memo("segmentation_tree", key, compute, stored_as=(Tree, np.ndarray))
 
     def of_clip(self, clip: Clip) -> TreeCutProposal:
         """The same proposal with the boundary model of a clip, if the model depends on the clip."""
         return replace(self, boundary=self.boundary.at(clip)) if isinstance(self.boundary, ClipBoundary) else self
 
-    def label_image(self, frame: Frame, cut: np.ndarray | None = None) -> np.ndarray:
+    def label_image(self, frame: Frame, grid: VoxelGrid | None = None, cut: np.ndarray | None = None) -> np.ndarray:
         """(H, W) int32 segments of a cut, 0 background, k + 1 its k-th node; the optimal cut by default."""
-        tree, w = self.tree_of(frame)
-        return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame)
+        tree, w = self.tree_of(frame, grid)
+        return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame, grid)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         frame, grid = observation.after, observation.grid
-        tree, w = self.of_clip(observation).tree_of(frame)
+        tree, w = self.of_clip(observation).tree_of(frame, grid)
         drawn = self.sampler.sample(rng, tree, w, n)
         segments = memo(
             "segments",
@@ -178,7 +188,7 @@ class TreeCutProposal(Proposal):
         )
         particles, counts = complete_segments(
             rng,
-            observation,
+            Clip((self.objects.foreground(frame, grid).frame,), grid, observation.index),
             [cut[segments.is_object[cut]] for cut in drawn.cuts],
             lambda node: tree.mask(node) & segments.object_pixels,
             self.completer,

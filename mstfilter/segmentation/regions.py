@@ -3,8 +3,9 @@
 Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows. Disparity
 is in sensor units (1/8 px at f = 525 px), lengths are in metres.
 
+>>> leaves = object_leaves(watershed, pixels)                 # objects do not share a leaf with the table
 >>> regions = measure_regions(leaves, frame, boundary)
->>> regions.of_leaf[leaf], regions.sums.shape, regions.borders[0]              # region 0 is the table
+>>> regions.sums.shape, regions.borders[0]                    # region 0 is the table
 """
 
 from __future__ import annotations
@@ -13,23 +14,18 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from mstfilter.scene import Frame, scaled_length
-from mstfilter.segmentation.boundary import (
-    TABLE_TOLERANCE,
-    above_table,
-    curvature,
-    filled_disparity,
-    pixels_above_table,
-    posed_camera,
-)
+from mstfilter.scene import Frame, above_table, posed_camera, scaled_area, scaled_length
+from mstfilter.segmentation.boundary import curvature, filled_disparity
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
 HEIGHT_BIN = 0.01
 _BINS = 32
 _QUADRIC = 6
-#: Smallest share of pixels above the table of a leaf that is part of an object.
-_MIXED = 0.1
+_SMALLEST_LEAF, _LEAF_REACH = 20, 4  # pixels of a leaf; distance at which a smaller one joins it
 #: Smallest clear step of disparity, in sensor disparity units.
 _CLEAR_STEP = 4.0
 
@@ -82,58 +78,75 @@ class SeenBorders:
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Measured leaves of a tree. All leaves of the table form one region."""
+    """Measured regions of an image."""
 
-    of_leaf: np.ndarray  #: (n_leaves,) int, region of every leaf; 0 is the table
+    image: np.ndarray  #: (H, W) int, region of every pixel; 0 is the table
     sums: np.ndarray  #: (R, C) columns `REGION`
     #: For each region a mapping from neighbour to the row (columns `BORDER`) of the common border, with the region
     #: as the first of the two.
     borders: list[dict[int, np.ndarray]]
 
 
-def measure_regions(
-    leaves: np.ndarray, frame: Frame, boundary: np.ndarray, seen: SeenBorders | None = None
-) -> Regions:
-    """Measure the leaves (H, W) of a tree of a boundary map (H, W), and what a network sees.
+def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Leaves (H, W) int that do not cross the border of the pixels of objects (H, W) bool; 0 is the other pixels.
 
-    A leaf belongs to the table if most of its pixels do.
+    Each connected part of a leaf is a leaf. Parts of a few pixels join the nearest larger one.
     """
-    width = leaves.shape[1]
-    of_leaf = _region_of_leaf(leaves, frame)
-    region = of_leaf[leaves]
-    n = int(of_leaf.max()) + 1
+    parts = _connected(np.where(pixels, leaves + 1, 0))
+    sizes = np.bincount(parts[pixels], minlength=int(parts.max()) + 1)
+    large = sizes >= scaled_area(_SMALLEST_LEAF, pixels.size)
+    if large.any():
+        near, (rows, columns) = distance_transform_edt(~large[parts], return_indices=True)
+        joins = pixels & (near <= _LEAF_REACH)
+        parts = np.where(joins, parts[rows, columns], parts)
+    numbers = np.zeros(int(parts.max()) + 1, np.int64)
+    used = np.unique(parts[pixels])
+    numbers[used] = np.arange(1, len(used) + 1)
+    return np.where(pixels, numbers[parts], 0)
+
+
+def _connected(image: np.ndarray) -> np.ndarray:
+    """Number (H, W) of the connected part of equal values of an image (H, W) int."""
+    pixel = np.arange(image.size).reshape(image.shape)
+    pairs = [
+        (pixel[a][image[a] == image[b]], pixel[b][image[a] == image[b]])
+        for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
+    ]
+    edges = np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
+    graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(image.size, image.size))
+    return np.asarray(connected_components(graph, directed=False)[1].reshape(image.shape))
+
+
+def measure_regions(
+    region: np.ndarray, frame: Frame, boundary: np.ndarray, seen: SeenBorders | None = None
+) -> Regions:
+    """Measure regions (H, W) int of an image with a boundary map (H, W), and what a network sees.
+
+    Region 0 is the table and all else that is no object; see `object_leaves`.
+    """
+    width = region.shape[1]
+    n = int(region.max()) + 1
     D = filled_disparity(frame)
     hollow, convex = curvature(D, scaled_length(1, width))
     sums = _region_sums(region, n, frame, hollow - convex, seen)
     smooth = cv2.GaussianBlur(D, (0, 0), max(0.7, scaled_length(1.5, width)))
     # The border that the network sees can be beside that of the leaves: the largest log odds in the surroundings.
     reach = 2 * max(1, round(scaled_length(2, width))) + 1
-    odds = np.zeros(leaves.shape, np.float32) if seen is None else seen.border
+    odds = np.zeros(region.shape, np.float32) if seen is None else seen.border
     odds = np.clip(cv2.dilate(odds, np.ones((reach, reach), np.uint8)), -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
     borders = _borders(region, n, np.stack([boundary, hollow, convex, odds], axis=-1), smooth)
     sums[:, REGION["perimeter"].start] = [sum(row[0] for row in near.values()) for near in borders]
-    return Regions(of_leaf, sums, borders)
-
-
-def _region_of_leaf(leaves: np.ndarray, frame: Frame) -> np.ndarray:
-    """Region (n_leaves,) of every leaf; 0 is the table, the others are numbered in order of their leaves."""
-    flat, above, raised = leaves.ravel(), above_table(frame), pixels_above_table(frame)
-    areas = np.bincount(flat)
-    # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
-    # disparity above it) make a leaf an object only if they are the majority.
-    meets = raised & (above < np.inf)
-    is_object = _raised(flat, above, meets, areas, _MIXED) | _raised(flat, above, raised, areas, 0.5)
-    return np.where(is_object, np.cumsum(is_object), 0)
+    return Regions(region, sums, borders)
 
 
 def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, seen: SeenBorders | None) -> np.ndarray:
-    """Sums (n, C), columns `REGION`, over the raised pixels of each region (H, W); the perimeter is missing.
+    """Sums (n, C), columns `REGION`, over the readings of each region (H, W); the perimeter is missing.
 
     `bend` (H, W) is the concave minus the convex curvature.
     """
     height, width = region.shape
     sums = np.zeros((n, sum(_WIDTHS.values())))
-    at = np.nonzero(pixels_above_table(frame) & (region > 0))
+    at = np.nonzero(frame.valid & (region > 0))
     which = region[at]
 
     def put(name: str, *values: np.ndarray) -> None:
@@ -160,14 +173,6 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
     bins = np.clip(points[:, 2] / HEIGHT_BIN, 0, _BINS - 1).astype(np.int64)
     sums[:, REGION["heights"]] = np.bincount(which * _BINS + bins, minlength=n * _BINS).reshape(n, _BINS)
     return sums
-
-
-def _raised(flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.ndarray, fraction: float) -> np.ndarray:
-    """Leaves with more than this fraction of pixels in the mask, and a mean height there above 1.75 tolerances."""
-    inside = np.bincount(flat[mask.ravel()], minlength=len(areas))
-    rise = np.bincount(flat[mask.ravel()], weights=np.minimum(above[mask], 1e3), minlength=len(areas))
-    raised: np.ndarray = (inside > fraction * areas) & (rise > 1.75 * TABLE_TOLERANCE * inside)
-    return raised
 
 
 def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:

@@ -178,7 +178,13 @@ class Tree:
         return inside[self.leaves]
 
 
-def _check_tree(self: TreeBuilder, found: Tree, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+def _check_tree(
+    self: TreeBuilder,
+    found: Tree,
+    boundary: np.ndarray,
+    frame: Frame | None = None,
+    pixels: np.ndarray | None = None,
+) -> Tree:
     check_type(found, Tree, "a Tree")
     if found.leaves.shape != boundary.shape:
         raise InputError(f"returns a tree of an image of shape {found.leaves.shape}, expected {boundary.shape}")
@@ -190,8 +196,12 @@ class TreeBuilder(Checked, ABC):
 
     @returns(_check_tree)
     @abstractmethod
-    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
-        """The tree of a boundary map (H, W). Some builders also need the frame."""
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
+        """The tree of a boundary map (H, W).
+
+        Some builders also need the frame, and use the pixels (H, W) bool that can belong to objects. By default,
+        these are `pixels_above_table`.
+        """
 
 
 @dataclass(frozen=True)
@@ -215,7 +225,7 @@ class UcmTree(TreeBuilder):
     centre: float = 0.55
     slope: float = 12.0
 
-    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         boundary = np.asarray(boundary)
         if boundary.ndim != 2 or boundary.size == 0:
             raise InputError(f"boundary map has shape {boundary.shape}, expected (H, W)")

@@ -63,7 +63,7 @@ def test_guesses_are_not_added_up():
 
 
 def test_hidden_objects_stay_until_the_frame_sees_through_them():
-    update, clip = PartitionUpdate(), clip_of(TWO)
+    update, clip = PartitionUpdate(mend=False), clip_of(TWO)  # `mend` would see the object by its colour
     state = step(update, clip, sample_of(clip, masks_of(TWO, clip.after))).particles[0]
     identity = state.record(2).id
     # In front of the second object the frame has no readings: nothing says that it is gone.

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mstfilter.errors import InputError
-from mstfilter.scene import Camera, Frame, render
+from mstfilter.scene import Camera, Frame, pixels_above_table, render
 from mstfilter.segmentation import (
     EVIDENCE_FEATURES,
     FEATURES,
@@ -24,7 +24,7 @@ from mstfilter.segmentation import (
 )
 from mstfilter.segmentation.border_network import BORDER_ARCHITECTURE, IMAGE_CHANNELS, BorderNet
 from mstfilter.segmentation.learned_tree import Agglomeration, quadric_residual, tree_of_merges
-from mstfilter.segmentation.regions import BORDER, REGION, measure_regions
+from mstfilter.segmentation.regions import BORDER, REGION, measure_regions, object_leaves
 from mstfilter.trained import write_model
 from tests.segmentation.scenes import GRID, TOUCHING, TWO, camera, frame_of
 
@@ -35,6 +35,7 @@ def measured(n: int = 6, seed: int = 0):
     height, width = frame.depth.shape
     leaves = (np.arange(height) * n // height)[:, None] * n + np.arange(width) * n // width
     boundary = np.random.default_rng(seed).random(frame.depth.shape)
+    leaves = object_leaves(leaves, pixels_above_table(frame))
     return leaves, measure_regions(leaves, frame, boundary), frame, boundary
 
 
@@ -42,8 +43,7 @@ def test_sums_of_merged_regions_are_the_sums_of_the_merged_image():
     leaves, regions, frame, boundary = measured()
     a, b = next((i, j) for i in range(1, len(regions.sums)) for j in regions.borders[i] if j > i)
     together = leaves.copy()
-    first, second = (int(np.flatnonzero(regions.of_leaf == r)[0]) for r in (a, b))
-    together[leaves == second] = first
+    together[leaves == b] = a
     merged = measure_regions(np.unique(together, return_inverse=True)[1].reshape(leaves.shape), frame, boundary)
     growing = Agglomeration(regions, lambda *pair: np.zeros(len(pair[0])))
     new = growing.merge(a, b, 0.0)
@@ -140,10 +140,10 @@ def test_perfect_evidence_tells_pairs_of_objects_from_parts():
     boundary = ColourDepthBoundary().boundary(frame)
     h, w = truth.shape
     blocks = (np.arange(h) // 12)[:, None] * 40 + np.arange(w) // 12 + 2000 * truth
-    leaves = np.unique(blocks, return_inverse=True)[1].reshape(truth.shape)
+    leaves = np.unique(np.where(truth > 0, blocks, 0), return_inverse=True)[1].reshape(truth.shape)
     regions = measure_regions(leaves, frame, boundary, seen)
     object_of = np.zeros(len(regions.sums), np.int64)
-    object_of[regions.of_leaf[leaves]] = truth
+    object_of[leaves] = truth
     found = {True: [], False: []}
     for i in range(1, len(regions.sums)):
         for j in regions.borders[i]:

@@ -1,9 +1,10 @@
-"""Five real frames of five camera set-ups (the package's constants were chosen on them, among others)."""
+"""Real frames. The constants of the package were chosen on those of `osd_learn`, among others."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from mstfilter import open_recording
 from mstfilter.scene import Camera, Frame
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation.proposal import TreeCutProposal
@@ -26,3 +27,16 @@ def test_optimal_cut_beats_components_on_touching_objects(shared_data):
         floor.append(weighted_coverage(components, truth))
     assert np.mean(cut) > 0.85
     assert np.mean(cut) > np.mean(floor) + 0.2
+
+
+def test_a_toy_in_full_view_is_one_object(shared_data):
+    """A white toy touches a stick at some pauses, and a thin board lies on the table."""
+    recording = open_recording(shared_data("real/jack"))
+    on_toy = ((312, 337), (329, 315), (291, 304), (353, 310), (393, 300))  # column and row at each pause
+    for clip, (column, row) in zip(recording.clips(), on_toy, strict=True):
+        labels = TreeCutProposal().label_image(clip.after, clip.grid)
+        toy = labels == labels[row, column]
+        assert labels[row, column] > 0
+        assert 1500 < toy.sum() < 6000, clip.index
+        rows, columns = np.nonzero(toy)
+        assert np.ptp(rows) < 110 and np.ptp(columns) < 110, clip.index

@@ -43,7 +43,7 @@ class MyUpdate(Update):
         """The result may have any number of particles; `predicted` or `proposed` may be None, but not both."""
         population = union(predicted, proposed)
         frame = observation.after
-        seen = ObjectRule().object_pixels(frame, observation.grid)  # (H, W) bool
+        seen = ObjectRule().foreground(frame, observation.grid).pixels  # (H, W) bool
         scores = []
         for hypothesis in population.particles:
             covered = project(hypothesis, frame.camera) > 0

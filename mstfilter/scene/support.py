@@ -1,0 +1,235 @@
+"""What stands on the table: the pixels of objects in a depth image with noise and missing readings.
+
+>>> found = foreground(frame, grid)
+>>> found.pixels                        # (H, W) bool, may belong to an object
+>>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading
+
+Depth decides where it is measured: a reading on the table never belongs to an object. Readings above the table are
+noise of the sensor unless they form a region. Dark and shiny surfaces and glare have no readings, and there colour
+decides: a pixel without a reading belongs to an object if its colour is not that of the table around it. The table is
+z = 0 if the camera has a pose, else the plane that contains the most readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from mstfilter.scene.arrays import read_only
+from mstfilter.scene.cache import memo
+from mstfilter.scene.camera import Camera, scaled_area, scaled_length
+from mstfilter.scene.frame import Frame
+from mstfilter.scene.geometry import fit_support_plane, table_residual
+from mstfilter.scene.voxels import VoxelGrid
+
+#: Readings up to this much above the table are table, in sensor disparity units.
+TABLE_TOLERANCE = 2.0
+# Areas and lengths are those of an image of 640 x 480 pixels.
+_DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
+_SMALLEST = 25  # pixels of a region of readings
+_RISE = 1.75  # mean rise of a region of readings, in tolerances
+_SMALLEST_DARK = 60  # pixels of a region without readings
+_COLOUR_REACH = 40.0  # standard deviation of the surroundings that show the colour of the table, pixels
+_EMPTY = 0.05  # share of readings of a row or column in the margin of the image, at most
+_TABLE_NEAR = 0.1  # share of table in these surroundings
+_COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the table; 1 % of its pixels are above
+_COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
+_ON_TABLE = 0.4  # share of table around a region without readings
+_FEW = 10  # readings of an object that do not determine the depth of its other pixels
+_STANDS = 0.004  # metres: estimated readings are at least this much nearer than the table
+
+
+@dataclass(frozen=True, eq=False)
+class Foreground:
+    """The pixels that can belong to objects, and the frame with their depth."""
+
+    pixels: np.ndarray  #: (H, W) bool
+    frame: Frame  #: the frame; pixels of objects without a reading have an estimated depth
+
+
+def above_table(frame: Frame) -> np.ndarray:
+    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
+
+    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
+    most readings.
+    """
+    return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
+
+
+def filled_above_table(frame: Frame) -> np.ndarray:
+    """`above_table`, filled from the nearest reading if depth has holes everywhere (sparse sensors)."""
+    height = above_table(frame)
+    beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
+    return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
+
+
+def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Depth (H, W) with the pixels of `holes` set to the nearest reading."""
+    if not holes.any() or holes.all():
+        return depth
+    rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
+    return np.asarray(depth[rows, columns])
+
+
+def posed_camera(frame: Frame) -> Camera:
+    """The camera of a frame; without a pose, with that relative to the fitted table (`fit_support_plane`)."""
+    camera = frame.camera
+    return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
+
+
+def pixels_above_table(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) with a reading above the table that is not on the robot."""
+    with np.errstate(invalid="ignore"):
+        return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
+
+
+def readings_above_table(frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
+    """Those of `pixels_above_table` with a reading in the grid, (H, W) bool. Without a grid, all of them."""
+    pixels = pixels_above_table(frame)
+    return pixels if grid is None else pixels & grid.contains(grid.index_of(frame.points))
+
+
+def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
+    """The pixels of objects in the workspace, and their depth. Cached by content.
+
+    Parameters
+    ----------
+    frame : Frame
+        The image.
+    grid : VoxelGrid
+        The workspace. Without one, objects are everywhere above the table.
+    """
+    key = (frame.key, None if grid is None else grid.key)
+    return memo("foreground", key, lambda: _foreground(frame, grid))
+
+
+def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
+    measured = _regions_of_readings(frame, grid)
+    pixels = _joined(frame, measured, _silent(frame))
+    depth = _with_estimates(frame, pixels)
+    return Foreground(read_only(pixels), frame if depth is None else replace(frame, depth=depth))
+
+
+def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
+    """Readings (H, W) bool that form a region above the table."""
+    raised = readings_above_table(frame, grid)
+    height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
+    solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
+    core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    regions, n = ndimage.label(core)
+    area = np.bincount(regions.ravel(), minlength=n + 1)
+    rise = np.bincount(regions.ravel(), weights=height.ravel(), minlength=n + 1)
+    kept = (area >= scaled_area(_SMALLEST, raised.size)) & (rise > _RISE * TABLE_TOLERANCE * area)
+    kept[0] = False
+    return (cv2.dilate(kept[regions].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & raised
+
+
+def _on_table(frame: Frame) -> np.ndarray:
+    """Readings (H, W) bool of the table."""
+    with np.errstate(invalid="ignore"):
+        return frame.valid & (np.abs(above_table(frame)) <= TABLE_TOLERANCE)
+
+
+def _without_readings(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) bool without a reading that do not show the robot."""
+    missing = ~np.isfinite(frame.depth)
+    return missing if frame.robot_mask is None else missing & ~frame.robot_mask
+
+
+def _silent(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) bool without a reading, and with another colour than the table around them."""
+    width, table = frame.camera.width, _on_table(frame)
+    lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
+    lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, width)))
+    share = _surroundings(table.astype(np.float32), width)
+    n = np.maximum(share, 1e-6)[..., None]
+    mean = _surroundings(lab * table[..., None], width) / n
+    variance = np.maximum(_surroundings(lab**2 * table[..., None], width) / n - mean**2, 0) + _COLOUR_NOISE
+    other = (((lab - mean) ** 2 / variance).sum(axis=-1) > _COLOUR_DISTANCE) & (share > _TABLE_NEAR)
+    silent = (_without_readings(frame) & other & _measured_part(frame)).astype(np.uint8)
+    return cv2.morphologyEx(silent, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+
+
+def _measured_part(frame: Frame) -> np.ndarray:
+    """The rectangle of the image (H, W) bool in which the sensor has readings; registered depth has empty margins."""
+    part = np.zeros(frame.depth.shape, bool)
+    rows, columns = (np.flatnonzero(frame.valid.mean(axis=axis) >= _EMPTY) for axis in (1, 0))
+    if len(rows) and len(columns):
+        part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    return part
+
+
+def _surroundings(image: np.ndarray, width: int) -> np.ndarray:
+    """Mean of an image (H, W, ...) around each pixel; computed at a quarter of the resolution."""
+    size = image.shape[1], image.shape[0]
+    small = cv2.resize(image, (max(1, size[0] // 4), max(1, size[1] // 4)), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(
+        small, (0, 0), max(1.0, scaled_length(_COLOUR_REACH, width) / 4), borderType=cv2.BORDER_CONSTANT
+    )
+    return cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
+
+
+def _joined(frame: Frame, measured: np.ndarray, silent: np.ndarray) -> np.ndarray:
+    """Readings of objects, and the regions without readings that touch them or stand on the table by themselves."""
+    either = (measured | silent).astype(np.uint8)
+    closed = cv2.morphologyEx(either, cv2.MORPH_CLOSE, _ellipse(scaled_length(2, frame.camera.width))) > 0
+    regions, n = ndimage.label(closed & (measured | _without_readings(frame)))
+    kept = np.zeros(n + 1, bool)
+    kept[regions[measured]] = True
+    table = _on_table(frame)
+    for k, box in enumerate(ndimage.find_objects(regions), start=1):
+        kept[k] |= not kept[k] and _stands_alone(regions, k, box, table)
+    kept[0] = False
+    return np.asarray(kept[regions])
+
+
+def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: np.ndarray) -> bool:
+    """Whether region `k` of an image (H, W), which has no readings, is large enough and surrounded by the table."""
+    height, width = regions.shape
+    reach = max(1, round(scaled_length(4, width)))
+    rows, columns = box
+    if (regions[box] == k).sum() < scaled_area(_SMALLEST_DARK, regions.size):
+        return False
+    if min(rows.start, columns.start, height - rows.stop, width - columns.stop) < reach:
+        return False  # the sensor has no readings at the rim of the image
+    around = (slice(rows.start - reach, rows.stop + reach), slice(columns.start - reach, columns.stop + reach))
+    inside = regions[around] == k
+    ring = (cv2.dilate(inside.astype(np.uint8), _ellipse(reach)) > 0) & ~inside
+    return bool(table[around][ring].mean() >= _ON_TABLE)
+
+
+def _ellipse(radius: float) -> np.ndarray:
+    size = 2 * max(1, round(radius)) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+
+
+def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
+    """Depth (H, W) with estimates at pixels of objects without a reading; None if all of them have one.
+
+    An estimate is the nearest reading of the object in the image, but not behind the table. An object without
+    readings stands upright where its lowest pixels see the table.
+    """
+    if not (pixels & ~frame.valid).any():
+        return None
+    camera = posed_camera(frame)
+    down = camera.rays() @ camera.pose.as_matrix()[2, :3]
+    with np.errstate(divide="ignore"):
+        table = np.where(down < 0, -camera.position[2] / down, np.inf)
+    depth = np.array(frame.depth)
+    regions, _ = ndimage.label(pixels)
+    for k, box in enumerate(ndimage.find_objects(regions), start=1):
+        inside = regions[box] == k
+        known, missing = inside & frame.valid[box], inside & ~frame.valid[box]
+        if missing.any():
+            found = fill_from_nearest(depth[box], ~known) if known.sum() >= _FEW else _at_base(table[box], inside)
+            depth[box][missing] = np.minimum(found, table[box] - _STANDS)[missing]
+    return depth
+
+
+def _at_base(table: np.ndarray, inside: np.ndarray) -> float:
+    """Depth of the table (h, w) at the lowest pixels inside."""
+    lowest = np.flatnonzero(inside.any(axis=1))[-1]
+    return float(np.median(table[lowest][inside[lowest]]))

@@ -1,0 +1,85 @@
+"""Pixels of objects, and their depth where the sensor has none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from mstfilter.scene import Frame, foreground, pixels_above_table, readings_above_table, render
+from tests.segmentation.scenes import GRID, TWO, camera, frame_of
+
+SEEN = render(TWO, GRID, camera(640)).labels
+
+
+def without(frame: Frame, holes: np.ndarray, colour: tuple[int, int, int] | None = None) -> Frame:
+    """The frame without readings in some pixels, perhaps of another colour."""
+    rgb = np.array(frame.rgb)
+    if colour is not None:
+        rgb[holes] = colour
+    return Frame(rgb, np.where(holes, np.nan, frame.depth).astype(np.float32), frame.camera)
+
+
+def share(found: np.ndarray, true: np.ndarray) -> float:
+    return float((found & true).sum() / true.sum())
+
+
+def test_without_noise_the_readings_above_the_table_are_the_foreground():
+    frame = frame_of(TWO, width=640)
+    found = foreground(frame, GRID)
+    assert found.frame is frame
+    assert (found.pixels != readings_above_table(frame, GRID)).sum() < 20  # single pixels at corners
+
+
+def test_noise_on_the_table_is_no_object():
+    frame = frame_of(TWO, width=640, noise=0.9)
+    table = SEEN == 0
+    assert (pixels_above_table(frame) & table).sum() > 500
+    found = foreground(frame, GRID).pixels
+    assert (found & table).sum() < 50
+    assert share(found, SEEN > 0) > 0.9
+
+
+@pytest.mark.parametrize("part", ["all of an object", "its middle"])
+def test_an_object_without_readings_is_found_by_its_colour(part):
+    frame = frame_of(TWO, width=640, noise=0.3)
+    holes = SEEN == 1
+    if part == "its middle":
+        rows, columns = np.nonzero(holes)
+        middle = np.hypot(np.arange(480)[:, None] - rows.mean(), np.arange(640)[None] - columns.mean())
+        holes &= middle < 25
+    found = foreground(without(frame, holes), GRID)
+    assert share(found.pixels, SEEN == 1) > 0.95
+    error = np.abs(found.frame.depth - frame.depth)[holes & found.pixels]
+    # The readings of the other pixels are near; an object without any stands at its lowest pixels.
+    assert np.median(error) < (0.05 if part == "its middle" else 0.12)
+    assert np.array_equal(found.frame.depth[~holes], frame.depth[~holes])
+
+
+def test_a_hole_in_the_table_is_no_object():
+    frame = frame_of(TWO, width=640, noise=0.3)
+    holes = np.zeros(SEEN.shape, bool)
+    holes[380:420, 300:360] = True  # on the table, before the objects
+    assert not foreground(without(frame, holes), GRID).pixels[holes].any()
+    assert foreground(without(frame, holes, (20, 20, 20)), GRID).pixels[holes].mean() > 0.9
+
+
+def test_empty_margins_of_registered_depth_are_no_objects():
+    frame = frame_of(TWO, width=640, noise=0.3)
+    margin = np.zeros(SEEN.shape, bool)
+    margin[:, :15] = margin[:12] = True
+    assert not foreground(without(frame, margin, (10, 10, 10)), GRID).pixels[margin].any()
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 1000), missing=st.floats(0, 0.9), noise=st.floats(0, 1))
+def test_measured_depth_stays_and_estimates_are_above_the_table(seed, missing, noise):
+    frame = frame_of(TWO, width=160, noise=noise)
+    blocks = np.random.default_rng(seed).random((12, 16)) < missing
+    holed = without(frame, np.kron(blocks, np.ones((10, 10))) > 0)
+    found = foreground(holed, GRID)
+    measured = np.isfinite(holed.depth)
+    np.testing.assert_array_equal(found.frame.depth[measured], holed.depth[measured])
+    assert not (found.pixels & measured & ~readings_above_table(holed, GRID)).any()
+    assert np.isfinite(found.frame.depth[found.pixels]).all()
+    assert (found.frame.points[..., 2][found.pixels & ~measured] > 0).all()
