@@ -167,6 +167,8 @@ _PACKAGES = {
     "onnxruntime": "'mstfilter[onnx]'",
     "dask.distributed": "'mstfilter[dask]'",
     "rerun-sdk": "'mstfilter[viewer]'",
+    "pandas": "'mstfilter[xarray]'",
+    "xarray": "'mstfilter[xarray]'",
 }
 
 

@@ -24,11 +24,12 @@ import functools
 import math
 import types
 import typing
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
-from mstfilter.errors import check_choice, check_component, check_integer, check_number
+from mstfilter.errors import InputWarning, check_choice, check_component, check_integer, check_number
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,9 @@ def _checks(cls: Any) -> tuple[tuple[str, _Check], ...]:
     """Names of the checked fields of a dataclass, with their checks."""
     try:
         hints = typing.get_type_hints(cls, include_extras=True)
-    except NameError:  # names that only a function or a type checker knows: a class of a user
+    except NameError as error:  # a name that only a function or a type checker knows
+        fact = f"the fields of {cls.__qualname__} are not checked, as an annotation has an unknown name: {error}"
+        warnings.warn(InputWarning(fact, "define or import the name in the module of the class"), stacklevel=4)
         return ()
     found = ((field.name, _check_of(hints[field.name])) for field in fields(cls))
     return tuple((name, check) for name, check in found if check is not None)

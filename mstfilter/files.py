@@ -276,18 +276,6 @@ _UNREADABLE = (
 )
 
 
-def folder_name(name: str) -> str:
-    """A name of a folder for any text, different for different texts on every file system.
-
-    Lower-case letters, digits, ``_`` and ``-`` stay. Other texts, long ones and names that Windows reserves become
-    such letters, ``~`` and a hash.
-    """
-    plain = re.sub(r"[^a-z0-9_-]+", "_", name.lower())[:60]
-    if plain == name and name and not re.fullmatch(r"con|prn|aux|nul|(com|lpt)[0-9]", name):
-        return name
-    return f"{plain}~{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:12]}"
-
-
 @contextmanager
 def writing(what: str, *hints: str) -> Iterator[None]:
     """Turn errors of the disk in a block that writes `what` into InputError."""

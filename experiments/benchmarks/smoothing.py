@@ -18,11 +18,9 @@ from mstfilter.files import write_csv
 from mstfilter.smc import Dynamics, backward_paths, bootstrap, genealogy, keep
 from mstfilter.smc.exact import kalman_filter
 
-BOUND = -np.log(SIGMA * np.sqrt(2 * np.pi))
 #: Ours by name, with the method of `particles` that does the same.
 METHODS = {
     "exact": ({}, "ON2"),
-    "rejection": ({"method": "rejection", "log_bound": BOUND}, "reject"),
     "mcmc": ({"method": "mcmc"}, "mcmc"),
     "mcmc, 3 steps": ({"method": "mcmc", "steps": 3}, None),
 }

@@ -295,7 +295,6 @@ def values() -> Iterator[tuple[str, Any, Any, Any]]:
             yield f"gaussian {width} of {example.__name__}", smc.Gaussian(width), example, None
     for function in (predictive, lambda x, y: np.zeros(len(x)), lambda x, y: -np.abs(x - y)):
         yield "priority", smc.PriorityLookahead(function), numbers, None
-    yield "program lookahead", smc.ProgramLookahead(ar1_program, 0.5), traces, None
 
 
 PARTS = {f.__name__: f for f in (values, proposals, updates, rejuvenations, transitions, resamplers)}

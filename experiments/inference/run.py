@@ -83,20 +83,18 @@ def thinned(chain: np.ndarray, discard: int, thin: int) -> np.ndarray:
 
 
 def pmmh_draws(seeds: list[int]) -> list[np.ndarray]:
-    """Posterior draws (DRAWS, 2) of each data set; all chains move in one sweep of filters."""
-    data = [simulate(seed) for seed in seeds]
-    start = np.array([(rho, np.log(sigma)) for _, _, (rho, sigma) in data])
+    """Posterior draws (DRAWS, 2) of each data set."""
 
     def of_log(theta: np.ndarray) -> ParticleFilter:
         return filter_of((theta[0], np.exp(theta[1])), PMMH["n"])
 
-    n_iterations = PMMH["discard"] + DRAWS * PMMH["thin"]
-    observations = [ys for _, ys, _ in data]
-    chains = pmmh(
-        of_log, observations, log_prior, start, [0.35, 0.4], n_iterations, seeds[0], batched=True, paired=True
-    )
-    draws = thinned(chains.theta, PMMH["discard"], PMMH["thin"])
-    return [np.stack([draws[:, r, 0], np.exp(draws[:, r, 1])], axis=1) for r in range(len(seeds))]
+    n_iterations, found = PMMH["discard"] + DRAWS * PMMH["thin"], []
+    for seed in seeds:
+        _, ys, (rho, sigma) = simulate(seed)
+        chain = pmmh(of_log, ys, log_prior, [rho, np.log(sigma)], [0.35, 0.4], n_iterations, seed)
+        draws = thinned(chain.theta[:, 0], PMMH["discard"], PMMH["thin"])
+        found.append(np.stack([draws[:, 0], np.exp(draws[:, 1])], axis=1))
+    return found
 
 
 def gibbs_draws(seeds: list[int]) -> list[np.ndarray]:

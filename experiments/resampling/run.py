@@ -57,19 +57,13 @@ def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Ite
         if scheme in left_out:
             continue
         filter = make(world, resampler, n)
-        runs = run_many(
-            filter,
-            [d.observations for d in data],
-            seeds,
-            paired=True,
-            log_evidence=log_evidence,
-            estimate=lambda state, info: world.estimate(state.population),
-        )
-        errors = np.abs(runs["estimate"] - answers)
+        collectors = {"z": log_evidence, "estimate": lambda state, info: world.estimate(state.population)}
+        runs = [run_many(filter, d.observations, [seed], **collectors) for seed, d in zip(seeds, data, strict=True)]
+        errors = np.abs(np.concatenate([run["estimate"] for run in runs]) - answers)
         errors = errors if errors.ndim == 2 else 0.5 * errors.sum(axis=2)
-        found = {"lost": np.isin(seeds, list(runs.lost)), "state_error": errors.mean(axis=1)}
+        found = {"lost": np.array([bool(run.lost) for run in runs]), "state_error": errors.mean(axis=1)}
         if filter.properly_weighted:
-            found["log_evidence_error"] = runs["log_evidence"][:, -1] - exact
+            found["log_evidence_error"] = np.array([run["z"][0, -1] for run in runs]) - exact
             found["evidence_ratio"] = np.exp(found["log_evidence_error"])
         for seed in seeds:
             mine = {measure: float(values[seed]) for measure, values in found.items()}

@@ -49,7 +49,6 @@ def filters(n: int) -> dict:
     return {
         "bootstrap": program.bootstrap(n),
         "guided": program.guided(guide, n),
-        "auxiliary": program.auxiliary(n, power=0.5),
         "resample-move": program.resample_move(n, steps=2),
     }
 

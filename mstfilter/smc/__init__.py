@@ -26,11 +26,11 @@
 `exact`                 linear-Gaussian and finite models with exact answers
 `gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
-`distributions`         distributions for models; adapters for those of scipy and torch
+`distributions`         distributions for models; an adapter for those of scipy
 `smoothing`             states given all observations
 `conditional`           paths of states by conditional SMC, one at a time
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
-`diagnostics`           energy distances, coalescence and variance of a run, scores against the truth
+`diagnostics`           variance of the estimates of a run, energy distances of populations
 `export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """

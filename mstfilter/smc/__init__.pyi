@@ -13,24 +13,15 @@ from mstfilter.smc.components import (
 )
 from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
 from mstfilter.smc.diagnostics import (
-    Coalescence as Coalescence,
-    Measured as Measured,
     RunVariance as RunVariance,
-    coalescence as coalescence,
     energy_distance as energy_distance,
-    log_score as log_score,
-    pit as pit,
     run_variance as run_variance,
-    selection_distance as selection_distance,
-    set_energy_score as set_energy_score,
 )
 from mstfilter.smc.distributions import (
     Bernoulli as Bernoulli,
     Categorical as Categorical,
-    Gamma as Gamma,
     MultivariateNormal as MultivariateNormal,
     Normal as Normal,
-    Poisson as Poisson,
     Student as Student,
     Uniform as Uniform,
     as_distribution as as_distribution,
@@ -64,10 +55,8 @@ from mstfilter.smc.history import (
     ess as ess,
     log_evidence as log_evidence,
     mean as mean,
-    n_particles as n_particles,
     resampled as resampled,
     unique_ancestors as unique_ancestors,
-    weight_entropy as weight_entropy,
 )
 from mstfilter.smc.inference import (
     Chains as Chains,
@@ -109,13 +98,10 @@ from mstfilter.smc.population import (
 )
 from mstfilter.smc.programs.filters import (
     Program as Program,
-    ProgramLookahead as ProgramLookahead,
     ProgramMove as ProgramMove,
 )
 from mstfilter.smc.programs.sites import (
-    Trace as Trace,
     observe as observe,
-    per_particle as per_particle,
     sample as sample,
     switch as switch,
 )
@@ -135,7 +121,6 @@ from mstfilter.smc.smoothing import (
     fixed_lag as fixed_lag,
     genealogy as genealogy,
     keep as keep,
-    paris as paris,
 )
 from mstfilter.smc.state_space import (
     Dynamics as Dynamics,

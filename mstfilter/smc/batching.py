@@ -6,12 +6,10 @@ The components are called once per step with the particles of all runs, as one p
 done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
 programs). A component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its
 arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
-Observations and inputs that differ between runs are repeated for each row.
 
 This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
-compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a call for
-them in another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if
-they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
+compared with a call for that run alone. If they differ, a component that states ``batched=True`` raises InputError.
+Otherwise, and if they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
 """
 
 from __future__ import annotations
@@ -31,20 +29,8 @@ from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence,
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import Info, State, WeightResampler
 from mstfilter.smc.population import Population, identity
-from mstfilter.smc.streams import (
-    Key,
-    RunGenerators,
-    by_run,
-    flat,
-    generators_of_step,
-    of_runs,
-    resampled_runs,
-    rows_of,
-    summaries,
-)
+from mstfilter.smc.streams import Key, RunGenerators, RunKeys, each_array, of_runs, rows_of, summaries
 
-#: Runs that are compared with a call for the runs in another order.
-_MOST_COMPARED = 64
 #: Steps at which runs are compared: the Pell numbers 0, 1, 2, 5, 12, 29, 70, ... Unlike powers of two, they also find
 #: a fault of every third step.
 _COMPARED_STEPS = frozenset(round((1 + math.sqrt(2)) ** k / math.sqrt(8)) for k in range(40))
@@ -90,13 +76,13 @@ def check_together(filter: ParticleFilter) -> None:
 
 def run_together(
     filters: RunFilters,
-    ys: list[list[Any]],
+    ys: list[Any],
     seeds: list[int],
     collectors: Mapping[str, Collector],
     check: bool = True,
     rounding: bool = False,
 ) -> list[Collected]:
-    """The runs of some seeds; `ys` has one sequence of observations for all runs, or one for each.
+    """The runs of some seeds with the observations `ys`.
 
     Without `check`, runs are not compared with single runs; with `rounding`, differences by rounding are accepted.
 
@@ -123,7 +109,7 @@ class _Sweep:
     def __init__(
         self,
         filters: RunFilters,
-        ys: list[list[Any]],
+        ys: list[Any],
         seeds: list[int],
         collectors: Mapping[str, Collector],
         check: bool,
@@ -131,9 +117,10 @@ class _Sweep:
     ) -> None:
         self.filters, self.filter, self.seeds, self.collectors = filters, filters.one(0), seeds, collectors
         self.check, self.rounding = check, rounding
-        self.given = [[split_input(y) for y in run] for run in ys]
-        self.n_steps = len(ys[0])
+        self.given = [split_input(y) for y in ys]
+        self.n_steps = len(ys)
         self.keys = [Key(seed) for seed in seeds]
+        self.streams = RunKeys(self.keys)
         self.runs = np.arange(len(seeds))  # the run of each row
         self.particles: Any = None
         self.log_weights = self.ess = self.log_mean = np.zeros(0)  # the last two after the last update
@@ -171,7 +158,7 @@ class _Sweep:
                 self.select(t)
             if filter.transition is not None:
                 self.call(t, "transition")
-        if filter.update is not None and self.observed(t) and len(self.runs):
+        if filter.update is not None and self.given[t][0] is not None and len(self.runs):
             self.call(t, "update")
         if len(self.runs):
             top = self.top[1] if self.top[0] is self.log_weights else None
@@ -179,41 +166,12 @@ class _Sweep:
         if filter.resample == "after" and len(self.runs):
             self.select(t)
 
-    # --- observations ---------------------------------------------------------------------------------------------
-    def of_run(self, t: int, row: int) -> tuple[Any, Any]:
-        """Observation and input of one run."""
-        return self.given[self.runs[row] % len(self.given)][t]
-
-    def observed(self, t: int) -> bool:
-        """Whether step t has observations."""
-        missing = {self.of_run(t, row)[0] is None for row in range(len(self.runs) if len(self.given) > 1 else 1)}
-        if len(missing) > 1:
-            raise NotTogether("observations", f"step {t}: some runs have an observation and others have none")
-        return missing == {False}
-
-    def by_row(self, rows: np.ndarray, t: int, which: int) -> Any:
-        """Observation or input of all runs, or one for each row of particles."""
-        if len(self.given) == 1:
-            return self.given[0][t][which]
-        found = [self.of_run(t, row)[which] for row in rows.tolist()]
-        if all(value is None for value in found):
-            return None
-        try:
-            values = np.stack([np.asarray(value) for value in found])
-            numbers = values.dtype.kind in "biufc"
-        except ValueError:
-            numbers = False
-        if not numbers:
-            what = ("observations", "inputs")[which]
-            raise NotTogether(what, f"step {t}: the {what} of the runs are not numbers or arrays of one shape")
-        return np.repeat(values, self.filter.n, axis=0).view(rows_of(self.filter.n))
-
     # --- calls of components --------------------------------------------------------------------------------------
     def call(self, t: int, slot: str) -> None:
         """Call a component for all runs; those that it loses are removed."""
         rows = np.arange(len(self.runs))
         try:
-            particles, log_weights = self.of_rows(t, slot, rows)
+            particles, log_weights = self.together(t, slot)
         except NotTogether:
             raise
         except LostRunError:  # all weights of all runs are 0
@@ -236,27 +194,28 @@ class _Sweep:
             self.runs, self.resampled = self.runs[rows], self.resampled[rows]
             self.ancestors = None if self.ancestors is None else self.ancestors[rows]
 
-    def of_rows(self, t: int, slot: str, rows: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Particles and log weights of a component that is called once for the given rows, in their order."""
-        runs, n = self.runs[rows], self.filter.n
-        y, u = (self.by_row(rows, t, k) for k in (0, 1))
-        component = getattr(self.filters.rows(runs).at_step(t, u), slot)
-        rng = RunGenerators(self.generators(t, slot, rows), n) if component.draws else None
-        population, log_weights = None, self.log_weights
+    def together(self, t: int, slot: str) -> tuple[Any, np.ndarray]:
+        """Particles and log weights of a component that is called once for all runs."""
+        (y, u), n = self.given[t], self.filter.n
+        component = getattr(self.filters.rows(self.runs).at_step(t, u), slot)
+        rng = RunGenerators(self.streams.generators(slot, t, self.runs), n) if component.draws else None
+        population = None
         if slot != "initial":
-            everything = len(rows) == len(self.runs) and rows[0] == 0
-            particles = self.particles if everything else of_runs(self.particles, rows)
-            log_weights = self.log_weights if everything else self.log_weights[rows]
-            population = Population.unchecked(flat(particles, n), log_weights.ravel())
-        found = _called(slot, component, rng, population, y, len(rows) * n)
-        if len(found) != len(rows) * n:
-            raise InputError(f"{len(rows) * n} particles became {len(found)}")
+            population = Population.unchecked(self.flat(self.particles), self.log_weights.ravel())
+        found = _called(slot, component, rng, population, y, len(self.runs) * n)
+        if len(found) != len(self.runs) * n:
+            raise InputError(f"{len(self.runs) * n} particles became {len(found)}")
         same = population is not None and found.log_weights is population.log_weights
-        return by_run(found.particles, n), log_weights if same else found.log_weights.reshape(-1, n)
+        particles = each_array(lambda a: np.asarray(a).reshape(-1, n, *a.shape[1:]), found.particles)
+        return particles, self.log_weights if same else found.log_weights.reshape(-1, n)
+
+    def flat(self, particles: Any) -> Any:
+        """Particles (R n, ...) of all runs."""
+        return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(self.filter.n)), particles)
 
     def alone(self, t: int, slot: str, row: int) -> Population:
         """What a component returns for one run; LostRunError, or `NotTogether` if it raises another error."""
-        y, u = self.of_run(t, row)
+        y, u = self.given[t]
         component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = self.key(t, slot, row).generator() if component.draws else None
         population = None
@@ -282,32 +241,20 @@ class _Sweep:
 
     # --- checks ---------------------------------------------------------------------------------------------------
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with single runs: the first and the last, or one in turn; at first all with another order."""
+        """Compare runs with single runs: the first and the last, or one in turn."""
         last, count = self.checked.get(slot, (0, 0))
         if t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == len(rows):
             return
         self.checked[slot] = len(rows), count + 1
         for k in {count % len(rows)} if last == len(rows) else {0, len(rows) - 1}:
-            self.same_scheme(self.filters.one(int(self.runs[rows[k]])))
+            run = int(self.runs[rows[k]])
+            self.same_scheme(self.filters.one(run))
             try:
-                single = self.alone(t, slot, int(rows[k]))
+                alone = self.alone(t, slot, int(rows[k]))
             except LostRunError:
-                self.refuse(t, slot, f"all weights of run {self.runs[rows[k]]} are 0 alone, but not in the batch")
-            ours = of_runs(particles, k), log_weights[k]
-            self.agree(t, slot, rows[k], ours, (single.particles, single.log_weights), "alone")
-        if count == 0 and len(rows) > 1:
-            self.compare_order(t, slot, rows, particles, log_weights)
-
-    def compare_order(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with a call for them in another order."""
-        order = np.roll(np.arange(0, len(rows), math.ceil(len(rows) / _MOST_COMPARED)), 1)
-        try:
-            others = self.of_rows(t, slot, rows[order])
-        except Exception as error:
-            self.refuse(t, slot, f"a call for the runs in another order raises {type(error).__name__}: {error}")
-        for k, row in enumerate(rows[order].tolist()):
-            ours = of_runs(particles, order[k]), log_weights[order[k]]
-            self.agree(t, slot, row, ours, (of_runs(others[0], k), others[1][k]), "with the runs in another order")
+                self.refuse(t, slot, f"all weights of run {run} are 0 alone, but not in the batch")
+            self.agree(t, slot, run, "particles", of_runs(particles, k), alone.particles)
+            self.agree(t, slot, run, "log weights", log_weights[k], alone.log_weights)
 
     def same_scheme(self, other: ParticleFilter) -> None:
         """Make single runs if the filter of a run has another number of particles, resampler or trigger."""
@@ -315,16 +262,14 @@ class _Sweep:
             if other is not self.filter and getattr(other, name) != getattr(self.filter, name):
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
 
-    def agree(self, t: int, slot: str, row: int, ours: tuple[Any, Any], other: tuple[Any, Any], how: str) -> None:
+    def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
         """Refuse the component if a run differs."""
-        for what, a, b in (("particles", ours[0], other[0]), ("log weights", ours[1], other[1])):
-            found = _difference(a, b)
-            if found is None or (found[0] and self.rounding):
-                continue
-            if found[0]:
-                raise NotTogether(slot, f"step {t}: its {what} differ by rounding from those of single runs")
-            run = int(self.runs[row])
-            self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} {how}")
+        found = _difference(ours, alone)
+        if found is None or (found[0] and self.rounding):
+            return
+        if found[0]:
+            raise NotTogether(slot, f"step {t}: its {what} differ by rounding from those of single runs")
+        self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} alone")
 
     def refuse_error(self, t: int, slot: str, error: Exception) -> NoReturn:
         """Make single runs if one of them raises an error too; else refuse the component."""
@@ -352,14 +297,13 @@ class _Sweep:
         if not len(rows):
             return
         index, out = self.selected(t, rows)
-        self.log_weights = self.log_weights.copy()
-        self.log_weights[rows] = self.log_mean[rows, None] if out is None else out
+        self.log_weights = _with_rows(self.log_weights, rows, self.log_mean[rows, None] if out is None else out)
         if out is not None:
             self.log_mean = self.log_mean.copy()  # `record` keeps the array of the step before
             self.log_mean[rows] = summaries(out)[1]
         if self.ancestors is not None:
             self.ancestors[rows] = index
-        self.particles = resampled_runs(self.particles, rows, index)
+        self.particles = each_array(lambda a: _with_rows(a, rows, a[rows[:, None], index]), self.particles)
 
     def wanted(self, t: int) -> Any:
         """(R,) bool, or one: the runs to resample."""
@@ -377,7 +321,7 @@ class _Sweep:
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
         if resampler.batched:
-            streams: Any = RunGenerators(self.generators(t, "resampler", rows))
+            streams: Any = RunGenerators(self.streams.generators("resampler", t, self.runs[rows]))
             return resampler.select(streams, self.log_weights[rows], n)
         drawn = [
             resampler.select(self.key(t, "resampler", row).generator(), self.log_weights[row], n)
@@ -390,10 +334,6 @@ class _Sweep:
     def key(self, t: int, slot: str, row: int) -> Key:
         """The key of a component of one run."""
         return self.keys[self.runs[row]].child(slot, t)
-
-    def generators(self, t: int, slot: str, rows: np.ndarray) -> list[np.random.Generator]:
-        """The generators of a component that is called for some runs."""
-        return generators_of_step([self.keys[run] for run in self.runs[rows].tolist()], slot, t)
 
     def record(self, t: int) -> None:
         """Keep what the collectors return for each run."""
@@ -437,6 +377,15 @@ class _Sweep:
         for t, (runs, values) in enumerate(steps):
             table[t, runs] = values
         return table
+
+
+def _with_rows(a: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A copy of an array with other values in some rows."""
+    if values.shape == a.shape:
+        return values
+    out = a.copy()
+    out[rows] = values
+    return out
 
 
 def _called(slot: str, component: Any, rng: Any, population: Population | None, y: Any, n: int) -> Population:

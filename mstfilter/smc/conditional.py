@@ -22,7 +22,6 @@ from mstfilter.smc.interfaces import DensityTransition, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.programs.handlers import CopyHandler, GuideHandler, ReplayHandler, SampleHandler, ScoreHandler
-from mstfilter.smc.programs.sites import PerParticle
 from mstfilter.smc.resampling import Multinomial
 from mstfilter.smc.smoothing import draw_log
 from mstfilter.smc.state_space import Dynamics, Prior
@@ -110,8 +109,6 @@ def _ancestor(
 def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
     """(n,) log f(new | old), for programs with log p(y | new, old); None if it is not known."""
     if isinstance(transition, ProgramTransition):
-        if isinstance(transition.model, PerParticle):
-            return None
         handler = ScoreHandler(dict(new))
         particles, density = run_program(transition.model, handler, old, y, count_particles(old))
         # A value that the program returns is a function of the previous particle, and has no density.
@@ -174,12 +171,11 @@ def _drawn(
 
 def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:
     """The given particle (one row) with the values that the program returns, and its log weight."""
-    values = given if isinstance(given, Mapping) else {name: np.asarray(a)[None] for name, a in given[0].items()}
     if component.guide is None or y is None:
-        particle, gain = run_program(component.model, CopyHandler(values, _FIRST), old, y, 1)
+        particle, gain = run_program(component.model, CopyHandler(given, _FIRST), old, y, 1)
         return particle, gain[0]
-    _, log_q = run_program(component.guide, ScoreHandler(values), old, y, 1)
-    particle, log_p = run_program(component.model, ScoreHandler(values), old, y, 1)
+    _, log_q = run_program(component.guide, ScoreHandler(given), old, y, 1)
+    particle, log_p = run_program(component.model, ScoreHandler(given), old, y, 1)
     return particle, log_p[0] - log_q[0]
 
 
@@ -223,10 +219,7 @@ def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Part
     """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
     component = filter.initial if previous is None else filter.transition
     if isinstance(component, ProgramInitial | ProgramTransition):
-        if isinstance(component.model, PerParticle):
-            raise InputError("the density of a path of a per_particle program is not available")
-        values = row if isinstance(row, Mapping) else row[0]
-        _, gain = run_program(component.model, ScoreHandler(values), previous, y, 1)
+        _, gain = run_program(component.model, ScoreHandler(row), previous, y, 1)
         return float(gain[0])
     if not isinstance(component, Prior | Dynamics):
         raise InputError("the filter is not made from a StateSpaceModel or a Program: its densities are not known")

@@ -1,37 +1,29 @@
-"""How good the estimates of a run are: Monte Carlo variances from the run itself, and scores against the truth.
+"""How good the estimates of a run are: Monte Carlo variances from the run itself, and distances of populations.
 
 >>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
->>> coalescence(keep(bootstrap(model, n=1000), observations)).ancestors     # (T,) of the last particles
 
-Both follow ancestors, so they need a filter whose particles all have known parents. What a selection changes is
-measured by a resampler that notes the energy distance between the particles before and after it:
+It follows ancestors, so it needs a filter whose particles all have known parents. `energy_distance` compares two
+populations, such as those before and after a selection. If the true state is known, half of the distance to it is the
+energy score of the population (Gneiting and Raftery 2007); lower is better:
 
->>> filter = bootstrap(model, n=1000, resampler=Measured(Systematic()))
->>> run_many(filter, observations, seeds=range(20), distance=selection_distance)
-
-If the true state is known, as in a simulation, weighted particles are a forecast of it (lower scores are better):
-
->>> log_score(population, lambda x: -0.5 * (x - truth) ** 2)    # -log of the density of the truth
->>> set_energy_score(population, truth)                         # needs distances only: any particles
->>> pit(population, truth, rng)                                 # uniform over many data sets if calibrated
+>>> energy_distance(population, Population(np.array([truth]))) / 2
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from mstfilter.errors import InputError, check_integer
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import Info, State
+from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population, as_matrix, union
-from mstfilter.smc.smoothing import Record, known_parents
+from mstfilter.smc.smoothing import known_parents
 from mstfilter.smc.transport_resampling import ResamplerWrapper
 
 
@@ -70,78 +62,6 @@ def _energy(particles: Any, masses: np.ndarray, distance: Callable[[Any], np.nda
     rows = max(1, 4_000_000 // max(1, len(x)))
     parts = [masses[k : k + rows] @ (cdist(x[k : k + rows], x) @ masses) for k in range(0, len(x), rows)]
     return max(0.0, -float(sum(parts)))
-
-
-@dataclass(frozen=True)
-class Measured(ResamplerWrapper):
-    """Measures the energy distance between the weighted particles before a selection and the particles after it.
-
-    The selection itself does not change. ``notes["energy_distance"]`` is the distance, which `selection_distance`
-    collects. Its mean over seeds is the squared error that the selection adds: for numbers, twice the integral over z
-    of the variance of the share of particles below z. `distance` is as for `energy_distance`.
-    """
-
-    distance: Callable[[Any], np.ndarray] | None = None
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        chosen = self.scheme.resample(rng, population, n)
-        ancestors = chosen.parents.get("ancestor")
-        if ancestors is None or (ancestors < 0).any():
-            found = energy_distance(population, chosen, self.distance)
-        else:  # all are particles of the population, so the distances of that suffice
-            masses = population.weights - np.bincount(ancestors, chosen.weights, len(population))
-            found = _energy(population.realised().particles, masses, self.distance)
-        return chosen.labelled(chosen.parents, {**chosen.notes, "energy_distance": found})
-
-
-def selection_distance(state: State, info: Info) -> float:
-    """The distance that `Measured` notes; 0 if the step did not resample, NaN if the resampler is not `Measured`."""
-    if not info.resampled:
-        return 0.0
-    return float(info.notes.get("resampler", {}).get("energy_distance", np.nan))
-
-
-@dataclass(frozen=True, eq=False)
-class Coalescence:
-    """The ancestors of the last particles of a run."""
-
-    #: (T,) int64: number of distinct ancestors at time t of the last particles of positive weight.
-    ancestors: np.ndarray
-    #: (T,) probability that two particles, drawn by weight from the last population, have the same ancestor at
-    #: time t.
-    shared: np.ndarray
-
-    @property
-    def time(self) -> int | None:
-        """Steps from the last time back to the latest common ancestor of all particles; None if there is none."""
-        common = np.flatnonzero(self.ancestors == 1)
-        return len(self.ancestors) - 1 - int(common[-1]) if len(common) else None
-
-    @property
-    def pair_time(self) -> float:
-        """Mean number of steps back to the latest common ancestor of two particles drawn by weight.
-
-        Pairs without one count as T steps, so the mean is a lower bound unless ``shared[0]`` is 1.
-        """
-        return float((1.0 - self.shared).sum())
-
-
-def coalescence(record: Record) -> Coalescence:
-    """How fast the paths of the last particles coalesce (Jacob, Murray, Rubenthaler 2015).
-
-    For equal weights and independent selections at every step, the genealogy is that of Wright and Fisher: two
-    particles share their ancestor s steps before with probability 1 - (1 - 1/n)^s.
-    """
-    last = record.populations[-1]
-    index, weights = np.flatnonzero(last.weights > 0), last.weights[last.weights > 0]
-    ancestors, shared = [], []
-    for t in range(len(record) - 1, -1, -1):
-        masses = np.bincount(index, weights)
-        ancestors.append(len(np.unique(index)))
-        shared.append(min(float(masses @ masses), 1.0))
-        if t:
-            index = record.parents(t)[index]
-    return Coalescence(np.array(ancestors[::-1]), np.array(shared[::-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,46 +242,3 @@ def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
     """Probability that two draws by weight are of different groups."""
     masses = np.bincount(groups, weights)
     return 1.0 - float(masses @ masses)
-
-
-def log_score(population: Population, log_density: Callable[[Any], np.ndarray]) -> float:
-    """Log score ``-log sum_i w_i p(y | x_i)`` of a population in nats.
-
-    ``log_density(particles)`` gives (n,) ``log p(y | x_i)``: of an observation, of the true state under a kernel
-    around each particle, or 0 and -inf for equal and different discrete states.
-    """
-    values = np.asarray(log_density(population.particles), dtype=np.float64)
-    if values.shape != (len(population),):
-        raise InputError(f"log_density returned shape {values.shape}, expected ({len(population)},)")
-    return -float(logsumexp(values, b=population.weights))
-
-
-def set_energy_score(
-    population: Population, truth: Any, distance: Callable[[Any], np.ndarray] | None = None
-) -> float:
-    """Energy score of a population against the true particle (Gneiting and Raftery 2007); lower is better.
-
-    ``sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``: half the `energy_distance` to a population of the truth
-    alone. `truth` is one particle: an array (...), a mapping of arrays, or an object. ``distance(particles)`` is as
-    for `energy_distance`; `mstfilter.forecasts.is_negative_type` checks whether it makes the score proper.
-    """
-    particles = population.particles
-    if isinstance(particles, Mapping):
-        one: Any = {name: np.asarray(truth[name])[None] for name in particles}
-    else:
-        one = np.asarray(truth)[None] if isinstance(particles, np.ndarray) else (truth,)
-    return energy_distance(population, Population(one, np.zeros(1)), distance) / 2
-
-
-def pit(population: Population, truth: Any, rng: np.random.Generator) -> np.ndarray:
-    """Probability integral transform (d,) of the true vector under a population of vectors, coordinate by coordinate.
-
-    ``F(y-) + U (F(y) - F(y-))`` with F the weighted distribution function and U uniform. It is uniform on [0, 1] if
-    the truth is distributed as the population is (Czado, Gneiting, Held 2009); over many data sets,
-    ``scipy.stats.kstest(values, "uniform")`` tests the calibration of a filter.
-    """
-    x, y = as_matrix(population.particles), np.asarray(truth, dtype=np.float64).reshape(-1)
-    if x.shape[1] != len(y):
-        raise InputError(f"the truth has {len(y)} coordinates and particles have {x.shape[1]}")
-    below, up_to = population.weights @ (x < y), population.weights @ (x <= y)
-    return np.asarray(below + rng.random(len(y)) * (up_to - below))

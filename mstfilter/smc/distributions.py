@@ -10,14 +10,13 @@ The first axis is that of the particles. Parameters of shape () or (n,) give val
 Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,), the entries of an event are independent, and
 their log densities are summed. `log_prob` is always (n,), or a number if nothing has rows.
 
-Frozen distributions of scipy.stats and objects of torch.distributions can be used in place of these
-(`as_distribution`); they take three to six times as long. Neither library is imported before it is used. The
-generator of torch is global, so its distributions are drawn by their inverse distribution function at uniforms of our
-generator, or, without an inverse, from their probabilities.
+Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
+of these (`as_distribution`); they take three to six times as long. The classes here are the most used ones. For a
+distribution of another library, write a `Distribution` whose `sample` draws by the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
-`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves and
-lookaheads evaluate values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
+`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves evaluate
+values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
 move rejects.
 """
 
@@ -291,30 +290,6 @@ class Uniform(_Independent):
         return (np.asarray(self.low) + self.high) / 2, (np.asarray(self.high) - self.low) / math.sqrt(12)
 
 
-@dataclass(frozen=True, eq=False)
-class Gamma(_Independent):
-    """Gamma with `shape` > 0 and `rate` > 0; the mean is shape / rate."""
-
-    shape: Any
-    rate: Any = 1.0
-
-    ranges: ClassVar = {"shape": POSITIVE, "rate": POSITIVE}
-
-    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        return rng.standard_gamma(self.shape, self.value_shape(size)) / self.rate
-
-    def log_prob(self, value: Any) -> np.ndarray:
-        from scipy.special import gammaln, xlogy
-
-        x, a = np.asarray(value, dtype=np.float64), np.asarray(self.shape, dtype=np.float64)
-        safe = np.where(x >= 0, x, 1.0)
-        inside = xlogy(a, self.rate) + xlogy(a - 1, safe) - self.rate * safe - gammaln(a)
-        return _sum_rows(np.where(x >= 0, inside, _impossible(x)))
-
-    def _moments(self) -> tuple[Any, Any]:
-        return np.asarray(self.shape) / self.rate, np.sqrt(self.shape) / self.rate
-
-
 def _cholesky(cov: np.ndarray) -> np.ndarray:
     """Lower triangular root of each covariance; NaN in `hypothetical` for a row that is not positive definite."""
     if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
@@ -397,33 +372,6 @@ class MultivariateNormal(_Checked):
 
 
 @dataclass(frozen=True, eq=False)
-class Poisson(_Independent):
-    """Poisson counts with mean `rate` >= 0."""
-
-    rate: Any
-    discrete = True
-    ranges: ClassVar = {"rate": Range("a number of at least 0", 0.0, np.finfo(float).max, open=False)}
-
-    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        return rng.poisson(self.rate, self.value_shape(size))
-
-    def log_prob(self, value: Any) -> np.ndarray:
-        from scipy.special import gammaln, xlogy
-
-        k = np.asarray(value, dtype=np.float64)
-        valid = (k >= 0) & (k == np.floor(k))
-        safe = np.where(valid, k, 0.0)
-        return _sum_rows(np.where(valid, xlogy(safe, self.rate) - gammaln(safe + 1) - self.rate, _impossible(k)))
-
-    def _moments(self) -> tuple[Any, Any]:
-        return self.rate, np.sqrt(self.rate)
-
-    @property
-    def centre(self) -> np.ndarray:
-        return np.floor(self.mean).astype(np.int64)
-
-
-@dataclass(frozen=True, eq=False)
 class Bernoulli(_Independent):
     """Booleans, True with probability `p`."""
 
@@ -442,10 +390,6 @@ class Bernoulli(_Independent):
 
     def _moments(self) -> tuple[Any, Any]:
         return self.p, np.sqrt(np.asarray(self.p) * (1 - np.asarray(self.p)))
-
-    @property
-    def centre(self) -> np.ndarray:
-        return np.asarray(self.p) > 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -502,28 +446,16 @@ class Categorical(Distribution):
         numbers = np.arange(self.probs.shape[-1], dtype=np.float64)
         return np.sqrt(np.maximum(self.probs @ numbers**2 - self.mean**2, 0.0))
 
-    @property
-    def centre(self) -> np.ndarray:
-        return np.argmax(self.probs, axis=-1)
-
 
 def as_distribution(value: Any) -> Distribution:
-    """Convert a distribution of this package, of scipy.stats (frozen or new style) or of torch.
-
-    Raises InputError if `value` is not a distribution.
-    """
+    """A distribution of this package, or one of scipy.stats (frozen or new style); InputError otherwise."""
     if isinstance(value, Distribution):
         return value
-    module = type(value).__module__
-    if module.startswith("scipy.stats"):
+    if type(value).__module__.startswith("scipy.stats"):
         return FromScipy(value)
-    if module.startswith("torch.distributions"):
-        ours, parameter = _OURS_FOR_TORCH.get(type(value).__name__, (FromTorch, None))
-        return ours(value if parameter is None else getattr(value, parameter).detach().numpy())
     raise InputError(
         f"expected a distribution, found a {type(value).__module__}.{type(value).__qualname__}",
-        "use one of mstfilter.smc, a frozen one of scipy.stats, or one of torch.distributions",
-        "or subclass mstfilter.smc.Distribution",
+        "use one of mstfilter.smc, a frozen one of scipy.stats, or subclass mstfilter.smc.Distribution",
     )
 
 
@@ -575,53 +507,5 @@ class FromScipy(Distribution):
             return np.sqrt(np.diagonal(wrapped.cov))[None]
         return np.asarray(wrapped.std() if hasattr(wrapped, "std") else wrapped.standard_deviation())
 
-    @property
-    def centre(self) -> np.ndarray:
-        """Mean, or the median of a discrete number."""
-        return self.mean if self.__dict__["_vector"] or not self.discrete else np.asarray(self.wrapped.median())
-
 
 _PARTICLES_LAST = ("dirichlet_frozen", "wishart_frozen", "invwishart_frozen")
-_OURS_FOR_TORCH: dict[str, tuple[Any, str | None]] = {
-    "Categorical": (Categorical, "probs"),
-    "Bernoulli": (Bernoulli, "probs"),
-    "Poisson": (Poisson, "rate"),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class FromTorch(Distribution):
-    """A continuous distribution of torch, drawn as ``icdf(u)`` in double precision."""
-
-    wrapped: Any
-
-    @property
-    def parameter_shape(self) -> tuple[int, ...]:
-        return (*(self.wrapped.batch_shape or (self.wrapped.event_shape and (1,))), *self.wrapped.event_shape)
-
-    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        import torch
-
-        u = rng.random(self.value_shape(size))
-        np.clip(u, 2.0**-54, None, out=u)  # 0 would be -inf
-        try:
-            return self.wrapped.icdf(torch.from_numpy(u)).numpy()
-        except NotImplementedError:
-            raise InputError(
-                f"torch's {type(self.wrapped).__name__} has no icdf, so it cannot be drawn reproducibly",
-                "use the one of mstfilter.smc or of scipy.stats",
-            ) from None
-
-    def log_prob(self, value: Any) -> np.ndarray:
-        import torch
-
-        found = self.wrapped.log_prob(torch.tensor(np.asarray(value)))
-        return _sum_rows(found.detach().numpy().astype(np.float64))
-
-    @property
-    def mean(self) -> np.ndarray:
-        return np.reshape(self.wrapped.mean, self.parameter_shape)
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.reshape(self.wrapped.stddev, self.parameter_shape)

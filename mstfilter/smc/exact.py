@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.gaussian import entry, nonlinear_gaussian, vectors
+from mstfilter.smc.gaussian import entry, nonlinear_gaussian, vector_of
 from mstfilter.smc.inputs import bind_step, check_observations, split_input, step_parameters, with_step
 from mstfilter.smc.state_space import StateSpaceModel
 
@@ -79,8 +79,8 @@ def _entry(name: str, given: np.ndarray, t: int = 0, u: Any = None) -> np.ndarra
 
 
 def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
-    """B u (d,), or (m, d) for one input for each row. Without BLAS, whose rounding depends on the number of rows."""
-    u = vectors("input", u, B.shape[1])
+    """B u (d,). Without BLAS, whose rounding depends on the number of rows."""
+    u = vector_of("input", u, B.shape[1])
     return (B * u[..., None, :]).sum(axis=-1)
 
 

@@ -1,19 +1,9 @@
-"""Results as tables of pandas, and as trees of xarray for ArviZ.
+"""Results as tables.
 
 >>> infos.to_pandas(), population.to_pandas(), chains.to_pandas(), history.to_pandas()
->>> arviz.summary(chains.to_arviz(["rho", "sigma"]))
->>> Population.from_arviz(population.to_arviz())              # the same particles and weights
 
 A class with `columns` is a `Table`: its columns are a mapping from names to arrays with one entry per row, which
 polars takes as well. An array with several entries per row has a column for each: ``x_0``, ``x_1``, or ``x_0_1``.
-
-Trees are `xarray.DataTree`, the container of ArviZ 1.0 and later; ``arviz.InferenceData.from_datatree`` converts them
-for 0.2x. The group ``posterior`` has the draws, with dimensions (chain, draw, ...); ``sample_stats`` has numbers of
-draws. Weighted particles are one chain. Their log weights, not normalised, are ``sample_stats["log_weight"]`` (chain,
-draw). If these differ, ``posterior.attrs["weights"]`` is "sample_stats/log_weight". ArviZ takes all draws as equally
-weighted, so its summaries hold only for draws without this attribute. Equally weighted draws come from a resampling:
-
->>> Systematic().resample(rng, population, 1000).to_arviz()
 """
 
 from __future__ import annotations
@@ -25,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import MissingLibraryError
+from mstfilter.errors import missing_library
 
 
 class Table(ABC):
@@ -44,10 +34,8 @@ def library(name: str) -> Any:
     """An optional library; MissingLibraryError if it is not installed."""
     try:
         return import_module(name)
-    except ImportError:
-        raise MissingLibraryError(
-            f"this export needs the library {name}, which is not installed", "pip install 'mstfilter[xarray]'"
-        ) from None
+    except ImportError as error:
+        raise missing_library(error, "this export", library=name) from error
 
 
 def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
@@ -58,19 +46,3 @@ def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarr
         for k in np.ndindex(a.shape[axes:]):
             columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
     return columns
-
-
-def draws_tree(posterior: Mapping[str, np.ndarray], sample_stats: Mapping[str, np.ndarray], **attributes: Any) -> Any:
-    """A ``DataTree`` of arrays (chain, draw, ...), with attributes of the group posterior."""
-    xarray = library("xarray")
-
-    def dataset(arrays: Mapping[str, np.ndarray]) -> Any:
-        dims = {
-            name: ("chain", "draw", *(f"{name}_dim_{k}" for k in range(a.ndim - 2))) for name, a in arrays.items()
-        }
-        sizes = dict(zip(("chain", "draw"), next(iter(arrays.values())).shape, strict=False))
-        coords = {name: np.arange(size) for name, size in sizes.items()}
-        return xarray.Dataset({name: (dims[name], a) for name, a in arrays.items()}, coords)
-
-    groups = {"posterior": dataset(posterior).assign_attrs(attributes)}
-    return xarray.DataTree.from_dict(groups | ({"sample_stats": dataset(sample_stats)} if sample_stats else {}))

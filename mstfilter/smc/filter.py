@@ -26,7 +26,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -37,7 +36,6 @@ from mstfilter.lazy import late, progress_of
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.inputs import AtStep, check_observations, split_input
 from mstfilter.smc.interfaces import (
-    Codec,
     Component,
     Info,
     Infos,
@@ -163,9 +161,6 @@ class ParticleFilter(AtStep):
         self,
         observations: Iterable[Any],
         state: State | int = 0,
-        *,
-        checkpoint: str | Path | None = None,
-        codec: Codec | None = None,
     ) -> Iterator[tuple[State, Info]]:
         """Yield the state and the info of every step.
 
@@ -175,62 +170,35 @@ class ParticleFilter(AtStep):
             One observation for each step, or `WithInput`. An observation that is missing is None.
         state : State or int
             The state to continue from, or a seed.
-        checkpoint : path, optional
-            A file to which the state is written after every step. If it exists, the run continues from its state: the
-            observations used before are skipped, and the result equals that of an uninterrupted run. InputError if
-            the file is of another seed, filter or model, or if those observations were others.
-        codec : Codec, optional
-            Stores particles that are not arrays, mappings of arrays or dataclasses of arrays.
         """
-        yield from self._steps(*self._begin(observations, state, checkpoint, codec))
+        keep_freed_memory()
+        check_observations(observations)
+        current = state if isinstance(state, State) else self.start(state)
+        for observation in observations:
+            current, info = self.step(current, observation)
+            yield current, info
 
     def run(
         self,
         observations: Iterable[Any],
         seed: int | State = 0,
         *,
-        checkpoint: str | Path | None = None,
-        codec: Codec | None = None,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
         """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
 
         ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
 
-        If the run continues from a checkpoint, it returns the infos of the later steps only. To keep weights or
-        particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
+        To keep weights or particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
         """
         total = len(observations) if isinstance(observations, Sized) else None
-        observations, state, store = self._begin(observations, seed, checkpoint, codec)
-        infos = Infos()
+        last, infos = seed if isinstance(seed, State) else self.start(seed), Infos()
         with progress_of(progress, "filter") as advance:
-            advance(state.t, total)
-            for state, info in self._steps(observations, state, store):  # noqa: B020
+            for state, info in self.iterate(observations, last):
+                last = state
                 infos.append(info)
-                advance(state.t, total)
-        return state, infos
-
-    def _begin(
-        self, observations: Iterable[Any], state: State | int, checkpoint: str | Path | None, codec: Codec | None
-    ) -> tuple[Iterable[Any], State, Any]:
-        """The remaining observations, the state to continue from, and the `Checkpoint` or None."""
-        keep_freed_memory()
-        check_observations(observations)
-        current = state if isinstance(state, State) else self.start(state)
-        if checkpoint is None:
-            return observations, current, None
-        from mstfilter.smc.checkpoint import Checkpoint
-
-        store = Checkpoint(Path(checkpoint), codec, self, current)
-        remaining = iter(observations)
-        return remaining, store.resume(remaining), store
-
-    def _steps(self, observations: Iterable[Any], state: State, store: Any) -> Iterator[tuple[State, Info]]:
-        for observation in observations:
-            state, info = self.step(state, observation)
-            if store is not None:
-                store.save(state, observation)
-            yield state, info
+                advance(len(infos), total)
+        return last, infos
 
 
 class _Step:

@@ -36,7 +36,6 @@ from mstfilter.smc.inputs import AtStep, step_parameters, with_step
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
-from mstfilter.smc.streams import Rows
 
 _Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d)
 
@@ -63,7 +62,7 @@ def nonlinear_gaussian(
 
     def log_likelihood(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
         noise = r.at(**step)
-        return noise.log_prob(vectors("observation", y, noise.size) - seen(x, step))
+        return noise.log_prob(vector_of("observation", y, noise.size) - seen(x, step))
 
     def log_transition(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
         return q.at(**step).log_prob(new - moved(old, step))
@@ -129,16 +128,11 @@ def entry(name: str, given: Any, t: int) -> Any:
     return given[t]
 
 
-def vectors(what: str, given: Any, size: int) -> np.ndarray:
-    """An observation or input (size,) of all particles, or (m, size) of the rows of a batch."""
-    vector = np.asanyarray(given, np.float64)
-    if vector.shape == (size,) and not isinstance(vector, Rows):
-        return vector
-    by_row = isinstance(vector, Rows)
-    if vector.ndim == by_row:
-        vector = vector[..., None]
-    if vector.shape[by_row:] != (size,):
-        raise InputError(f"the {what} has shape {vector.shape[by_row:]}, expected ({size},)")
+def vector_of(what: str, given: Any, size: int) -> np.ndarray:
+    """An observation or input as a vector (size,); a number counts as (1,)."""
+    vector = np.atleast_1d(np.asarray(given, np.float64))
+    if vector.shape != (size,):
+        raise InputError(f"the {what} has shape {np.shape(given)}, expected ({size},)")
     return vector
 
 

@@ -1,8 +1,7 @@
 """Recording quantities of a run.
 
 A collector is a function ``(state, info) -> number or array``, called after every step. `ess`, `unique_ancestors`,
-`weight_entropy`, `log_evidence`, `mean`, `resampled` and `n_particles` are collectors, and
-`mstfilter.smc.diagnostics.selection_distance`.
+`log_evidence`, `mean` and `resampled` are collectors.
 
 >>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
 >>> history["ess"]                                   # (T,)
@@ -37,14 +36,6 @@ def unique_ancestors(state: State, info: Info) -> int:
     return state.population.unique_ancestors
 
 
-def weight_entropy(state: State, info: Info) -> float:
-    """Entropy of the normalised weights in nats: log n if they are equal, 0 if one particle has all weight."""
-    assert state.population is not None
-    w = state.population.weights
-    w = w[w > 0]
-    return float(-(w @ np.log(w)))
-
-
 def log_evidence(state: State, info: Info) -> float:
     """Log evidence so far; NaN if the filter does not report it."""
     found = state.log_evidence
@@ -54,11 +45,6 @@ def log_evidence(state: State, info: Info) -> float:
 def resampled(state: State, info: Info) -> bool:
     """Whether the step resampled."""
     return info.resampled
-
-
-def n_particles(state: State, info: Info) -> int:
-    """Particles after the step."""
-    return info.n
 
 
 def mean(state: State, info: Info) -> Any:

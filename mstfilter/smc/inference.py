@@ -36,7 +36,7 @@ from mstfilter.errors import InputError, LostRunError, check_integer, check_numb
 from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.distributions import as_distribution
-from mstfilter.smc.export import Table, draws_tree, flat_columns
+from mstfilter.smc.export import Table, flat_columns
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
@@ -73,29 +73,6 @@ class Chains(Table):
     def _stats(self) -> dict[str, np.ndarray]:
         return {"log_evidence": self.log_evidence, "log_density": self.log_density}
 
-    def to_arviz(self, names: Sequence[str] = (), discard: int = 0) -> Any:
-        """The chains as an ``xarray.DataTree`` for ArviZ (see `mstfilter.smc.export`).
-
-        Parameters
-        ----------
-        names : sequence of str
-            One name per parameter. Default: one variable ``theta`` (chain, draw, d).
-        discard : int
-            Iterations left out at the beginning.
-
-        Returns
-        -------
-        xarray.DataTree
-            Groups ``posterior`` and ``sample_stats`` (``log_evidence``, and ``lp`` for the log density; none of
-            `particle_gibbs`, where they are unknown). Draws are equally weighted. Paths are left out.
-        """
-        theta = self.theta[discard:].swapaxes(0, 1)
-        if names and len(names) != theta.shape[2]:
-            raise InputError(f"there are {len(names)} names for {theta.shape[2]} parameters")
-        posterior = {name: theta[..., k] for k, name in enumerate(names)} or {"theta": theta}
-        stats = {name.replace("log_density", "lp"): a[discard:].T for name, a in self._stats().items()}
-        return draws_tree(posterior, {} if np.isnan(self.log_density).all() else stats)
-
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
 
@@ -120,35 +97,31 @@ class _Posterior:
     """Log prior and estimated log evidence of rows of parameters."""
 
     filter_of: FilterOf
-    data: list[list[Any]]  #: one sequence of observations for all chains, or one for each
+    observations: list[Any]
     log_prior: Callable[[np.ndarray], float]
     batched: bool = False
     n_sweeps: int = 0
 
-    def __call__(
-        self, rng: np.random.Generator, theta: np.ndarray, chains: np.ndarray | None = None
-    ) -> dict[str, np.ndarray]:
-        """``theta`` (R, d) of some chains, all by default, with ``log_density`` and ``log_evidence`` (R,)."""
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """``theta`` (R, d) with ``log_density`` and ``log_evidence`` (R,)."""
         seeds = rng.integers(2**63, size=len(theta))
         log_prior = np.array([float(self.log_prior(row)) for row in theta])
         if np.isnan(log_prior).any():
             raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
         evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
         if possible.any():
-            rows = (np.arange(len(theta)) if chains is None else chains)[possible]
-            data = self.data if len(self.data) == 1 else [self.data[r] for r in rows]
-            evidence[possible] = self._estimates(theta[possible], data, seeds[possible].tolist())
+            evidence[possible] = self._estimates(theta[possible], seeds[possible].tolist())
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
-    def _estimates(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of filters in one sweep, or one by one if this is impossible."""
         if self.batched:
             try:
-                return self._in_one_sweep(thetas, data, seeds)
+                return self._in_one_sweep(thetas, seeds)
             except NotTogether as why:
                 self.batched = False
                 warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=5)
-        return self._one_by_one(thetas, data, seeds)
+        return self._one_by_one(thetas, seeds)
 
     def _filter(self, theta: np.ndarray) -> ParticleFilter:
         filter = self.filter_of(theta)
@@ -156,15 +129,15 @@ class _Posterior:
             raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
         return filter
 
-    def _one_by_one(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _one_by_one(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             with suppress(LostRunError):
-                state, _ = self._filter(theta).run(data[r % len(data)], seed)
+                state, _ = self._filter(theta).run(self.observations, seed)
                 found[r] = state.log_evidence
         return found
 
-    def _in_one_sweep(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
+    def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """The estimates of a batch whose components hold the parameters of each row.
 
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
@@ -184,7 +157,7 @@ class _Posterior:
         filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
         check = not self.n_sweeps & (self.n_sweeps - 1)
         self.n_sweeps += 1
-        runs = run_together(filters, data, seeds, {"z": log_evidence}, check=check, rounding=True)
+        runs = run_together(filters, self.observations, seeds, {"z": log_evidence}, check=check, rounding=True)
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 
 
@@ -198,7 +171,6 @@ def pmmh(
     seed: int = 0,
     *,
     batched: bool = False,
-    paired: bool = False,
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
@@ -220,8 +192,6 @@ def pmmh(
         chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
         parameters; some are compared. If they differ, InputError, or a warning and single runs.
-    paired : bool
-        If True, `observations` are sequences of observations, one for each chain.
 
     Raises
     ------
@@ -231,10 +201,7 @@ def pmmh(
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    data = [list(ys) for ys in observations] if paired else [list(observations)]
-    if paired and len(data) != len(theta):
-        raise InputError(f"there are {len(data)} sequences of observations for {len(theta)} chains")
-    posterior = _Posterior(filter_of, data, log_prior, batched)
+    posterior = _Posterior(filter_of, list(observations), log_prior, batched)
     key = Key(seed).child("pmmh")
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -264,7 +231,7 @@ def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.n
                 f"the start {theta[r].tolist()} of chain {r} has log density {state['log_density'][r]}: {what}",
                 "start where the prior and the likelihood are positive, or take more particles",
             )
-        for name, values in posterior(key.child(attempt).generator(), theta[lost], lost).items():
+        for name, values in posterior(key.child(attempt).generator(), theta[lost]).items():
             state[name][lost] = values
     return state
 
@@ -315,7 +282,7 @@ def ensemble(
     if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
         raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, [list(observations)], log_prior, batched)
+    posterior = _Posterior(filter_of, list(observations), log_prior, batched)
     rng = Key(seed).child("ensemble").generator()
 
     def log_density(thetas: np.ndarray) -> np.ndarray:

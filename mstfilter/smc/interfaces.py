@@ -264,7 +264,7 @@ class Distribution(ABC):
     Attributes
     ----------
     discrete : bool
-        Whether the values are integers: a lookahead then uses the mode, a move draws new values.
+        Whether the values are integers: a move then draws new values.
     draws_numbers : bool
         Whether draws are known not to be NaN. If False, programs check them.
     """
@@ -318,11 +318,6 @@ class Distribution(ABC):
     @abstractmethod
     def sd(self) -> np.ndarray:
         """Standard deviation of each entry, of the shape of the mean."""
-
-    @property
-    def centre(self) -> np.ndarray:
-        """The mean, or the mode of a discrete distribution; a lookahead uses it instead of a draw."""
-        return self.mean
 
 
 class Codec(ABC):

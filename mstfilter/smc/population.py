@@ -28,7 +28,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.lazy import late
-from mstfilter.smc.export import Table, draws_tree, flat_columns
+from mstfilter.smc.export import Table, flat_columns
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -204,9 +204,9 @@ class Population(Table):
         Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. ``"mate"``: the
-        second parent of a particle that two previous ones made. A resampler adds ``"ancestor"``, the index before the
-        resampling; a population after a step has it if the step resampled after its update.
+        proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. A resampler adds
+        ``"ancestor"``, the index before the resampling; a population after a step has it if the step resampled after
+        its update.
     notes : mapping
         Values that a component records: plain numbers, strings and lists.
     """
@@ -259,28 +259,6 @@ class Population(Table):
             objects[:] = particles
             return {"particle": objects}
         return dict(particles) if isinstance(particles, Mapping) else {"x": particles}
-
-    def to_arviz(self) -> Any:
-        """The particles as one chain of an ``xarray.DataTree``, with their weights (see `mstfilter.smc.export`)."""
-        if "particle" in self._arrays():
-            as_matrix(self.realised().particles)
-        posterior = {name: a[None] for name, a in self._arrays().items()}
-        named = {"weights": "sample_stats/log_weight"} if np.ptp(self.log_weights) else {}
-        return draws_tree(posterior, {"log_weight": self.log_weights[None]}, **named)
-
-    @classmethod
-    def from_arviz(cls, tree: Any) -> Population:
-        """All draws of a ``DataTree`` or of ArviZ's ``InferenceData``, with the weights of `to_arviz` if it has them.
-
-        Particles are a mapping of arrays; an array if the only variable is called "x".
-        """
-        by_name = {
-            str(name): a.transpose("chain", "draw", ...).values for name, a in tree["posterior"].data_vars.items()
-        }
-        particles = {name: a.reshape(-1, *a.shape[2:]) for name, a in by_name.items()}
-        stats = tree["sample_stats"].data_vars if "sample_stats" in tree else {}
-        population = cls(particles["x"] if set(particles) == {"x"} else particles)
-        return population.reweighted(stats["log_weight"].values.reshape(-1)) if "log_weight" in stats else population
 
     def __len__(self) -> int:
         return len(self.log_weights)
@@ -363,17 +341,16 @@ class Population(Table):
     def traced_through(self, resampled: Population | None) -> Population:
         """The same particles, with parents traced through a resampling before the prediction.
 
-        ``parents["previous"]`` and ``parents["mate"]`` are indices into `resampled`; they become indices into the
-        population that was resampled, if it is known. The notes are dropped.
+        ``parents["previous"]`` are indices into `resampled`; they become indices into the population that was
+        resampled, if it is known. The notes are dropped.
         """
-        parents = dict(self.parents)
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
-        for name in ("previous", "mate"):
-            if ancestors is not None and name in parents:
-                index = parents[name]
-                stayed = index is identity(len(ancestors))
-                parents[name] = ancestors if stayed else np.where(index >= 0, ancestors[index], -1)
-        return self.labelled(parents)
+        index = self.parents.get("previous")
+        if ancestors is None or index is None:
+            return self.labelled(self.parents)
+        stayed = index is identity(len(ancestors))
+        traced = ancestors if stayed else np.where(index >= 0, ancestors[index], -1)
+        return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
         """Replace the particles by as many new ones; weights and parents stay, notes are dropped."""
@@ -431,10 +408,6 @@ def union(predicted: Population | None, proposed: Population | None) -> Populati
     none_a, none_b = np.full(len(predicted), -1), np.full(len(proposed), -1)
     parents = {
         name: np.concatenate([predicted.parents.get(name, none_a), proposed.parents.get(name, none_b)])
-        for name in (
-            "previous",
-            "proposed",
-            *(["mate"] if "mate" in {**predicted.parents, **proposed.parents} else []),
-        )
+        for name in ("previous", "proposed")
     }
     return Population(particles, np.concatenate([predicted.log_weights, proposed.log_weights]), parents)

@@ -1,9 +1,8 @@
-"""Many runs: several filters, seeds and data sets.
+"""Many runs: several filters and seeds.
 
 >>> runs = run_many(bootstrap(model, n=100), observations, seeds=range(200), ess=ess, log_evidence=log_evidence)
 >>> runs["ess"].shape                                  # (seed, time)
 (200, 50)
->>> run_many(bootstrap(model, n=100), data_sets, seeds=range(200), paired=True)        # run r gets data_sets[r]
 >>> runs = run_many(
 ...     {"systematic": bootstrap(model, 100), "multinomial": bootstrap(model, 100, Multinomial())},
 ...     observations, seeds=range(20), workers=4)
@@ -18,26 +17,21 @@ the same random streams, which makes differences between arms less noisy than th
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning, LostRunError, check_integer, naming
-from mstfilter.files import atomic_path, check_output, folder_name
 from mstfilter.lazy import progress_of
 from mstfilter.processes import environment
-from mstfilter.reading import read_arrays
 from mstfilter.smc.batching import Collected, NotTogether, RunFilters, check_together, run_together
-from mstfilter.smc.checkpoint import digest
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import Collector, History, check_one_shape, collect, log_evidence
 from mstfilter.smc.inputs import check_observations
@@ -49,9 +43,7 @@ def run_many(
     observations: Iterable[Any],
     seeds: Iterable[int] = range(10),
     *,
-    paired: bool = False,
     workers: int = 1,
-    folder: str | Path | None = None,
     progress: bool | Callable[[int, int | None], None] = False,
     **collectors: Collector,
 ) -> History:
@@ -65,17 +57,10 @@ def run_many(
         T observations, the same for all runs; None if missing, `WithInput` with an input.
     seeds : iterable of int
         Different non-negative integers.
-    paired : bool
-        If True, `observations` are sequences of T observations, one for each seed. Components that are called with
-        all runs get the observations of a step by row.
     workers : int
         Number of processes; 1 uses the calling process. More are started by joblib's loky, as new interpreters that
         get the filters by cloudpickle, and limit the numerical libraries to one thread. InputError if a worker dies,
         with the runs that may have ended it.
-    folder : path, optional
-        Every finished run is stored there, as ``arm/seed.npz``; characters of an arm other than lower-case letters,
-        digits, ``_`` and ``-`` are replaced by a hash. The same call runs only those that are missing. InputError if
-        a stored run was made by another filter, other observations or other collectors, or if its file is damaged.
     progress : bool or callable
         True shows a progress bar; a function is called as ``progress(done, total)`` when runs finish.
     **collectors
@@ -100,16 +85,15 @@ def run_many(
     if workers > 1:
         _check_caller()
     collectors, seeds = collectors or {"log_evidence": log_evidence}, [int(seed) for seed in seeds]
-    ys = _sequences(observations, paired)
-    _check_seeds(seeds, ys, paired)
-    job = _Job(arms, ys, seeds, collectors)
-    if folder is not None:
-        check_output(Path(folder), folder=True, empty=False)
-        job = replace(job, folder=Path(folder), hashes=job.all_hashes())
-    found = job.load_all()
+    if not seeds:
+        raise InputError("there are no seeds")
+    if len(set(seeds)) < len(seeds):
+        raise InputError(f"a seed occurs twice in {seeds}", "every run has a seed of its own")
+    job = _Job(arms, list(check_observations(observations)), seeds, collectors)
+    found: dict[_Task, Collected] = {}
     single: dict[str, str] = {}
     with progress_of(progress, "runs") as advance:
-        for part in _finished(job, job.chunks(found, workers), workers):
+        for part in _finished(job, job.chunks(workers), workers):
             found.update(part.runs)
             single.update(part.single)
             advance(len(found), len(arms) * len(job.seeds))
@@ -122,25 +106,6 @@ def run_many(
 
 _MOST_ROWS = 100_000  # particles of runs that are processed together; more are not faster
 _ALONE = "filter"  # the arm of a single filter
-
-
-def _sequences(observations: Iterable[Any], paired: bool) -> list[list[Any]]:
-    """The sequences of observations: one for all runs, or one for each."""
-    given = enumerate(observations if paired else [observations])
-    return [list(check_observations(ys, f"run {run}, " if paired else "")) for run, ys in given]
-
-
-def _check_seeds(seeds: list[int], ys: list[list[Any]], paired: bool) -> None:
-    """Raise InputError if seeds and sequences of observations do not fit."""
-    if not seeds:
-        raise InputError("there are no seeds")
-    if len(set(seeds)) < len(seeds):
-        raise InputError(f"a seed occurs twice in {seeds}", "every run has a seed of its own")
-    if paired and len(ys) != len(seeds):
-        raise InputError(f"there are {len(ys)} sequences of observations for {len(seeds)} seeds")
-    lengths = sorted({len(sequence) for sequence in ys})
-    if len(lengths) > 1:
-        raise InputError(f"sequences of observations have lengths {lengths}, expected one length")
 
 
 _Task = tuple[str, int]  # an arm and a seed
@@ -160,51 +125,42 @@ class _Job:
     """What `run_many` runs."""
 
     arms: dict[str, ParticleFilter]
-    ys: list[list[Any]]
+    ys: list[Any]
     seeds: list[int]
     collectors: dict[str, Collector]
-    folder: Path | None = None
-    hashes: dict[_Task, str] = field(default_factory=dict)  #: of what a stored run depends on
 
     def where(self, arm: str, seed: int | None = None) -> str:
         """What an error is about; a single filter has no name."""
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
-    def observations(self, seed: int) -> list[Any]:
-        return self.ys[self.seeds.index(seed) % len(self.ys)]
-
-    def chunks(self, found: Mapping[_Task, Collected], workers: int) -> list[_Chunk]:
-        """Missing runs that a worker makes in one go: many seeds if they can be processed together."""
+    def chunks(self, workers: int) -> list[_Chunk]:
+        """Runs that a worker makes in one go: many seeds if they can be processed together."""
         chunks = []
-        for arm in self.arms:
-            missing = [seed for seed in self.seeds if (arm, seed) not in found]
-            share = -(-len(missing) // (4 * workers if workers > 1 else 1))
-            size = max(1, min(share, _MOST_ROWS // self.arms[arm].n))
+        for arm, filter in self.arms.items():
+            share = -(-len(self.seeds) // (4 * workers if workers > 1 else 1))
+            size = max(1, min(share, _MOST_ROWS // filter.n))
             try:
-                check_together(self.arms[arm])
+                check_together(filter)
             except NotTogether:
                 size = 1
-            chunks += [(arm, missing[k : k + size]) for k in range(0, len(missing), size)]
+            chunks += [(arm, self.seeds[k : k + size]) for k in range(0, len(self.seeds), size)]
         return chunks
 
     def run(self, arm: str, seeds: list[int]) -> _Part:
-        """Make some runs of an arm, and store the results."""
+        """Make some runs of an arm."""
         runs, why = self.made(arm, seeds)
         found = {(arm, seed): run for seed, run in zip(seeds, runs, strict=True)}
-        for task, run in found.items():
-            self.save(*task, run)
         return _Part(found, {arm: why} if why else {})
 
     def made(self, arm: str, seeds: list[int]) -> tuple[list[Collected], str]:
         """Some runs of an arm, and why they were made one by one; "" if they were made together, or there is one."""
         filter, why = self.arms[arm], ""
-        ys = self.ys if len(self.ys) == 1 else [self.observations(seed) for seed in seeds]
         try:
             check_together(filter)
             if len(seeds) > 1:
                 same = RunFilters(lambda run: filter, lambda runs: filter)
                 with naming(self.where(arm)):
-                    return run_together(same, ys, seeds, self.collectors), ""
+                    return run_together(same, self.ys, seeds, self.collectors), ""
         except NotTogether as error:
             why = f"{error.slot}: {error.reason}"
         return [self.single(arm, seed) for seed in seeds], why
@@ -213,12 +169,12 @@ class _Job:
         """One run, up to the step at which it is lost."""
         lost: list[str] = []
         with naming(self.where(arm, seed)):
-            steps = _until_lost(self.arms[arm].iterate(self.observations(seed), seed), lost)
+            steps = _until_lost(self.arms[arm].iterate(self.ys, seed), lost)
             return Collected(dict(collect(steps, **self.collectors)), "".join(lost))
 
     def history(self, found: Mapping[_Task, Collected], single: Mapping[str, str], has_arms: bool) -> History:
         """The results of all runs; without the axis of arms for a single filter."""
-        sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys[0])}
+        sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys)}
         coords = {"arm": list(self.arms), "seed": np.asarray(self.seeds), "time": np.arange(sizes["time"])}
         runs = [found[task] for task in product(self.arms, self.seeds)]
         dims = tuple(sizes) if has_arms else ("seed", "time")
@@ -240,71 +196,6 @@ class _Job:
         for value, row in zip(values, rows, strict=True):
             value[: len(row)] = row if len(row) else 0
         return values
-
-    # --- stored runs ----------------------------------------------------------------------------------------------
-    def all_hashes(self) -> dict[_Task, str]:
-        """The hashes of all runs."""
-
-        def of(arm: str, ys: list[Any]) -> str:
-            return digest((self.arms[arm], ys, self.collectors))
-
-        shared = {arm: of(arm, self.ys[0]) for arm in self.arms}
-        return {
-            (arm, seed): shared[arm] if len(self.ys) == 1 else of(arm, self.observations(seed))
-            for arm, seed in product(self.arms, self.seeds)
-        }
-
-    def path(self, arm: str, seed: int) -> Path:
-        assert self.folder is not None
-        return self.folder / folder_name(arm) / f"{seed}.npz"
-
-    def save(self, arm: str, seed: int, run: Collected) -> None:
-        if self.folder is None:
-            return
-        arrays: dict[str, Any] = {f"rows/{name}": row for name, row in run.rows.items()}
-        arrays["head"] = json.dumps({"made_by": self.hashes[arm, seed], "seed": seed, "lost": run.lost})
-        with atomic_path(self.path(arm, seed)) as partial, partial.open("wb") as file:
-            np.savez(file, **arrays)
-
-    def load(self, arm: str, seed: int) -> Collected | None:
-        """A stored run; None if there is none. InputError if the file is damaged, or of another run."""
-        if self.folder is None or not self.path(arm, seed).exists():
-            return None
-        path = self.path(arm, seed)
-        arrays = read_arrays(path, "a stored run", _DAMAGED)
-        try:
-            head = json.loads(str(arrays.pop("head")))
-            made_by, lost = (head["made_by"], head["seed"]), str(head["lost"])
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{path} is not a stored run of run_many", _DAMAGED) from None
-        if made_by != (self.hashes[arm, seed], seed):
-            raise InputError(
-                f"run {path} was made by another filter or seed, other observations or other collectors",
-                "choose another folder, or remove this one",
-            )
-        rows = {name.removeprefix("rows/"): row for name, row in arrays.items()}
-        lengths, steps = {np.shape(row)[:1] for row in rows.values()}, len(self.ys[0])
-        if set(rows) != set(self.collectors) or (not lost and lengths != {(steps,)}):
-            raise InputError(f"stored run {path} is not complete", _DAMAGED)
-        return Collected(rows, lost)
-
-    def load_all(self) -> dict[_Task, Collected]:
-        """All stored runs. The error states how many cannot be used."""
-        found, errors = {}, []
-        for task in product(self.arms, self.seeds):
-            try:
-                run = self.load(*task)
-            except InputError as error:
-                errors.append(error)
-            else:
-                found.update({} if run is None else {task: run})
-        if errors:
-            more = f"; {len(errors)} stored runs cannot be used" if len(errors) > 1 else ""
-            raise InputError(f"{errors[0].message}{more}", *errors[0].hints) from errors[0]
-        return found
-
-
-_DAMAGED = "remove the file and call run_many again: it runs what is missing, with the same result"
 
 
 def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
@@ -343,7 +234,6 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
             f"a worker process died{how}; the first runs that are not finished: {begun}",
             "if memory ran out: use fewer workers or fewer particles",
             "workers=1 runs in this process and shows a crash of compiled code",
-            *(["the same call with the folder continues"] if job.folder else []),
         ) from None
 
 

@@ -11,34 +11,30 @@ Three smoothers of a record return a tuple with one population per time:
 - `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It has more distinct
   particles, and a bias if the state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
-  path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"`` or ``"rejection"``.
+  path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"``.
 
 They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
-
-`paris` yields smoothed means of sums over the path while observations arrive, in constant memory.
 
 `mstfilter.smc.conditional` draws single paths, also of programs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, check_number
-from mstfilter.fields import Bounded, PositiveInt
+from mstfilter.errors import InputError, check_choice, check_component, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.population import Particles, Population, count_particles, take
+from mstfilter.smc.population import Particles, Population, take
 from mstfilter.smc.resampling import draw_rows, independent_draws
-from mstfilter.smc.state_space import metropolis
-from mstfilter.smc.streams import Key
+from mstfilter.smc.state_space import moved
 
-BackwardMethod = Literal["exact", "mcmc", "rejection"]
+BackwardMethod = Literal["exact", "mcmc"]
 #: Pairs of particles per call of `log_prob`.
 _PAIRS = 1_000_000
 
@@ -117,7 +113,6 @@ def backward_paths(
     method: BackwardMethod = "exact",
     *,
     steps: int = 1,
-    log_bound: float | None = None,
 ) -> tuple[Population, ...]:
     """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
 
@@ -128,13 +123,8 @@ def backward_paths(
     transition : DensityTransition
         That of the model, ``Dynamics(model)``. One with a proposal cannot be used: its density is that of the
         proposal.
-    method : "exact", "mcmc" or "rejection"
+    method : "exact" or "mcmc"
         "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
-
-        "rejection" (Douc, Garivier, Moulines, Olsson 2011) draws particles by weight and accepts them with
-        probability f / max f. The law is that of "exact". A path that has accepted none of N particles is drawn as by
-        "exact" (Dau and Chopin 2023). So a step takes at most about 2 n N densities, on average n times the mean of
-        max f / p(x_{t+1} | y_0 .. y_t).
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
         steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
@@ -143,19 +133,19 @@ def backward_paths(
         Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
     steps : int
         Metropolis steps of "mcmc".
-    log_bound : float
-        For "rejection": an upper bound of ``transition.log_prob``. InputError if a density exceeds it.
     """
     check_integer("n", n)
-    kernel = _Backward(transition, method, steps, log_bound)
+    check_component("transition", transition, DensityTransition)
+    check_choice("method", method, get_args(BackwardMethod))
+    check_integer("steps", steps)
     last = record.populations[-1].realised()
     index = _by_weight(rng, last, n)
     path = [Population(take(last.particles, index))]
     for t in range(len(record) - 2, -1, -1):
         population = record.populations[t].realised()
-        parents = record.parents(t + 1)[index] if method == "mcmc" else None
-        move = kernel.move(population, path[-1].particles, record.observations[t + 1], t)
-        index = kernel.draw(rng, move, parents, 1)[:, 0]
+        y, u = split_input(record.observations[t + 1])
+        move = _Move(population, path[-1].particles, transition.at_step(t + 1, u), y, t)
+        index = move.metropolis(rng, record.parents(t + 1)[index], steps) if method == "mcmc" else move.exact(rng, n)
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))
 
@@ -170,7 +160,7 @@ class _Move:
     y: Any
     t: int
 
-    def log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def _log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """(k,) log density of the moves from particles `index` to the later ones at `rows` (default: all)."""
         later = self.later if rows is None else take(self.later, rows)
         found = self.transition.log_prob(take(self.population.particles, index), later, self.y)
@@ -181,139 +171,27 @@ class _Move:
             raise _impossible(self.t)
         return density
 
-    def exact(self, rng: np.random.Generator, rows: np.ndarray, n_draws: int) -> np.ndarray:
-        """(k, n_draws) indices of predecessors of the later particles at `rows`."""
-        m = len(self.population)
-        index, block = np.empty((len(rows), n_draws), np.int64), max(1, _PAIRS // m)
-        for begin in range(0, len(rows), block):
-            some = rows[begin : begin + block]
-            density = self.log_density(np.tile(np.arange(m), len(some)), np.repeat(some, m))
-            log_weights = self.population.log_weights + density.reshape(-1, m)
-            for k in range(n_draws):
-                index[begin : begin + block, k] = draw_log(rng, log_weights, self.t)
-        return index
+    def exact(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n,) indices of predecessors, drawn from their law."""
+        m, drawn = len(self.population), []
+        for rows in np.split(np.arange(n), range(max(1, _PAIRS // m), n, max(1, _PAIRS // m))):
+            density = self._log_density(np.tile(np.arange(m), len(rows)), np.repeat(rows, m))
+            drawn.append(draw_log(rng, self.population.log_weights + density.reshape(-1, m), self.t))
+        return np.concatenate(drawn)
 
-    def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int, n_draws: int) -> np.ndarray:
-        """(n, n_draws) states of chains that start at the parents, every `steps` steps."""
-        density = self.log_density(parents)
+    def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int) -> np.ndarray:
+        """(n,) indices of predecessors after Metropolis steps that start at the parents."""
+        density = self._log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
 
         def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
             index = _by_weight(rng, self.population, len(parents))
-            density = self.log_density(index)
+            density = self._log_density(index)
             return {"index": index, "density": density}, density - now["density"]
 
-        chain = metropolis(rng, {"index": parents, "density": density}, propose, steps * n_draws)
-        draws = [state["index"] for k, (state, _) in enumerate(chain, 1) if k % steps == 0]
-        return np.stack(draws, axis=1)
-
-    def rejected(self, rng: np.random.Generator, n: int, log_bound: float) -> np.ndarray:
-        """(n,) indices of predecessors of the n later particles, by rejection."""
-        index, left, trials = np.empty(n, np.int64), np.arange(n), 0
-        while len(left) and trials < len(self.population):
-            each = max(1, n // len(left))  # a round evaluates at most n densities
-            new = _by_weight(rng, self.population, each * len(left)).reshape(len(left), each)
-            density = self.log_density(new.ravel(), np.repeat(left, each))
-            if density.max() > log_bound + 1e-9 * (1 + abs(log_bound)):
-                raise InputError(
-                    f"step {self.t}: the log density of a move is {density.max()}, more than log_bound = {log_bound}"
-                )
-            accepted = (density - log_bound > -rng.standard_exponential(len(density))).reshape(new.shape)
-            first, some = accepted.argmax(axis=1), accepted.any(axis=1)
-            index[left[some]] = new[some, first[some]]
-            left, trials = left[~some], trials + each
-        if len(left):
-            index[left] = self.exact(rng, left, 1)[:, 0]
-        return index
-
-
-@dataclass(frozen=True)
-class _Backward(Bounded):
-    """Draws predecessors of later particles; the fields are arguments of `backward_paths`."""
-
-    transition: DensityTransition
-    method: BackwardMethod
-    steps: PositiveInt
-    log_bound: float | None
-
-    def __post_init__(self) -> None:
-        if self.method == "rejection":
-            check_number("log_bound", self.log_bound)
-
-    def move(self, population: Population, later: Particles, observation: Any, t: int) -> _Move:
-        """The moves from a population at time `t` to the particles after `observation`."""
-        y, u = split_input(observation)
-        return _Move(population, later, self.transition.at_step(t + 1, u), y, t)
-
-    def draw(self, rng: np.random.Generator, move: _Move, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
-        """(n, n_draws) indices; `parents` (n,) of the later particles are for "mcmc"."""
-        if parents is not None:
-            return move.metropolis(rng, parents, self.steps, n_draws)
-        n = count_particles(move.later)
-        if self.log_bound is not None and self.method == "rejection":
-            return np.stack([move.rejected(rng, n, self.log_bound) for _ in range(n_draws)], axis=1)
-        return move.exact(rng, np.arange(n), n_draws)
-
-
-def paris(
-    filter: ParticleFilter,
-    observations: Iterable[Any],
-    functional: Callable[[int, Particles | None, Particles], np.ndarray],
-    transition: DensityTransition,
-    seed: int = 0,
-    n_draws: int = 2,
-    method: BackwardMethod = "exact",
-    *,
-    steps: int = 1,
-    log_bound: float | None = None,
-) -> Iterator[np.ndarray]:
-    """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
-
-    After each observation it yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the last
-    population is kept, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A step
-    takes n^2 densities, with "mcmc" (1 + `steps` `n_draws`) n.
-
-    Parameters
-    ----------
-    filter : ParticleFilter
-        With proper weights.
-    functional : callable
-        ``(t, previous, particles) -> (n,) or (n, k)`` is h_t of paired rows; `previous` is None at t = 0.
-    transition : DensityTransition
-        The transition of the model, ``Dynamics(model)``.
-    n_draws : int
-        At least 2: with one the variance grows as that of the genealogy.
-    method, steps, log_bound
-        As in `backward_paths`.
-
-    Yields
-    ------
-    float64 scalar or (k,)
-    """
-    check_integer("n_draws", n_draws)
-    if not filter.properly_weighted:
-        raise InputError("a component of the filter is not properly weighted: its smoothed means have another limit")
-    kernel = _Backward(transition, method, steps, log_bound)
-    past: Population | None = None
-    statistic = np.zeros(0)
-    state = filter.start(seed)
-    for t, observation in enumerate(observations):
-        state, _ = filter.step(state, observation)
-        assert state.population is not None
-        now = state.population.realised()
-        if past is None:
-            statistic = np.asarray(functional(t, None, now.particles), np.float64)
-        else:
-            rng = Key(seed).child("paris", t).generator()
-            parents = known_parents(now, t) if method == "mcmc" else None
-            move = kernel.move(past, now.particles, observation, t - 1)
-            index = kernel.draw(rng, move, parents, n_draws).ravel()
-            later = take(now.particles, np.repeat(np.arange(len(now)), n_draws))
-            statistic = statistic[index] + functional(t, take(past.particles, index), later)
-            statistic = statistic.reshape(len(now), n_draws, *statistic.shape[1:]).mean(axis=1)
-        past = now
-        yield np.tensordot(now.weights, statistic, axes=1)
+        last, _ = moved(rng, {"index": parents, "density": density}, propose, steps)
+        return last["index"]
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:

@@ -42,7 +42,6 @@ from mstfilter.smc.interfaces import (
 )
 from mstfilter.smc.population import Particles, Population, count_particles
 from mstfilter.smc.resampling import Systematic
-from mstfilter.smc.streams import Rows
 
 _Chains = TypeVar("_Chains")  # states of Markov chains
 
@@ -88,7 +87,7 @@ class StateSpaceModel(AtStep):
 
     @classmethod
     def of(cls, initial: Any, transition: Callable[..., Any], observation: Callable[..., Any]) -> StateSpaceModel:
-        """A model from distributions of this package, frozen ones of scipy.stats, or those of torch.
+        """A model from distributions of this package, or frozen ones of scipy.stats.
 
         `initial` is the distribution of x_0, ``transition(particles)`` that of x_t, and ``observation(particles)``
         that of y_t, one row per particle. The functions may have the further parameters ``t`` and ``u``.
@@ -136,8 +135,6 @@ class StateSpaceModel(AtStep):
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     """(n,) log p(y | x). Without the check, entries of a vector would be compared with the particles one by one."""
     found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
-    if isinstance(y, Rows) and found[1:] == event:  # one observation for each particle
-        return distribution.log_prob(np.asarray(y))
     if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
         raise InputError(
             f"the observation has shape {found}, expected the event shape {event}",
@@ -365,7 +362,7 @@ def bootstrap(
 
 def guided(
     model: StateSpaceModel,
-    proposal: Callable[[Any, Any], Any],
+    proposal: Callable[[Any, Any], Any] | None,
     n: int,
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
@@ -377,7 +374,7 @@ def guided(
     model : StateSpaceModel
         With its log densities.
     proposal : callable
-        ``(particles, y) -> distribution`` of x_t.
+        ``(particles, y) -> distribution`` of x_t; None: the transition of the model.
     initial : callable, optional
         ``(y) -> distribution`` of x_0; default the prior of the model.
     **components
@@ -413,13 +410,7 @@ def auxiliary(
     **components
         As in `guided`.
     """
-    return replace(
-        bootstrap(model, n),
-        initial=Prior(model, initial),
-        transition=Dynamics(model, proposal),
-        lookahead=PriorityLookahead(log_priority),
-        **components,
-    )
+    return replace(guided(model, proposal, n, initial, **components), lookahead=PriorityLookahead(log_priority))
 
 
 def resample_move(model: StateSpaceModel, move: Rejuvenation, n: int, **components: Any) -> ParticleFilter:

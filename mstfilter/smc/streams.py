@@ -21,14 +21,15 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from hashlib import shake_128
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.random.bit_generator import ISpawnableSeedSequence
+from numpy.random import PCG64, Generator
+from numpy.random.bit_generator import ISeedSequence, ISpawnableSeedSequence
 
 from mstfilter.errors import InputError
 
@@ -59,7 +60,7 @@ class Key:
 
     def generator(self) -> np.random.Generator:
         """A new generator at the start of the stream."""
-        return np.random.Generator(np.random.PCG64(_KeySequence(self)))  # type: ignore[arg-type]
+        return Generator(PCG64(_KeySequence(self)))  # type: ignore[arg-type]
 
 
 class _KeySequence(ISpawnableSeedSequence):
@@ -87,31 +88,14 @@ class _KeySequence(ISpawnableSeedSequence):
         return [_KeySequence(self.key.child("spawn", k)) for k in range(first, self._n_spawned)]
 
 
-class _Words(ISpawnableSeedSequence):
-    """The seed of a generator that has no children."""
-
-    def __init__(self, words: np.ndarray) -> None:
-        self.words = words
-
-    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
-        return self.words
-
-    def spawn(self, n_children: int) -> list[Any]:
-        raise InputError("the generators of many runs have no children")
-
-
-def generators_of_step(keys: Iterable[Key], slot: str, t: int) -> list[np.random.Generator]:
-    """``key.child(slot, t).generator()`` for each key, without children, in half the time."""
-    block, row = divmod(t, _BLOCK)
-    words = [_seeds(key.seed, (*key.path, slot), block)[row] for key in keys]
-    return [np.random.Generator(np.random.PCG64(_Words(w))) for w in words]  # type: ignore[arg-type]
-
-
 @lru_cache(maxsize=1 << 13)
 def _seeds(seed: int, path: tuple[int | str, ...], block: int | None) -> np.ndarray:
     """(16, 4) uint64 seeds of PCG64, one for each index of a block of a path, or one for the path itself."""
-    name = repr((seed, path, block)).encode()
-    return np.frombuffer(shake_128(name).digest(32 * _BLOCK), "<u8").reshape(_BLOCK, 4)
+    return np.frombuffer(_digest(seed, path, block), "<u8").reshape(_BLOCK, 4)
+
+
+def _digest(seed: int, path: tuple[int | str, ...], block: int | None) -> bytes:
+    return shake_128(repr((seed, path, block)).encode()).digest(32 * _BLOCK)
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
@@ -163,6 +147,33 @@ class Rows(np.ndarray):
 def rows_of(n: int) -> type[Rows]:
     """The class of arrays with `n` rows for each run; numpy gives it to the results of operations."""
     return type("Rows", (Rows,), {"n": n})
+
+
+class RunKeys:
+    """The keys of R runs: makes the generators of a component at a step for some of them, in half the time."""
+
+    def __init__(self, keys: list[Key]) -> None:
+        self.keys = keys
+        self._blocks: dict[str, tuple[int, np.ndarray]] = {}  # slot -> number of a block of steps, (R, 16, 4) seeds
+
+    def generators(self, slot: str, t: int, runs: np.ndarray) -> list[np.random.Generator]:
+        """``keys[r].child(slot, t).generator()`` for each r of `runs`; these generators have no children."""
+        block, row = divmod(t, _BLOCK)
+        if slot not in self._blocks or self._blocks[slot][0] != block:
+            digests = [_digest(key.seed, (*key.path, slot), block) for key in self.keys]
+            self._blocks[slot] = block, np.frombuffer(b"".join(digests), "<u8").reshape(-1, _BLOCK, 4)
+        seeds = _SeedsInTurn(self._blocks[slot][1][runs, row])
+        return [Generator(PCG64(seeds)) for _ in runs]  # type: ignore[arg-type]
+
+
+class _SeedsInTurn(ISeedSequence):
+    """Seeds (k, 4) of k generators, each of which asks for its seed once. One object takes less time than k."""
+
+    def __init__(self, words: np.ndarray) -> None:
+        self._rows = iter(words)
+
+    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> np.ndarray:
+        return next(self._rows)
 
 
 class RunGenerators:
@@ -235,8 +246,8 @@ class RunGenerators:
         if not inner:
             return np.array([draw(rng) for rng in self._generators])
         out = np.empty((len(self), *inner))
-        for row, rng in zip(out.reshape(len(self), -1), self._generators, strict=True):
-            draw(rng, out=row)
+        for row, rng in zip(out, self._generators, strict=True):
+            row[...] = draw(rng, inner)  # takes less time than out=row
         return self._joined(out)
 
 
@@ -269,29 +280,6 @@ def each_array(function: Callable[[np.ndarray], np.ndarray], particles: Any) -> 
     raise InputError("the particles are objects")
 
 
-def flat(particles: Any, n: int) -> Any:
-    """Particles (R n, ...) of particles (R, n, ...)."""
-    return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(n)), particles)
-
-
-def by_run(particles: Any, n: int) -> Any:
-    """Particles (R, n, ...) of particles (R n, ...)."""
-    return each_array(lambda a: np.asarray(a).reshape(-1, n, *a.shape[1:]), particles)
-
-
 def of_runs(particles: Any, row: Any) -> Any:
     """Particles of one run, or of the runs of an index."""
     return each_array(lambda a: a[row], particles)
-
-
-def resampled_runs(particles: Any, rows: np.ndarray, index: np.ndarray) -> Any:
-    """Particles after resampling some rows by (len(rows), n) ancestors."""
-
-    def chosen(a: np.ndarray) -> np.ndarray:
-        if len(rows) == len(a):
-            return a[rows[:, None], index]
-        out = a.copy()
-        out[rows] = a[rows[:, None], index]
-        return out
-
-    return each_array(chosen, particles)

@@ -12,16 +12,14 @@ from mstfilter.smc import (
     Always,
     Chains,
     Infos,
-    Multinomial,
     Population,
     bootstrap,
     collect,
     ess,
-    n_particles,
+    mean,
     resampled,
     run_many,
     unique_ancestors,
-    weight_entropy,
 )
 from tests.smc.models import AR1, ar1_observations
 
@@ -35,60 +33,6 @@ PARTICLES = {
 }
 
 
-def same(a, b):
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[name], b[name]) for name in a)
-    return a.dtype == b.dtype and np.array_equal(a, b)
-
-
-@pytest.mark.parametrize("kind", PARTICLES)
-def test_weighted_particles_come_back_from_a_tree(kind):
-    pytest.importorskip("xarray")
-    population = Population(PARTICLES[kind], LOG_WEIGHTS)
-    tree = population.to_arviz()
-    assert tree["posterior"].attrs["weights"] == "sample_stats/log_weight"
-    assert tree["sample_stats"]["log_weight"].dims == ("chain", "draw")
-    assert all(a.dims[:2] == ("chain", "draw") and a.shape[:2] == (1, 6) for a in tree["posterior"].values())
-    again = Population.from_arviz(tree)
-    assert same(again.particles, population.particles)
-    np.testing.assert_array_equal(again.log_weights, population.log_weights)
-
-
-def test_equally_weighted_draws_are_not_marked():
-    pytest.importorskip("xarray")
-    drawn = Multinomial().resample(RNG, Population(PARTICLES["numbers"], LOG_WEIGHTS), 8)
-    assert "weights" not in drawn.to_arviz()["posterior"].attrs
-    assert Population.from_arviz(drawn.to_arviz()).log_mean_weight == drawn.log_mean_weight
-
-
-def test_chains_as_a_tree():
-    pytest.importorskip("xarray")
-    tree = CHAINS.to_arviz(["a", "b", "c"], discard=1)
-    assert tree["posterior"].sizes == {"chain": 2, "draw": 3} and "weights" not in tree["posterior"].attrs
-    for k, name in enumerate("abc"):
-        np.testing.assert_array_equal(tree["posterior"][name].values, CHAINS.theta[1:, :, k].T)
-    np.testing.assert_array_equal(tree["sample_stats"]["lp"].values, CHAINS.log_density[1:].T)
-    np.testing.assert_array_equal(tree["sample_stats"]["log_evidence"].values, CHAINS.log_evidence[1:].T)
-    draws = Population.from_arviz(CHAINS.to_arviz())
-    np.testing.assert_array_equal(draws.particles["theta"], CHAINS.theta.swapaxes(0, 1).reshape(8, 3))
-    assert draws.ess == 8
-    unknown = Chains(CHAINS.theta, np.full((4, 2), np.nan), np.full((4, 2), np.nan), CHAINS.accepted)
-    assert list(unknown.to_arviz().children) == ["posterior"]
-    with pytest.raises(InputError, match="2 names for 3 parameters"):
-        CHAINS.to_arviz(["a", "b"])
-
-
-def test_arviz_reads_the_trees():
-    """With ArviZ 0.2x as with 1.0: the mean that it reports is that of the draws."""
-    arviz = pytest.importorskip("arviz")
-    data = CHAINS.to_arviz(["a", "b", "c"])
-    convert = getattr(getattr(arviz, "InferenceData", None), "from_datatree", lambda tree: tree)
-    data = convert(data)
-    summary = arviz.summary(data, round_to=6)
-    np.testing.assert_allclose(summary["mean"].to_numpy(float), CHAINS.theta.mean(axis=(0, 1)), atol=1e-5)
-    assert Population.from_arviz(data).particles["b"].tolist() == CHAINS.theta[:, :, 1].T.ravel().tolist()
-
-
 def test_columns_of_particles():
     assert list(Population(PARTICLES["vectors"]).columns()) == ["x_0", "x_1", "weight", "log_weight"]
     mapping = Population(PARTICLES["mapping"], LOG_WEIGHTS)
@@ -98,8 +42,6 @@ def test_columns_of_particles():
     np.testing.assert_array_equal(columns["weight"], mapping.weights)
     objects = Population(("a", ("b",)))
     assert objects.columns()["particle"].tolist() == ["a", ("b",)]
-    with pytest.raises(InputError, match="str objects"):
-        objects.to_arviz()
     with pytest.raises(InputError, match="arrays called weight"):
         Population({"weight": np.zeros(2)}).columns()
 
@@ -118,7 +60,9 @@ def test_data_frames():
     pandas, _ = pytest.importorskip("pandas"), pytest.importorskip("xarray")
     ys = ar1_observations(5)
     _, infos = bootstrap(AR1, 8).run(ys, 1)
-    history = run_many({"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=n_particles)
+    history = run_many(
+        {"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=lambda state, info: info.n
+    )
     for table in (infos, history, CHAINS, Population(PARTICLES["mapping"])):
         frame = table.to_pandas()
         assert isinstance(frame, pandas.DataFrame)
@@ -136,10 +80,10 @@ def test_data_frames():
 def test_a_missing_library(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(MissingLibraryError, match="needs the library pandas"):
+    with pytest.raises(MissingLibraryError, match="this export needs pandas"):
         CHAINS.to_pandas()
-    with pytest.raises(MissingLibraryError, match="needs the library xarray"):
-        CHAINS.to_arviz()
+    with pytest.raises(MissingLibraryError, match="this export needs xarray"):
+        collect([]).to_xarray()
 
 
 def test_a_history_shows_itself_in_five_lines():
@@ -149,15 +93,15 @@ def test_a_history_shows_itself_in_five_lines():
     assert repr(few) == f"History: time 5\n  ess float64 (5,), {low:.4g} to {high:.4g}\n  resampled bool (5,)"
     collectors = {
         "ess": ess,
-        "n": n_particles,
+        "n": lambda state, info: info.n,
         "unique": unique_ancestors,
-        "entropy": weight_entropy,
+        "mean": mean,
         "fired": resampled,
     }
     many = run_many({"a": filter}, [*ys, 1e200], [1, 2], **collectors)
     lines = repr(many).splitlines()
     assert lines[0] == "History: arm 1, seed 2, time 6, 2 runs lost" and len(lines) == 5
-    assert lines[-1] == "  also entropy, fired"
+    assert lines[-1] == "  also mean, fired"
     assert repr(collect([])) == "History: time 0"
 
 

@@ -27,8 +27,6 @@ def test_a_fault_is_a_named_error(name):
 @pytest.mark.parametrize("name", CORRECT)
 def test_a_correct_program_runs(name):
     filter, ys = CORRECT[name]
-    if "torch" in name:
-        pytest.importorskip("torch", reason="torch cannot be imported", exc_type=ImportError)
     for seed in range(3):
         with warnings.catch_warnings():
             warnings.simplefilter("error")

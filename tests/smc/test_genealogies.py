@@ -1,4 +1,4 @@
-"""Single-run variances against their definition and against many runs; coalescence against Wright and Fisher."""
+"""Single-run variances against their definition and against many runs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,9 @@ from mstfilter.smc import (
     KeepWeights,
     Multinomial,
     Never,
-    Population,
-    Record,
     StateSpaceModel,
     Systematic,
     bootstrap,
-    coalescence,
     keep,
     log_evidence,
     mean,
@@ -161,44 +158,3 @@ def test_wrong_calls_are_named():
     ):
         with pytest.raises(InputError, match=message):
             call()
-
-
-def test_coalescence_by_hand():
-    parents = [None, [0, 0, 2, 3], [1, 1, 2, 3], [2, 0, 1, 2]]
-    weights = [None, None, None, [0.4, 0.3, 0.3, 0.0]]
-    record = Record(
-        tuple(
-            Population(
-                np.zeros(4),
-                None if w is None else safe_log(w),
-                {} if p is None else {"previous": p},
-            )
-            for p, w in zip(parents, weights, strict=True)
-        ),
-        (0,) * 4,
-    )
-    # Last particles 0, 1, 2 descend from 2, 0, 1 at time 2, from 2, 1, 1 at time 1, and from 2, 0, 0 at time 0.
-    found = coalescence(record)
-    assert found.ancestors.tolist() == [2, 2, 3, 3] and found.time is None
-    assert found.shared == pytest.approx([0.16 + 0.36, 0.16 + 0.36, 0.34, 0.34])
-    assert found.pair_time == pytest.approx(0.48 * 2 + 0.66 * 2)
-
-
-def safe_log(w):
-    with np.errstate(divide="ignore"):
-        return np.log(w)
-
-
-def test_neutral_selections_coalesce_as_wright_and_fisher_say():
-    """Pairs within 4.5 standard errors of 1 - (1 - 1/n)^s, common ancestors of 3 by the chain of their numbers."""
-    flat = replace(AR1, log_likelihood=lambda x, y: np.zeros(len(x)))
-    filter, R, T = bootstrap(flat, 3, Multinomial(), Always()), 150, 40
-    found = [coalescence(keep(filter, [0.0] * T, seed)) for seed in range(R)]
-    shared = np.array([f.shared for f in found])[:, -9:]
-    back = np.arange(9)[::-1]
-    expected = 1 - (1 - 1 / 3) ** (back + 1)  # one of three draws is the particle itself
-    error = shared.std(axis=0, ddof=1) / np.sqrt(R)
-    assert (np.abs(shared.mean(axis=0) - expected) <= 4.5 * error + 1e-12).all()
-    # 3 lines become 1, 2, 3 with probability 1/9, 6/9, 2/9; 2 become 1, 2 with 1/3, 2/3: mean 9/7 + 6/7 * 3.
-    times = np.array([f.time for f in found], dtype=float)
-    assert abs(times.mean() - (9 / 7 + 18 / 7)) < 4.5 * times.std(ddof=1) / np.sqrt(R)

@@ -5,7 +5,6 @@ Chi-square tests at 1e-4, means at 5 standard errors: false alarm below 2e-3 for
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -35,7 +34,6 @@ from mstfilter.smc import (
     observe,
     particle_gibbs,
     path_log_prob,
-    per_particle,
     pmmh,
     sample,
     smc_sampler,
@@ -103,15 +101,11 @@ CONDITIONAL = {  # two particles: an error of the weights shows
     "guided program": Program(chain).guided(guide, 2),
     "switch": Program(branching).bootstrap(2),
     "returned values": Program(keeping).bootstrap(2),
-    "per particle": Program(per_particle(chain)).bootstrap(2),
-    "guided per particle": Program(per_particle(chain)).guided(per_particle(guide), 2),
 }
 
 
 def as_path(name, states):
     """The states (T,) as a path of particles of a filter."""
-    if "per particle" in name:
-        return tuple({"k": int(k)} for k in states)
     if name == "objects":
         return tuple(BOXES[k] for k in states)
     if name == "mapping":
@@ -121,22 +115,17 @@ def as_path(name, states):
     return {"k": states} if name in ("program", "guided program", "switch") else states
 
 
-def states_in(path):
-    traces = isinstance(path, tuple) and isinstance(path[0], Mapping)
-    return np.array([trace["k"] for trace in path]) if traces else states_of(path)
-
-
-@pytest.mark.parametrize("name", ["vector", "no density", "guided", "per particle", "guided per particle"])
+@pytest.mark.parametrize("name", ["vector", "no density", "guided"])
 def test_conditional_smc_keeps_the_law_of_paths(name):
     """Chi-square of the paths after three sweeps from paths that are drawn from the exact posterior."""
-    n = 100 if "per particle" in name else 300
+    n = 300
     starts = np.random.default_rng(1).choice(len(PATHS), n, p=JOINT / JOINT.sum())
     counts, moved = np.zeros(len(PATHS)), 0
     for seed, k in enumerate(starts):
         path = as_path(name, PATHS[k])
         for sweep in range(3):
             path = conditional_path(CONDITIONAL[name], SYMBOLS, 3 * seed + sweep, path)
-        end = states_in(path)
+        end = states_of(path)
         counts[int(end @ [9, 3, 1])] += 1
         moved += not np.array_equal(end, PATHS[k])
     expected = n * JOINT / JOINT.sum()
@@ -164,7 +153,7 @@ def test_conditional_smc_is_the_same_for_every_form_of_a_model(name, same):
     for seed in range(60):
         one = conditional_path(CONDITIONAL[name], SYMBOLS, seed, one)
         other = conditional_path(CONDITIONAL[same], SYMBOLS, seed, other)
-        np.testing.assert_array_equal(states_in(one), other)
+        np.testing.assert_array_equal(states_of(one), other)
         distinct.add(tuple(other))
     assert len(distinct) > 3
 
@@ -194,8 +183,6 @@ def test_what_has_no_conditional_form():
         conditional_path(bootstrap(AR1, 5), [])
     with pytest.raises(InputError, match="densities are not known"):
         path_log_prob(replace(bootstrap(AR1, 5), initial=Drawn()), ys, np.zeros(3))
-    with pytest.raises(InputError, match="per_particle"):
-        path_log_prob(CONDITIONAL["per particle"], [0], ({"k": 0},))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,6 @@ from mstfilter.smc import (
     keep,
     linear_gaussian,
     nonlinear_gaussian,
-    paris,
     path_log_prob,
     run_many,
 )
@@ -90,10 +89,9 @@ def test_the_first_transition_is_called_with_the_second_step():
 
 def test_batches_smoothing_and_conditional_paths_take_inputs():
     filter = bootstrap(MODEL, 20)
-    for paired, data in ((False, WITH), (True, [WITH, WITH[::-1]])):
-        runs = run_many(filter, data, [3, 4], paired=paired)
-        single = [filter.run(data[r] if paired else data, seed)[0] for r, seed in enumerate((3, 4))]
-        assert [state.log_evidence for state in single] == runs["log_evidence"][:, -1].tolist()
+    runs = run_many(filter, WITH, [3, 4])
+    single = [filter.run(WITH, seed)[0] for seed in (3, 4)]
+    assert [state.log_evidence for state in single] == runs["log_evidence"][:, -1].tolist()
     path = conditional_path(filter, WITH, 1)
     total = MODEL.log_initial(path[:1])[0]
     for t, y in enumerate(YS):
@@ -103,17 +101,6 @@ def test_batches_smoothing_and_conditional_paths_take_inputs():
     assert path_log_prob(filter, WITH, path) == pytest.approx(total, abs=1e-12)
     paths = backward_paths(np.random.default_rng(0), keep(filter, WITH, 0), Dynamics(MODEL), 50)
     assert len(paths) == len(WITH)
-    assert len(list(paris(filter, WITH, lambda t, old, new: new, Dynamics(MODEL)))) == len(WITH)
-
-
-def test_a_checkpoint_resumes_with_inputs(tmp_path):
-    filter, path = bootstrap(MODEL, 20), tmp_path / "run.npz"
-    filter.run(WITH[:3], 5, checkpoint=path)
-    resumed, _ = filter.run(WITH, 5, checkpoint=path)
-    assert resumed.log_evidence == filter.run(WITH, 5)[0].log_evidence
-    other = [WithInput(YS[0], 9.0), *WITH[1:]]
-    with pytest.raises(InputError, match="observations differ"):
-        filter.run(other, 5, checkpoint=path)
 
 
 def test_an_input_that_is_not_given_is_named():

@@ -18,7 +18,6 @@ from mstfilter.smc import (
     Always,
     DensityTransition,
     Dynamics,
-    LargestWeights,
     Population,
     Proposal,
     RandomWalkMove,
@@ -30,7 +29,6 @@ from mstfilter.smc import (
     genealogy,
     guided,
     keep,
-    paris,
     resample_move,
 )
 from tests.smc.models import (
@@ -38,7 +36,6 @@ from tests.smc.models import (
     MOVES,
     RHO,
     SD0,
-    SIGMA,
     SYMBOLS,
     TAU,
     ar1_observations,
@@ -88,10 +85,8 @@ FILTERS = {
 }
 
 
-BOUND = -np.log(SIGMA * np.sqrt(2 * np.pi))
 METHODS = {
     "exact": {},
-    "rejection": {"method": "rejection", "log_bound": BOUND},
     "mcmc": {"method": "mcmc"},
     "mcmc, 4 steps": {"method": "mcmc", "steps": 4},
 }
@@ -120,7 +115,7 @@ def independent_metropolis(target, weights, steps):
     return np.linalg.matrix_power(kernel, steps)
 
 
-@pytest.mark.parametrize("method", ["exact", "rejection", "mcmc", "mcmc, 4 steps"])
+@pytest.mark.parametrize("method", METHODS)
 def test_the_law_of_a_path_given_the_record(method):
     """Chi-square over all 64 paths of indices, 20,000 paths; the law of the Markov chain is enumerated."""
     record, dynamics, moves, parents = small_record()
@@ -137,9 +132,7 @@ def test_the_law_of_a_path_given_the_record(method):
             return dynamics.log_prob(*(states[4 * (x // 10) + x % 10] for x in (previous, new)), observation)
 
     rng, n = np.random.default_rng(5), 20_000
-    found = backward_paths(
-        rng, marked, Marked(), n, **METHODS[method] | ({"log_bound": np.log(0.8)} if method == "rejection" else {})
-    )
+    found = backward_paths(rng, marked, Marked(), n, **METHODS[method])
     index = np.array([p.particles % 10 for p in found])
     steps = METHODS[method].get("steps", 1)
     wanted = record.populations[2].weights
@@ -170,45 +163,6 @@ def test_smoothers_agree_with_the_joint_gaussian(name):
     if name == "always":
         noise = [np.std(found[method], axis=0)[0, 0] for method in ("genealogy", "exact")]
         assert noise[0] > 1.3 * noise[1]
-
-
-def path_sums(t, previous, x):
-    """Terms of sum x_t, and of sum x_{t-1} x_t."""
-    return np.stack([x, np.zeros(len(x)) if previous is None else previous * x], axis=1)
-
-
-@pytest.mark.parametrize("method", ["exact", "rejection", "mcmc"])
-@pytest.mark.parametrize("name", ["bootstrap", "after", "guided"])
-def test_paris_agrees_with_the_joint_gaussian(name, method):
-    """Sums over the whole path, at the end and at an earlier time (given the observations so far)."""
-    filter = replace(FILTERS[name], n=60)
-    runs = [list(paris(filter, YS, path_sums, Dynamics(AR1), seed, **METHODS[method])) for seed in range(30)]
-    runs = np.array(runs)
-    assert runs.shape == (30, T, 2)
-    mean, _, neighbours = smoothed()
-    wanted = np.array([mean.sum(), (neighbours + mean[1:] * mean[:-1]).sum()])
-    error = runs[:, -1].std(axis=0, ddof=1) / np.sqrt(30)
-    assert (np.abs(runs[:, -1].mean(axis=0) - wanted) < 5 * error + 4 / 60).all()
-    first = runs[:, 0, 0]
-    assert abs(first.mean() - kalman_ar1(YS)[0][0, 0]) < 5 * first.std(ddof=1) / np.sqrt(30) + 1 / 60
-
-
-def test_paris_has_less_variance_than_the_genealogy():
-    """With resampling at every step over 40 observations."""
-    ys, filter, sums = ar1_observations(40), bootstrap(AR1, 30, trigger=Always()), []
-    for seed in range(20):
-        *_, (total, _) = paris(filter, ys, path_sums, Dynamics(AR1), seed)
-        paths = genealogy(keep(filter, ys, seed))
-        sums.append([total, sum(p.weights @ p.particles for p in paths)])
-    variance = np.var(sums, axis=0)
-    assert variance[0] < 0.6 * variance[1]
-
-
-def test_paris_rejects():
-    with pytest.raises(InputError, match="transition is"):
-        next(paris(bootstrap(AR1, 5), YS, path_sums, AR1))
-    with pytest.raises(InputError, match="not properly weighted"):
-        next(paris(bootstrap(AR1, 5, LargestWeights()), YS, path_sums, Dynamics(AR1)))
 
 
 @pytest.mark.parametrize("kind", ["mapping", "objects"])
@@ -283,13 +237,11 @@ def test_the_density_is_asked_with_the_observation_of_its_move():
     assert listening.heard == YS[:0:-1]
 
 
-@pytest.mark.parametrize(("method", "most"), [("exact", 400), ("mcmc", 2), ("mcmc, 4 steps", 5), ("rejection", 12)])
+@pytest.mark.parametrize(("method", "most"), [("exact", 400), ("mcmc", 2), ("mcmc, 4 steps", 5)])
 def test_the_number_of_densities_per_path_and_step(method, most):
-    """Of 400 particles; by rejection the mean is max f / p(x_{t+1}) = 1.5 to 3 in most steps of this record."""
     listening, record = Listening(AR1), keep(bootstrap(AR1, 400), YS, 1)
     backward_paths(np.random.default_rng(0), record, listening, 300, **METHODS[method])
-    number = sum(listening.sizes) / (300 * (T - 1))
-    assert number == most if method != "rejection" else 1.5 < number < most
+    assert sum(listening.sizes) / (300 * (T - 1)) == most
 
 
 @dataclass(frozen=True)
@@ -307,10 +259,8 @@ def test_what_cannot_be_smoothed():
     with pytest.raises(InputError, match="transition is StateSpaceModel"):
         backward_paths(rng, record, AR1, 5)
     for settings, message in (
-        ({"method": "metropolis"}, "method is 'metropolis', expected exact, mcmc or rejection"),
+        ({"method": "metropolis"}, "method is 'metropolis', expected exact or mcmc"),
         ({"method": "mcmc", "steps": 0}, "steps is 0"),
-        ({"method": "rejection"}, "log_bound is None"),
-        ({"method": "rejection", "log_bound": BOUND - 0.1}, "more than log_bound = "),
     ):
         with pytest.raises(InputError, match=message):
             backward_paths(rng, record, Dynamics(AR1), 200, **settings)

@@ -28,7 +28,6 @@ from mstfilter.smc import (
     guided,
     key_of,
     observe,
-    per_particle,
     resample_move,
     run_many,
     sample,
@@ -90,7 +89,6 @@ ASSEMBLIES = {
     "clusters": branching(bootstrap(AR1, 8, ClusterStratified(), Always())),
     "KLD size": branching(replace(bootstrap(AR1, 8, trigger=Always()), size=Kld(n_min=2, n_max=9))),
     "program": branching(Program(walk).resample_move(8, guide=guide, trigger=Always())),
-    "per particle": branching(Program(per_particle(walk)).resample_move(8, trigger=Always())),
 }
 
 

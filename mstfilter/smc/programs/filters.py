@@ -1,4 +1,4 @@
-"""Filters from a program: bootstrap, guided, auxiliary and resample-move."""
+"""Filters from a program: bootstrap, guided and resample-move."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fields import NonNegativeFloat, PositiveFloat, PositiveInt
+from mstfilter.fields import PositiveFloat, PositiveInt
 from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import AtStep
-from mstfilter.smc.interfaces import Component, Lookahead, Proposal, Rejuvenation, Transition
+from mstfilter.smc.interfaces import Component, Proposal, Rejuvenation, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
-    CentreHandler,
     GuideHandler,
     ReplayHandler,
     SampleHandler,
@@ -29,9 +27,9 @@ from mstfilter.smc.programs.handlers import (
     Site,
     SiteHandler,
 )
-from mstfilter.smc.programs.sites import PerParticle, ProgramRun, Trace, active_run
+from mstfilter.smc.programs.sites import ProgramRun, active_run
 from mstfilter.smc.state_space import choose_rows, moved
-from mstfilter.smc.streams import RunGenerators, child
+from mstfilter.smc.streams import RunGenerators
 
 Model = Callable[..., Any]
 _Scored = tuple[ProgramRun, list[Site]]
@@ -67,10 +65,6 @@ class Program:
         """
         return self._filter(guide, n, components)
 
-    def auxiliary(self, n: int, guide: Model | None = None, power: float = 1.0, **components: Any) -> ParticleFilter:
-        """Auxiliary filter with an automatic lookahead, exact for every model; see `ProgramLookahead`."""
-        return replace(self._filter(guide, n, components), lookahead=ProgramLookahead(self.model, power))
-
     def resample_move(
         self, n: int, steps: int = 1, scale: float = 0.5, guide: Model | None = None, **components: Any
     ) -> ParticleFilter:
@@ -82,25 +76,15 @@ class Program:
         return ParticleFilter(initial=initial, transition=transition, n=n, **components)
 
 
-class _OfProgram(AtStep):
-    """A component with a model, and perhaps a guide, that may depend on the step."""
-
-    @property
-    def step_functions(self) -> Mapping[str, int | None]:  # type: ignore[override]
-        functions = {name: value for name, value in vars(self).items() if name in ("model", "guide")}
-        return {name: None if isinstance(value, PerParticle) else 2 for name, value in functions.items()}
-
-
 @dataclass(frozen=True)
-class _ProgramStep(_OfProgram, Component):
+class _ProgramStep(Component):
     """A step of a program: draws, by the guide if there is one, and weights."""
 
     model: Model
     guide: Model | None = None
 
-    @property
-    def batched(self) -> bool | None:
-        return False if isinstance(self.model, PerParticle) else None
+    batched: ClassVar[bool | None] = None
+    step_functions: ClassVar = {"model": 2, "guide": 2}
 
     @cached_property
     def schedule(self) -> Schedule:
@@ -127,7 +111,7 @@ class _ProgramStep(_OfProgram, Component):
         try:
             return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
         except InputError:
-            if np.isnan(gain).any() and not isinstance(model, PerParticle):  # name the site
+            if np.isnan(gain).any():  # name the site
                 run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
             raise
 
@@ -154,36 +138,13 @@ def _step(
     """Particles, drawn by the guide if there is one, and gains of the log weights."""
     if guide is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
-    if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
-        raise InputError("model and guide must both be per_particle, or neither")
     proposed = GuideHandler(rng, n)
     run_program(guide, proposed, previous, observation, n)
     return run_program(model, ReplayHandler(proposed), previous, observation, n)
 
 
 @dataclass(frozen=True)
-class ProgramLookahead(_OfProgram, Lookahead):
-    """Priority from a run with the mean (mode of a discrete site) instead of each draw.
-
-    It is raised to `power`; below 1 if the lookahead at the mean is too confident.
-    """
-
-    model: Model
-    power: NonNegativeFloat = 1.0
-
-    def log_priority(self, population: Population, observation: Any) -> np.ndarray:
-        """(n,) log probability of the observation, bounded from below."""
-        with hypothetical():
-            _, priority = run_program(self.model, CentreHandler(), population.particles, observation, len(population))
-        # An observation that is impossible at the mean may be possible for a draw: at most 50 below the best.
-        top = priority.max()
-        if not np.isfinite(top):
-            return np.zeros(len(priority))
-        return self.power * np.maximum(np.nan_to_num(priority, nan=-np.inf), top - 50.0)
-
-
-@dataclass(frozen=True)
-class ProgramMove(_OfProgram, Rejuvenation):
+class ProgramMove(Rejuvenation):
     """Metropolis-Hastings on all sites of a step at once.
 
     Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution; discrete sites
@@ -202,44 +163,22 @@ class ProgramMove(_OfProgram, Rejuvenation):
     scale: PositiveFloat = 0.5
     steps: PositiveInt = 1
 
+    step_functions: ClassVar = {"model": 2}
+
     def move(
         self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
     ) -> Population:
         past, n = None if previous is None else previous.particles, len(population)
-        particles: Particles
-        if not isinstance(self.model, PerParticle):
-            particles, accepted = self._moved(rng, self.model, population.particles, past, observation, n, False)
-        else:
-            traces, rates = [], []
-            for i, particle in enumerate(population.particles):
-                stream, before = child(rng, "particle", i), None if past is None else past[i]
-                new, rate = self._moved(stream, self.model.function, particle, before, observation, 1, True)
-                traces.append(Trace(new))
-                rates.append(rate)
-            particles, accepted = tuple(traces), float(np.mean(rates))
-        return Population(particles, population.log_weights, population.parents, {"accepted": accepted})
 
-    def _moved(
-        self, rng: np.random.Generator, function: Model, x: Any, previous: Any, observation: Any, n: int, single: bool
-    ) -> tuple[Mapping[str, Any], float]:
-        """Values after the steps, and the rate of accepted steps; `single` for one particle without particle axis."""
-
-        def score(values: Mapping[str, Any], no_axis: bool = False) -> _Scored:
-            handler = ScoreHandler(values, no_axis)
+        def score(values: Mapping[str, np.ndarray]) -> _Scored:
+            handler = ScoreHandler(values)
             with hypothetical():
-                return _run_once(function, handler, previous, observation, n, single), handler.sites
+                return _run_once(self.model, handler, past, observation, n), handler.sites
 
         def propose(rng: np.random.Generator, state: _Scored) -> tuple[_Scored, np.ndarray]:
             now, sites = state
             values = self._propose(rng, now.values, sites)
-            try:
-                new, new_sites = score(values)
-            except InputError as error:
-                if not single or not isinstance(error.__cause__, InputError | None):
-                    raise
-                return state, np.full(n, -np.inf)  # other sites are reached, which have no values
-            if [s.name for s in new_sites] != [s.name for s in sites]:
-                return state, np.full(n, -np.inf)
+            new, new_sites = score(values)
             forward = self._log_density(now.values, values, sites, n)
             backward = self._log_density(values, now.values, new_sites, n)
             with np.errstate(invalid="ignore"):
@@ -250,8 +189,8 @@ class ProgramMove(_OfProgram, Rejuvenation):
                 return new if accepted.any() else old
             return score(choose_rows(accepted, new[0].values, old[0].values))
 
-        (now, _), rate = moved(rng, score(x, single), propose, self.steps, choose)
-        return _values_of(now), rate
+        (now, _), accepted = moved(rng, score(population.particles), propose, self.steps, choose)
+        return Population(_values_of(now), population.log_weights, population.parents, {"accepted": accepted})
 
     def _propose(
         self, rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site]
@@ -293,31 +232,20 @@ def run_program(
 
     Returns
     -------
-    particles : mapping of arrays (n, ...), or tuple of n `Trace`
+    particles : mapping of arrays (n, ...)
         Values of the sites, and the values that the program returned.
     gain : (n,) float64
         Added to the log weights.
     """
-    if not isinstance(model, PerParticle):
-        run = _run_once(model, handler, previous, observation, n, False)
-        return _values_of(run), run.gain
-    runs = [
-        _run_once(model.function, handler.row(i), None if previous is None else previous[i], observation, 1, True)
-        for i in range(n)
-    ]
-    return tuple(Trace(_values_of(r)) for r in runs), np.concatenate([r.gain for r in runs])
+    run = _run_once(model, handler, previous, observation, n)
+    return _values_of(run), run.gain
 
 
 def _run_once(
-    function: Model,
-    handler: SiteHandler,
-    previous: Any,
-    observation: Any,
-    n: int,
-    single: bool = False,
+    function: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> ProgramRun:
-    """One pass of a function, `single` without the particle axis."""
-    run = ProgramRun(handler, n, single)
+    """One pass of a function."""
+    run = ProgramRun(handler, n)
     run.function = function
     if isinstance(previous, dict):
         previous = MappingProxyType(previous)
@@ -345,15 +273,15 @@ def _call(function: Model, run: ProgramRun, previous: Any, observation: Any) -> 
 _RAW_ERRORS = {
     "truth value of an array": (
         "the program decides by an array that holds all particles (if, and, or, while)",
-        "use switch(name, probs, branches), numpy.where, or mark the program with @per_particle",
+        "use switch(name, probs, branches) or numpy.where",
     ),
     "scalar": (
         "the program uses an array that holds all particles as one number (float, int, range, math, list index)",
-        "use numpy (numpy.exp, x.astype(int), an array as table), or mark the program with @per_particle",
+        "use numpy (numpy.exp, x.astype(int)) or an array as table",
     ),
     "unhashable": (
         "the program uses an array that holds all particles as a key",
-        "use an array as table, table[x], or mark the program with @per_particle",
+        "use an array as table, table[x]",
     ),
     "read-only": (
         "the program changes an array of particles in place",
@@ -391,16 +319,13 @@ def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
         return InputError(
             f"previous has no {error.args[0]!r} ({place})",
             f"it has {sorted(previous)}, the sites and returned values of the step before",
-            *(["previous.get(name) is for sites that not all particles reach"] if run.single else []),
         )
     fact, *hints = next((_RAW_ERRORS[part] for part in _RAW_ERRORS if part in str(error)), ("the program fails",))
-    if run.single:
-        fact, hints = "the program fails", []
     return InputError(f"{fact} ({place}): {type(error).__name__}: {error}".replace("\n", " "), *hints)
 
 
 def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
-    """Check the values that a program returned: one row per particle, or any value of a single particle."""
+    """Check the values that a program returned: one row per particle."""
     if returned is None:
         return {}
     if not isinstance(returned, Mapping):
@@ -411,16 +336,15 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
     for name, value in returned.items():
         if name in ("log_weight", "log_weights"):
             raise InputError(f"a program returned {name!r}, which does not weight the particles", "use observe")
-        if not run.single:
-            value = np.asarray(value)
-            if value.flags.writeable:
-                value = np.array(value)  # the program may write to its array in the next step
-            if value.ndim == 0 or len(value) != run.n:
-                raise InputError(
-                    f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"
-                )
-            run.returns(name, value)
-        if name in run.values and not _equal(value, run.values[name][0] if run.single else run.values[name]):
+        value = np.asarray(value)
+        if value.flags.writeable:
+            value = np.array(value)  # the program may write to its array in the next step
+        if value.ndim == 0 or len(value) != run.n:
+            raise InputError(
+                f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"
+            )
+        run.returns(name, value)
+        if name in run.values and not _equal(value, run.values[name]):
             raise InputError(
                 f"a program returned {name!r} with other values than site {name!r}",
                 "return them under another name: densities and moves need the values of the site",
@@ -436,9 +360,8 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _values_of(run: ProgramRun) -> dict[str, Any]:
-    """The particle (or all particles) after a run: values of the sites, and returned values."""
-    values = {name: a[0] for name, a in run.values.items()} if run.single else run.values
-    particles = {**values, **run.returned}
+    """All particles after a run: values of the sites, and returned values."""
+    particles = {**run.values, **run.returned}
     if not particles:
         raise InputError("the program sampled nothing and returned nothing: a particle would be empty")
     return particles

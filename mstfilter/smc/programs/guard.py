@@ -9,9 +9,7 @@ fault of every third step):
    first run.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-3. Particles of a `per_particle` program run alone, too. In the first two steps, each sees the lists, dictionaries,
-   sets and arrays in the closure and the global variables of the function as before the step.
-4. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
+3. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
    the evidence must agree.
 
 The results of a filter do not depend on these checks.
@@ -19,14 +17,12 @@ The results of a filter do not depend on these checks.
 
 from __future__ import annotations
 
-import pickle
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from copy import copy
+from copy import deepcopy
 from functools import partial
-from types import CellType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -35,7 +31,7 @@ from mstfilter.errors import InputError, InputWarning
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
 from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler
-from mstfilter.smc.programs.sites import Call, PerParticle, ProgramRun, recorded
+from mstfilter.smc.programs.sites import Call, ProgramRun, recorded
 from mstfilter.smc.streams import child
 
 #: Numbers of the steps of one kind that are checked.
@@ -62,9 +58,9 @@ class Guard:
     ) -> None:
         self.rng, self.past, self.observation, self.model, self.guide = rng, past, observation, model, guide
         self.previous, self.count = None if past is None else past.particles, count
-        self.state, self.content = rng.bit_generator.state, self._content()
-        #: Functions that know nothing of this step.
-        self.fresh = {id(f): _with_copies(f) for f in (model, guide) if f is not None} if count <= 2 else {}
+        self.state = rng.bit_generator.state
+        #: Copies that know nothing of this step, of objects that are models and may keep values.
+        self.fresh = {id(f): _copy(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
         """Particles and gain of the log weights, as ``step()`` returns them; InputError if a check fails."""
@@ -72,30 +68,12 @@ class Guard:
             particles, gain = step()
         if self.count <= 2:
             self._repeat(step, particles, gain, runs)
-        if isinstance(self.model, PerParticle):
-            if self._content() != self.content:
-                raise InputError(
-                    "the program changes a value of `previous` in place, which copies of the particle share",
-                    "copy it first (copy.deepcopy), change the copy and return that",
-                )
-            if self.fresh and self.guide is None:
-                self._check_single(run, particles, gain)
-            return particles, gain
         for whole in runs:
             for rows in _groups(whole) if whole.n > 1 else ():
                 self._check_alone(run, whole, rows)
         if self.guide is not None and len(gain) >= 100:
             self._check_guide(run, gain)
         return particles, gain
-
-    def _content(self) -> bytes | None:
-        """The objects in the particles of a `per_particle` program, as bytes, which are compared and never read."""
-        if not isinstance(self.model, PerParticle):
-            return None
-        try:
-            return pickle.dumps(self.previous)
-        except Exception:  # an object that cannot be pickled is not checked
-            return None
 
     # --- the same random numbers ------------------------------------------------------------------------------------
     def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray, runs: list[ProgramRun]) -> None:
@@ -149,33 +127,11 @@ class Guard:
                     raise InputError(message, *_ALONE) from again
         return few, rows
 
-    def _check_single(self, run: Run, particles: Any, gain: np.ndarray) -> None:
-        """Compare two particles of a `per_particle` program with runs that keep nothing of the other particles."""
-        self.rng.bit_generator.state, after = self.state, self.rng.bit_generator.state
-        for i in {len(gain) - 1, len(gain) // 2}:
-            previous, handler = self.previous and self.previous[i], SampleHandler(self.rng).row(i)
-            try:
-                alone = run(_with_copies(self.fresh[id(self.model)]), handler, previous, self.observation, 1, True)
-            except Exception:  # a copy may lack what another function keeps: not checked
-                continue
-            values = {**{name: a[0] for name, a in alone.values.items()}, **alone.returned}
-            if not _close(gain[i], alone.gain[0], 1e-9) or _first_difference(particles[i], values) is not None:
-                raise InputError(
-                    f"particle {i} has other values or weights after the particles before it than alone",
-                    "keep values of a particle in the particle, not in global variables or closures",
-                )
-        self.rng.bit_generator.state = after
-
     def _run_again(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
         previous = None if self.previous is None else take(self.previous, rows)
         handler, arguments = CopyHandler(whole.values, rows), (previous, self.observation, len(rows))
         fresh = self.fresh.get(id(whole.function))
-        if fresh is not None:
-            try:
-                return run(_with_copies(fresh), handler, *arguments)
-            except Exception:  # a copy may lack what another function keeps
-                fresh = None
-        return run(whole.function, handler, *arguments)
+        return run(whole.function if fresh is None else _copy(fresh), handler, *arguments)
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
@@ -243,8 +199,8 @@ def _parts(function: Any) -> list[Any]:
 
     The models of many parameter values, as in PMMH, have the same parts.
     """
-    while isinstance(function, partial | PerParticle):
-        function = function.func if isinstance(function, partial) else function.function
+    while isinstance(function, partial):
+        function = function.func
     values = [*(getattr(function, "__defaults__", None) or ())]
     for cell in getattr(function, "__closure__", None) or ():
         with suppress(ValueError):  # an empty cell
@@ -252,42 +208,12 @@ def _parts(function: Any) -> list[Any]:
     return [getattr(function, "__code__", function), *(v for v in values if not isinstance(v, float | np.ndarray))]
 
 
-def _with_copies(function: Any) -> Any:
-    """The function with copies of the containers in its closure, defaults, globals and attributes."""
-    if isinstance(function, partial):
-        return partial(_with_copies(function.func), *function.args, **function.keywords)
-    if isinstance(function, PerParticle):
-        return _with_copies(function.function)
-    if isinstance(function, MethodType):
-        return MethodType(function.__func__, _with_copies(function.__self__))
+def _copy(function: Any) -> Any:
+    """A copy of an object that is a program; functions, and objects that cannot be copied, are shared."""
     try:
-        if isinstance(function, FunctionType):
-            return _function_with_copies(function)
-        new = copy(function)
-        if new is not function:
-            new.__dict__.update(_copied(vars(function)))
-    except Exception:  # an empty cell, a list in itself, or an object that cannot be copied
+        return deepcopy(function)
+    except Exception:
         return function
-    return new
-
-
-def _function_with_copies(function: FunctionType) -> FunctionType:
-    cells = tuple(CellType(_copied(cell.cell_contents)) for cell in function.__closure__ or ())
-    kept = function.__globals__
-    names = {name: _copied(kept[name]) for name in function.__code__.co_names if name in kept}
-    defaults = tuple(map(_copied, function.__defaults__ or ()))
-    new = FunctionType(function.__code__, {**kept, **names}, None, defaults, cells)
-    new.__kwdefaults__ = function.__kwdefaults__
-    return new
-
-
-def _copied(value: Any) -> Any:
-    """A copy of an array of at most 16 MiB or a container, and of those in it; other objects are shared."""
-    if type(value) is np.ndarray and value.nbytes <= 1 << 24:
-        return value.copy()
-    if type(value) is dict:
-        return {key: _copied(v) for key, v in value.items()}
-    return type(value)(map(_copied, value)) if type(value) in (list, set) else value
 
 
 def _check_returned(run: ProgramRun) -> None:
@@ -340,25 +266,16 @@ def _spread(values: np.ndarray) -> Any:
     return np.ptp(finite) if finite.size else 0.0
 
 
-def _first_difference(particles: Any, again: Any) -> str | None:
+def _first_difference(particles: Mapping[str, np.ndarray], again: Mapping[str, np.ndarray]) -> str | None:
     """The first name whose values differ between two populations."""
-    if isinstance(particles, Mapping):
-        if list(particles) != list(again):
-            return f"the names {sorted(set(particles) ^ set(again))}"
-        return next((f"values of {k!r}" for k, v in particles.items() if not _same(v, again[k])), None)
-    found = map(_first_difference, particles, again)
-    return next((f"{d} of particle {i}" for i, d in enumerate(found) if d is not None), None)
+    if list(particles) != list(again):
+        return f"the names {sorted(set(particles) ^ set(again))}"
+    pairs = ((name, np.asarray(a), np.asarray(again[name])) for name, a in particles.items())
+    return next((f"values of {name!r}" for name, a, b in pairs if not _same(a, b)), None)
 
 
-def _same(a: Any, b: Any) -> bool:
-    """Whether two values are equal up to rounding; objects without a comparison are."""
-    if isinstance(a, np.ndarray | np.generic | float):
-        return np.shape(a) == np.shape(b) and bool(_close(a, b, 1e-9).all())
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        return list(a) == list(b) and all(map(_same, a.values(), b.values()))
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(map(_same, a, b))
-    return type(a).__eq__ is object.__eq__ or bool(np.all(a == b))
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.shape == b.shape and bool(_close(a, b, 1e-9).all())
 
 
 def _first_call_that_differs(one: list[ProgramRun], two: list[ProgramRun]) -> str | None:

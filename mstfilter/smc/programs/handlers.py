@@ -1,6 +1,6 @@
 """Handlers decide the values of the sites of a program.
 
-A value is a draw, a replayed draw of a guide, the mean of the distribution, or given.
+A value is a draw, a replayed draw of a guide, or given.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical
 from mstfilter.smc.interfaces import Distribution
-from mstfilter.smc.streams import child
 
 
 class Site(NamedTuple):
@@ -42,7 +41,7 @@ class SiteHandler(ABC):
     draws : bool
         Whether the values are new, and not given.
     strict : bool
-        Whether a log density of NaN or +inf is an error. It is for single particles that are drawn.
+        Whether a log density of NaN or +inf is an error.
     """
 
     observes = True
@@ -52,10 +51,6 @@ class SiteHandler(ABC):
     @abstractmethod
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         """Values (size, ...) of a site and what they add to the log weights (None: nothing)."""
-
-    def row(self, index: int) -> SiteHandler:
-        """The handler of one particle of a `per_particle` program."""
-        return self
 
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
         """End a pass, in which the sites have the given values."""
@@ -70,9 +65,6 @@ class SampleHandler(SiteHandler):
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         return site.distribution.sample(self.rng, site.size), None
 
-    def row(self, index: int) -> SampleHandler:
-        return SampleHandler(child(self.rng, "particle", index))
-
 
 class GuideHandler(SiteHandler):
     """Draws every site for n particles, and keeps values and log densities for a `ReplayHandler`."""
@@ -84,7 +76,6 @@ class GuideHandler(SiteHandler):
         self.values: dict[str, np.ndarray] = {}
         self.log_q: dict[str, np.ndarray] = {}
         self.sites: dict[str, list[Site]] = {}
-        self.rows: list[GuideHandler] = []
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         value = site.distribution.sample(self.rng, site.size)
@@ -92,10 +83,6 @@ class GuideHandler(SiteHandler):
         log_q[site.index] = site.distribution.log_prob(value)
         self.sites.setdefault(site.name, []).append(site)
         return value, None
-
-    def row(self, index: int) -> GuideHandler:
-        self.rows.append(GuideHandler(child(self.rng, "particle", index), 1))
-        return self.rows[-1]
 
     def finish(self, values: dict[str, np.ndarray]) -> None:
         self.values = dict(values)
@@ -146,9 +133,6 @@ class ReplayHandler(SiteHandler):
                 "sample it in the same branches as in the model, or outside of the branches",
             )
 
-    def row(self, index: int) -> ReplayHandler:
-        return ReplayHandler(self.guide.rows[index])
-
     def finish(self, values: dict[str, np.ndarray]) -> None:
         unused = sorted(set(self.guide.values) - set(values))
         if unused:
@@ -165,15 +149,6 @@ def check_shape(what: str, value: np.ndarray, distribution: Distribution, size: 
             f"{what} have shape {value.shape}, expected {shape} by the {type(distribution).__name__}",
             "the mean of a distribution states the event shape: it is (), (n,), (1, d) or (n, d)",
         )
-
-
-class CentreHandler(SiteHandler):
-    """Sets every site to the mean of its distribution (mode if discrete)."""
-
-    draws = False
-
-    def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        return np.broadcast_to(site.distribution.centre, site.distribution.value_shape(site.size)), None
 
 
 class CopyHandler(SiteHandler):
@@ -196,24 +171,19 @@ class CopyHandler(SiteHandler):
 class ScoreHandler(SiteHandler):
     """Takes given values of each site, weights them by their density, and keeps the sites.
 
-    With `single` they are the values of one particle, without the particle axis. With `strict`, a log density of NaN
-    or +inf is an error.
+    With `strict`, a log density of NaN or +inf is an error.
     """
 
     draws = False
 
-    def __init__(self, values: Mapping[str, Any], single: bool = False, strict: bool = False) -> None:
-        self.values, self.single, self.strict = values, single, strict
+    def __init__(self, values: Mapping[str, np.ndarray], strict: bool = False) -> None:
+        self.values, self.strict = values, strict
         self.sites: list[Site] = []
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         if site.name not in self.values:
             raise InputError("there is no value for it")
         self.sites.append(site)
-        value = np.asarray(self.values[site.name])[None] if self.single else self.values[site.name]
-        value = value[site.index]
+        value = self.values[site.name][site.index]
         check_shape("the values", value, site.distribution, site.size)
         return value, site.distribution.log_prob(value)
-
-    def row(self, index: int) -> ScoreHandler:
-        return ScoreHandler(self.values, self.single)

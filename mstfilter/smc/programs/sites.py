@@ -6,14 +6,12 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.distributions import Categorical, as_distribution
-from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import frozen_view, take
 from mstfilter.smc.programs.handlers import Site, SiteHandler, check_shape
@@ -41,12 +39,12 @@ def sample(name: str, distribution: Any) -> Any:
     name : str
         Unique within a step, except for sites in different branches of a `switch`.
     distribution : Distribution
-        Of this package, frozen of scipy.stats, or of torch; parameters have one row per particle.
+        Of this package or frozen of scipy.stats; parameters have one row per particle.
 
     Returns
     -------
     ndarray ``(n, *event_shape)``
-        One row per particle, read-only; a number or array without that axis in a `per_particle` program.
+        One row per particle, read-only.
     """
     return _current().sample(name, distribution)
 
@@ -93,78 +91,6 @@ def _current() -> ProgramRun:
             "run the function through Program(model).bootstrap(n) or another filter of it",
         )
     return run
-
-
-@dataclass(frozen=True)
-class PerParticle(AtStep):
-    """A program that runs once for every particle; made by `per_particle`.
-
-    ``function(previous, observation)`` gets the particle's `Trace` as `previous`.
-    """
-
-    function: Callable[..., Any]
-    step_functions: ClassVar = {"function": 2}
-
-    def __call__(self, previous: Any, observation: Any, **step: Any) -> Any:
-        return self.function(previous, observation, **step)
-
-
-def per_particle(function: Callable[..., Any]) -> PerParticle:
-    """Mark a program whose set of sites may differ between particles. It runs once for every particle, so slower."""
-    return PerParticle(function)
-
-
-class Trace(Mapping[str, Any]):
-    """An immutable mapping from names to numbers, strings or arrays: a particle of a `per_particle` program.
-
-    Arrays, lists, sets and dictionaries in it cannot be changed either, since copies of the particle share them.
-    """
-
-    __slots__ = ("_values",)
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = {name: _frozen(v) for name, v in values.items()}
-
-    def __getitem__(self, name: str) -> Any:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __repr__(self) -> str:
-        return f"Trace({self._values!r})"
-
-    def __reduce__(self) -> tuple[Any, ...]:  # a copy is a dict, which can be changed
-        return dict, (self._values,)
-
-
-class FrozenList(list[Any]):
-    """A list in a `Trace`. It cannot be changed; ``items + [new]`` and ``list(items)`` are new lists."""
-
-    def _refuse(self, *_: Any, **__: Any) -> Any:
-        raise TypeError("a list in a particle is read-only: write items + [new], or change list(items)")
-
-    def __reduce__(self) -> tuple[Any, ...]:  # a copy is a list, which can be changed
-        return list, (list(self),)
-
-    append = extend = insert = remove = pop = clear = sort = reverse = _refuse
-    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse
-
-
-def _frozen(value: Any) -> Any:
-    """The value, read-only: copies of arrays and of Python's containers; other objects are shared."""
-    if isinstance(value, np.ndarray):
-        return frozen_view(np.array(value)) if value.flags.writeable else value
-    if type(value) is list:
-        return FrozenList(_frozen(v) for v in value)
-    if type(value) is tuple:
-        return tuple(_frozen(v) for v in value)
-    if type(value) is dict:
-        return Trace(value)
-    return frozenset(value) if type(value) is set else value
 
 
 class Call(NamedTuple):
@@ -232,13 +158,10 @@ class Call(NamedTuple):
 
 
 class ProgramRun:
-    """One pass of a program over n particles; the handler decides the values.
+    """One pass of a program over n particles; the handler decides the values."""
 
-    With `single` the program sees the values of one particle, without the particle axis.
-    """
-
-    def __init__(self, handler: SiteHandler, n: int, single: bool = False) -> None:
-        self.handler, self.n, self.single = handler, n, single
+    def __init__(self, handler: SiteHandler, n: int) -> None:
+        self.handler, self.n = handler, n
         self.values: dict[str, np.ndarray] = {}
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
@@ -285,7 +208,7 @@ class ProgramRun:
         if gain is not None:
             self._add(gain, size)
         self.inside = False
-        return value[0] if self.single else value
+        return value
 
     def observe(self, name: str, distribution: Any, value: Any) -> None:
         self._last, self.inside = ("observation", name, self._where), True
@@ -314,9 +237,6 @@ class ProgramRun:
 
     def _event_shape(self, distribution: Distribution, found: tuple[int, ...]) -> tuple[int, ...]:
         """Event shape of a distribution of which a value of shape `found` is observed."""
-        if self.single:
-            shape = distribution.parameter_shape
-            return shape[1:] if shape[:1] == (1,) else shape
         event = distribution.value_shape(self._size)[1:]
         independent = len(found) > 1 and found[0] == self._size and not distribution.parameter_shape
         return found[1:] if independent else event  # entries with the same parameters
@@ -326,12 +246,9 @@ class ProgramRun:
         distribution = Categorical(probs)
         if distribution.probs.shape[-1] != len(branches):
             raise InputError(f"{distribution.probs.shape[-1]} probabilities for {len(branches)} branches")
-        if not self.single:
-            for k, argument in enumerate(args):
-                _check_rows(argument, self._size, k)
+        for k, argument in enumerate(args):
+            _check_rows(argument, self._size, k)
         index = self.sample(name, distribution, branch=True)
-        if self.single:
-            return branches[int(index)](*args)
         outer, path, where, results, groups = self._rows, self._path, self._where, [], []
         for k, branch in enumerate(branches):  # also empty groups: the sites of all branches exist at every step
             group = np.flatnonzero(index == k)
@@ -392,12 +309,9 @@ class ProgramRun:
 
     def _add(self, log_prob: Any, size: int) -> None:
         log_prob = np.asarray(log_prob)
-        if self.single:
-            log_prob = log_prob.sum()
-        elif log_prob.shape not in ((size,), (), (1,)):
+        if log_prob.shape not in ((size,), (), (1,)):
             raise InputError(f"log_prob has shape {log_prob.shape}, expected one number per particle, ({size},)")
-        strict = self.handler.draws if self.single else self.handler.strict
-        if strict and size and not log_prob.max() < np.inf:
+        if self.handler.strict and size and not log_prob.max() < np.inf:
             wrong = np.flatnonzero(~(np.atleast_1d(log_prob) < np.inf))
             raise InputError(
                 f"log density is {np.atleast_1d(log_prob)[wrong[0]]} for {len(wrong)} of {size} particles",
