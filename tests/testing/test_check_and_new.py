@@ -73,10 +73,8 @@ def test_a_starting_file_is_for_scenes_if_there_is_one(tmp_path, monkeypatch, ca
 
 def test_starting_files_pass_their_tests(tmp_path):
     """All in one run of pytest, since pytest starts slowly. The contracts themselves are run above."""
-    for kind in ("transition", "similarity", "rejuvenation", "resampler"):
-        write_starter(kind, tmp_path / f"my_{kind}.py", "numbers")
-    for kind in ("boundary", "evidence"):
-        write_starter(kind, tmp_path / f"my_{kind}.py", "scenes")
+    for kind, target in (("rejuvenation", "numbers"), ("resampler", "numbers"), ("evidence", "scenes")):
+        write_starter(kind, tmp_path / f"my_{kind}.py", target)
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
