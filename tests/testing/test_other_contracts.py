@@ -90,7 +90,9 @@ def test_components_of_models_keep_their_contract(name):
 
 
 @pytest.mark.parametrize(
-    "kind", ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
+    "kind",
+    ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
+    + ["completer", "rule"],
 )
 def test_components_of_the_package_keep_their_contract(kind):
     """All components but oracles, which need the ground truth of a recording, and front ends, which need files."""
