@@ -31,7 +31,6 @@
 `conditional`           paths of states by conditional SMC, one at a time
 `inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
 `diagnostics`           variance of the estimates of a run, energy distances of populations
-`export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """
 

@@ -36,11 +36,10 @@ from mstfilter.errors import InputError, LostRunError, check_integer, check_numb
 from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.distributions import as_distribution
-from mstfilter.smc.export import Table, flat_columns
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import log_evidence
 from mstfilter.smc.interfaces import Distribution, Resampler
-from mstfilter.smc.population import Particles, Population, take
+from mstfilter.smc.population import Particles, Population, flat_columns, take
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key, rows_of
@@ -49,7 +48,7 @@ FilterOf = Callable[[np.ndarray], ParticleFilter]
 
 
 @dataclass(frozen=True, eq=False)
-class Chains(Table):
+class Chains:
     """Markov chains of parameters."""
 
     theta: np.ndarray  #: (n_iterations, n_chains, d) parameters after each iteration
@@ -65,7 +64,7 @@ class Chains(Table):
         return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns of `to_pandas`: chain, draw, parameters, log evidence and log density, chain after chain."""
+        """Columns of a table: chain, draw, parameters, log evidence and log density, chain after chain."""
         numbers = np.indices(self.log_density.shape)
         arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta, **self._stats()}
         return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)

@@ -36,7 +36,6 @@ import numpy as np
 from mstfilter.errors import InputError, check_integer
 from mstfilter.fields import Bounded
 from mstfilter.lazy import late, short_repr
-from mstfilter.smc.export import Table
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
@@ -377,11 +376,11 @@ class Info:
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
 
-class Infos(list[Info], Table):
+class Infos(list[Info]):
     """The records of the steps of a run: a list that can be read as a table.
 
     >>> state, infos = filter.run(observations)
-    >>> infos.to_pandas()                   # or polars.DataFrame(infos.columns())
+    >>> pandas.DataFrame(infos.columns())
     """
 
     def rows(self) -> list[dict[str, Any]]:
