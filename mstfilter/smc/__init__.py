@@ -29,7 +29,7 @@
 `distributions`         distributions for models; an adapter for those of scipy
 `smoothing`             states given all observations
 `conditional`           paths of states by conditional SMC, one at a time
-`inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
+`inference`             parameters of a model: PMMH, particle Gibbs, emcee
 `diagnostics`           variance of the estimates of a run, energy distances of populations
 ======================  ===================================================================================
 """

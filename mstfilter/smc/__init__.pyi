@@ -60,11 +60,9 @@ from mstfilter.smc.history import (
 )
 from mstfilter.smc.inference import (
     Chains as Chains,
-    TemperedSample as TemperedSample,
     ensemble as ensemble,
     particle_gibbs as particle_gibbs,
     pmmh as pmmh,
-    smc_sampler as smc_sampler,
 )
 from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
