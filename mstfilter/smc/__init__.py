@@ -15,7 +15,7 @@
 `population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights
-`transport_resampling`  wrappers of schemes, sorted particles, transport
+`wrapped_resampling`    wrappers of schemes: sorted, shuffled, merged, tempered
 `components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
 `streams`               random streams named by seed, step, slot and index; generators of many runs
 `history`               collectors: quantities of a run, recorded at every step
@@ -63,7 +63,6 @@ __components__ = {
         "fearnhead_clifford": "FearnheadClifford",
         "chopthin": "Chopthin",
         "clusters": "ClusterStratified",
-        "ensemble_transform": "EnsembleTransform",
         "coalesced": "Coalesced",
         "tempered": "Tempered",
         "shuffled": "Shuffled",

@@ -338,9 +338,3 @@ def test_what_chains_reject():
         ensemble(filter_of, YS, log_prior, [[0.1]], 5)
     with pytest.raises(InputError, match=r"draw returned parameters of shape \(2,\)"):
         particle_gibbs(filter_of, YS, lambda rng, theta, path: [1.0, 2.0], [0.1], 5)
-
-
-# --- SMC samplers, against a conjugate normal model ---------------------------------------------------------------
-
-POINTS = np.random.default_rng(3).normal([1.0, -2.0], 1.0, (6, 2))
-EVIDENCE = sum(stats.multivariate_normal(np.zeros(6), 4 + np.eye(6)).logpdf(column) for column in POINTS.T)

@@ -4,9 +4,6 @@ A resampler must be properly weighted: a particle of normalised weight W_i gets 
 that carry W_i together if their weights differ. `mstfilter.smc.testing.copies` lists the weights and numbers of
 particles for which this is tested: n = m, n < m and n > m, ties, zeros, heavy and light weights.
 
-A scheme that makes new particles instead of copies is a `TransformResampler` and has another law: it keeps the
-weighted mean of the particles, and its output weights are equal.
-
 A scheme may be correct and slow: the cost of rejection grows with max w / mean w. The generator of the statistical
 tests counts what is drawn, and a case is left out as "too slow at this weight" if it exceeds the budget. The clock is
 not used, so the outcome of a check does not depend on the machine.
@@ -21,8 +18,7 @@ from unittest import SkipTest
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, as_matrix
+from mstfilter.smc import Population, Resampler, WeightResampler
 from mstfilter.smc.testing.contract import (
     FALSE_ALARM,
     BatchedContract,
@@ -85,9 +81,7 @@ class ResamplerContract(Contract):
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         assert isinstance(result, Population), f"resample returns {type(result).__name__}, expected a Population"
         ancestors = result.parents.get("ancestor")
-        assert ancestors is not None, (
-            'the result has no parents "ancestor": a scheme that makes new particles inherits TransformResampler'
-        )
+        assert ancestors is not None, 'the result has no parents "ancestor"'
         m = len(inputs["population"])
         wrong = ancestors[(ancestors < 0) | (ancestors >= m)]
         assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
@@ -282,88 +276,3 @@ class WeightResamplerContract(BatchedContract, ResamplerContract):
             share = np.exp(chosen.log_weights - population.log_mean_weight)
             copies.append(share[chosen.parents["ancestor"] > 0].sum() * (n / len(chosen)))
         return np.array(copies)
-
-
-class TransformResamplerContract(Contract):
-    """The contract of every `TransformResampler`: n new particles of equal weight whose mean is the weighted mean.
-
-    For n other than the number of particles it may raise InputError. The example has particles that are arrays of
-    numbers, or mappings of such arrays. Reich (2013), "A nonparametric ensemble transform method for Bayesian
-    inference".
-    """
-
-    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        particles = self.example(seeded(seed), 20)[0].realised().particles
-        return {"population": Population(particles, log_of(np.linspace(1, 2 + seed, 20))), "n": 20}
-
-    def call(self, component: TransformResampler, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
-        return component.resample(rng, inputs["population"], inputs["n"])
-
-    def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        assert isinstance(result, Population), f"resample returns {type(result).__name__}, expected a Population"
-        assert not result.parents, f"new particles have parents {sorted(result.parents)}, expected none"
-        before = inputs["population"].log_mean_weight
-        assert np.allclose(result.log_weights, before, rtol=0, atol=1e-9), (
-            f"log weights of the result lie in {result.log_weights.min():.6g} .. {result.log_weights.max():.6g}, "
-            f"expected the log mean of the old weights, {before:.6g}"
-        )
-
-    @prerequisite
-    def test_gives_n_particles(self) -> None:
-        """It returns n particles for any n; at most n if ``exact_size`` is False."""
-        component = self.make()
-        for m in (1, 4, 7):
-            for n in (1, 2, m, 2 * m + 3):
-                pair = self._resample(component, np.linspace(1, 3, m), n)
-                found = n if pair is None else len(pair[1])
-                enough = found == n if component.exact_size else 1 <= found <= n
-                assert enough, f"asked to make {n} particles of {m} it returns {found}"
-
-    def test_keeps_the_weighted_mean(self) -> None:
-        """The mean of the new particles is the weighted mean of the old ones, also with weights of zero."""
-        for weights in ((1, 2, 1.5, 0.5, 2), *_ZEROS, (1, 1e-6, 1e-12, 1, 1)):
-            for n in (1, 3, 5, 9):
-                pair = self._resample(self.make(), weights, n)
-                if pair is None:
-                    continue
-                old, new = pair
-                x = as_matrix(old.particles)
-                found, expected = as_matrix(new.particles).mean(axis=0), old.weights @ x
-                i = int(np.argmax(np.abs(found - expected)))
-                assert np.allclose(found, expected, rtol=0, atol=1e-6 * max(np.abs(x).max(), 1e-300)), (
-                    f"of weights {weights} to {n} particles, coordinate {i} has mean {found[i]:.6g}, expected "
-                    f"{expected[i]:.6g}"
-                )
-
-    def test_common_factor_of_weights(self) -> None:
-        """A common factor of the weights does not change the new particles."""
-        weights = np.array([0.11, 0.36, 0.15, 0.38])
-        a = self._resample(self.make(), weights, 4)
-        for shift in (100.0, -100.0, 1e4, -1e4):
-            b = self._resample(self.make(), weights, 4, shift)
-            equal = a and b and np.allclose(as_matrix(a[1].particles), as_matrix(b[1].particles))
-            assert equal, f"adding {shift:g} to all log weights changes the new particles (overflow or underflow?)"
-
-    def test_keeps_a_spread(self) -> None:
-        """The variance of the new particles is a quarter to four times the weighted one of the old particles."""
-        inputs = self.inputs(0)
-        population = inputs["population"]
-        x, w = as_matrix(population.particles), population.weights
-        before = w @ (x - w @ x) ** 2
-        after = as_matrix(self.checked_call(self.make(), inputs).particles).var(axis=0)
-        ratio = (after[before > 0] / before[before > 0]).tolist()
-        assert all(0.25 <= r <= 4 for r in ratio), f"the variance of the particles changes by a factor {ratio[0]:.3g}"
-
-    def _resample(
-        self, component: Any, weights: Any, n: int, shift: float = 0.0
-    ) -> tuple[Population, Population] | None:
-        """The particles before and after; None if the component refuses n other than their number."""
-        particles = self.example(seeded(0), len(weights))[0].realised().particles
-        population = Population(particles, log_of(weights) + shift)
-        inputs = {"population": population, "n": n}
-        if n != len(weights):
-            try:
-                self.call(component, seeded(3), inputs)
-            except InputError:
-                return None
-        return population, self.checked_call(component, inputs)
