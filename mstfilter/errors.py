@@ -167,7 +167,6 @@ _PACKAGES = {
     "onnxruntime": "'mstfilter[onnx]'",
     "dask.distributed": "'mstfilter[dask]'",
     "rerun-sdk": "'mstfilter[viewer]'",
-    "pandas": "'mstfilter[xarray]'",
     "xarray": "'mstfilter[xarray]'",
 }
 

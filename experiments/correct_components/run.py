@@ -199,8 +199,6 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
     for example in (numbers, vectors, mapping):
         yield f"clusters of {example.__name__}", smc.ClusterStratified(), example, None
         yield f"Hilbert sort of {example.__name__}", smc.Sorted(), example, None
-    for example in (numbers, vectors):
-        yield f"transform of {example.__name__}", smc.EnsembleTransform(), example, None
     yield "keep weights", smc.KeepWeights(), numbers, None
 
 

@@ -60,11 +60,9 @@ from mstfilter.smc.history import (
 )
 from mstfilter.smc.inference import (
     Chains as Chains,
-    TemperedSample as TemperedSample,
     ensemble as ensemble,
     particle_gibbs as particle_gibbs,
     pmmh as pmmh,
-    smc_sampler as smc_sampler,
 )
 from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
@@ -82,7 +80,6 @@ from mstfilter.smc.interfaces import (
     Similarity as Similarity,
     Size as Size,
     State as State,
-    TransformResampler as TransformResampler,
     Transition as Transition,
     Trigger as Trigger,
     Update as Update,
@@ -134,9 +131,8 @@ from mstfilter.smc.state_space import (
     resample_move as resample_move,
 )
 from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
-from mstfilter.smc.transport_resampling import (
+from mstfilter.smc.wrapped_resampling import (
     Coalesced as Coalesced,
-    EnsembleTransform as EnsembleTransform,
     KeepWeights as KeepWeights,
     ResamplerWrapper as ResamplerWrapper,
     Shuffled as Shuffled,

@@ -14,7 +14,7 @@ Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(b
 resampler=...)``. The first observation updates the initial state before any prediction.
 
 `metropolis` is the Metropolis-Hastings kernel of all chains of this package: of particles (`RandomWalkMove`, and
-`ProgramMove` for programs), of parameters (`pmmh`, `smc_sampler`) and of the ancestors of `backward_paths`.
+`ProgramMove` for programs), of parameters (`pmmh`) and of the ancestors of `backward_paths`.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class _ProgramStep(Component):
         guard = None if in_batch else self.schedule.guard(rng, past, observation, model, guide)
 
         def step() -> tuple[Particles, np.ndarray]:
-            return _step(rng, model, guide, previous, observation, n)
+            return program_step(rng, model, guide, previous, observation, n)
 
         try:
             particles, gain = step() if guard is None else guard.checked(_run_once, step)
@@ -132,7 +132,7 @@ class ProgramTransition(_ProgramStep, Transition):
         return self._advance(rng, population, observation, len(population))
 
 
-def _step(
+def program_step(
     rng: np.random.Generator, model: Model, guide: Model | None, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
     """Particles, drawn by the guide if there is one, and gains of the log weights."""
