@@ -95,7 +95,6 @@ from mstfilter.smc.population import (
 )
 from mstfilter.smc.programs.filters import (
     Program as Program,
-    ProgramMove as ProgramMove,
 )
 from mstfilter.smc.programs.sites import (
     observe as observe,

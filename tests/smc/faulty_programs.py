@@ -15,7 +15,6 @@ import numpy as np
 from scipy import stats
 
 from mstfilter.smc import (
-    Always,
     Bernoulli,
     Categorical,
     Distribution,
@@ -198,9 +197,6 @@ def the_covariance_of_the_particles(previous, y):
 def a_mean_if_the_observation_is_missing(previous, y):
     m = 0.0 if previous is None else previous["x"].mean() if y is None else previous["x"]
     seen(sample("x", Normal(m, 0.6)), y)
-
-
-in_likelihood(ALONE, "resample_move", a_mean_in_a_resample_move_filter=np.mean)
 
 
 @faulty(ALONE)
@@ -479,8 +475,6 @@ def a_branch_returns_a_reduction(previous, y):
 class Mine(Distribution):
     """A Gaussian around `mean`, whose parts the cases below replace."""
 
-    sd = np.float64(0.6)
-
     def __init__(self, mean):
         self.centre_ = np.asarray(mean, np.float64)
 
@@ -626,20 +620,6 @@ def a_switch_with_probabilities_of_particles(previous, y):
     return z
 
 
-@correct(kind="resample_move", trigger=Always())
-def moves_beyond_the_support(previous, y):
-    s = sample("s", stats.gamma(1.0, scale=0.5) if previous is None else stats.gamma(4.0, scale=previous["s"] / 4.0))
-    x = sample("x", Normal(0.0, np.sqrt(s)))
-    seen(x, y)
-
-
-@correct(kind="resample_move", trigger=Always())
-def moves_of_probabilities(previous, y):
-    p = sample("p", Uniform(0.0, 1.0))
-    k = sample("k", Bernoulli(p))
-    seen(k.astype(float), y)
-
-
 def wide(previous, y):
     sample("x", Normal(0.7 * y if previous is None else 0.5 * y + 0.5 * previous["x"], 1.0))
 
@@ -775,7 +755,7 @@ class Clipped(Distribution):
     """A mixture of a point at 0 and a half normal would have no density; this is a count with a bound."""
 
     discrete = True
-    mean, sd = np.float64(1.2), np.float64(0.9)
+    mean = np.float64(1.2)
 
     def sample(self, rng, size):
         return np.minimum(rng.poisson(1.4, size), 3)

@@ -645,7 +645,7 @@ add_faults(
 @faulty(_KEPT, "of neighbours", None, kernel)
 def pairs_of_steps(rng, x, previous, y):
     step = np.repeat(rng.standard_normal(-(-len(x) // 2)), 2)[: len(x)]
-    return np.asarray(optimal(previous, y).mean) + float(np.asarray(optimal(0.0, y).sd)) * step
+    return np.asarray(optimal(previous, y).mean) + float(np.asarray(optimal(0.0, y).scale)) * step
 
 
 @faulty(_KEPT, "x_t - x_{t-1}", None, kernel)
