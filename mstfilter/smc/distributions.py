@@ -431,10 +431,10 @@ class Categorical(Distribution):
 
 
 def as_distribution(value: Any) -> Distribution:
-    """A distribution of this package, or one of scipy.stats (frozen or new style); InputError otherwise."""
+    """A distribution of this package, or a frozen one of scipy.stats; InputError otherwise."""
     if isinstance(value, Distribution):
         return value
-    if type(value).__module__.startswith("scipy.stats"):
+    if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):
         return FromScipy(value)
     raise InputError(
         f"expected a distribution, found a {type(value).__module__}.{type(value).__qualname__}",
@@ -444,7 +444,7 @@ def as_distribution(value: Any) -> Distribution:
 
 @dataclass(frozen=True, eq=False)
 class FromScipy(Distribution):
-    """A frozen distribution of scipy.stats, uni- or multivariate, or one of its new style (``stats.Normal``)."""
+    """A frozen distribution of scipy.stats, uni- or multivariate."""
 
     wrapped: Any
 
@@ -466,10 +466,7 @@ class FromScipy(Distribution):
         wrapped, shape = self.wrapped, self.value_shape(size)
         if self.__dict__["_vector"]:
             return np.reshape(wrapped.rvs(size=size, random_state=rng), shape)
-        if hasattr(wrapped, "rvs"):
-            return np.asarray(wrapped.rvs(size=shape, random_state=rng))
-        rows = self.batch_shape not in ((), (1,))  # the new style adds a shape to that of the parameters
-        return np.reshape(wrapped.sample(() if rows else (size,), rng=rng), shape)
+        return np.asarray(wrapped.rvs(size=shape, random_state=rng))
 
     def log_prob(self, value: Any) -> np.ndarray:
         if type(self.wrapped).__name__ in _PARTICLES_LAST and np.ndim(value) == len(self.parameter_shape):

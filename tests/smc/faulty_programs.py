@@ -308,7 +308,6 @@ in_site("loc of a Normal is nan in row", a_location_of_nan=lambda x: Normal(np.s
 in_site(r"high of a Uniform is \S+ in row", an_empty_interval=lambda x: Uniform(0.0, x))
 in_site("df of a Student is -", negative_degrees_of_freedom=lambda x: Student(x, 0.0, 1.0))
 in_site("Domain error|is NaN|nan", a_negative_scale_of_scipy=lambda x: stats.norm(0.0, x))
-in_site("is NaN", a_negative_scale_of_new_scipy=lambda x: stats.Normal(mu=0.0, sigma=x))
 in_observation(r"p of a Bernoulli is \S+ in row", 1, a_negative_probability=Bernoulli)
 in_observation("log density is nan", 0, a_negative_rate=stats.poisson)
 in_observation(
@@ -654,12 +653,6 @@ def scipy_distributions(previous, y):
     k = sample("k", stats.binom(5, 1 / (1 + np.exp(-x))))
     v = sample("v", stats.multivariate_normal([0.0, 1.0], np.eye(2)))
     observe("y", stats.norm(x + 0.1 * k + v[:, 0], 0.5), y)
-
-
-@correct()
-def scipy_distributions_of_the_new_kind(previous, y):
-    x = sample("x", stats.Normal(mu=np.zeros(200) if previous is None else 0.9 * previous["x"], sigma=0.6))
-    observe("y", stats.norm(x, 0.5), y)
 
 
 @correct(ys=[0, 1, 1, 0])
