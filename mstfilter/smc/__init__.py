@@ -24,7 +24,7 @@
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
 `exact`                 linear-Gaussian and finite models with exact answers
-`gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
+`gaussian`              models with Gaussian noise; UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; an adapter for those of scipy
 `smoothing`             states given all observations

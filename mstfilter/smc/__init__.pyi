@@ -44,7 +44,6 @@ from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.gaussian import (
     ConditionallyLinear as ConditionallyLinear,
     Linear as Linear,
-    ekf_proposal as ekf_proposal,
     nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
     ukf_proposal as ukf_proposal,
@@ -95,7 +94,6 @@ from mstfilter.smc.population import (
 )
 from mstfilter.smc.programs.filters import (
     Program as Program,
-    ProgramMove as ProgramMove,
 )
 from mstfilter.smc.programs.sites import (
     observe as observe,

@@ -293,11 +293,6 @@ class Distribution(ABC):
     def mean(self) -> np.ndarray:
         """Expected value, of the shape of the parameters: (), (n,), (1, d) or (n, d)."""
 
-    @property
-    @abstractmethod
-    def sd(self) -> np.ndarray:
-        """Standard deviation of each entry, of the shape of the mean."""
-
 
 class Codec(ABC):
     """Converts particles to named arrays and back, bit for bit, without pickle."""
