@@ -136,12 +136,6 @@ class _Posterior:
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
         """
         first = self._filter(thetas[0])
-        for slot in ("initial", "transition", "update"):
-            if getattr(first, slot) is not None and getattr(first, slot).batched is False:
-                raise InputError(
-                    f"with batched=True the {slot} of the filter must be batched",
-                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes it so",
-                )
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:

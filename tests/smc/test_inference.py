@@ -310,7 +310,7 @@ def test_what_chains_reject():
     for scale in (0.0, [0.1, 0.2], [[-1.0]]):
         with pytest.raises(InputError, match="scale is"):
             pmmh(filter_of, YS, log_prior, [0.1], scale, 5)
-    with pytest.raises(InputError, match="must be batched"):
+    with pytest.warns(UserWarning, match="one by one: initial: it is not batched"):
         pmmh(lambda theta: bootstrap(replace(AR1, batched=False), 5), YS, log_prior, [0.1], 0.5, 5, batched=True)
     with pytest.raises(InputError, match="not properly weighted"):
         pmmh(lambda theta: bootstrap(AR1, 5, LargestWeights()), YS, log_prior, [0.1], 0.5, 5)
