@@ -165,7 +165,6 @@ _PACKAGES = {
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "dask.distributed": "'mstfilter[dask]'",
-    "pandas": "'mstfilter[xarray]'",
     "xarray": "'mstfilter[xarray]'",
 }
 

@@ -19,7 +19,7 @@ from mstfilter import smc
 from mstfilter.files import write_csv
 from mstfilter.smc import Normal, Population
 from mstfilter.testing import run_contract
-from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, optimal, optimal_initial, predictive
+from tests.smc.models import AR1, SD0, TAU, optimal, optimal_initial, predictive
 from tests.testing import faults, other_faults
 
 RESULTS = Path(__file__).parent / "results" / "checks.csv"
@@ -199,18 +199,7 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
     for example in (numbers, vectors, mapping):
         yield f"clusters of {example.__name__}", smc.ClusterStratified(), example, None
         yield f"Hilbert sort of {example.__name__}", smc.Sorted(), example, None
-    for example in (numbers, vectors):
-        yield f"transform of {example.__name__}", smc.EnsembleTransform(), example, None
     yield "keep weights", smc.KeepWeights(), numbers, None
-
-
-def ar1_program(previous, y):
-    x = smc.sample("x", Normal(0.0, SD0) if previous is None else Normal(RHO * previous["x"], SIGMA))
-    smc.observe("y", Normal(x, TAU), y)
-
-
-def traces(rng, n):
-    return Population({"x": rng.standard_normal(n)}, rng.standard_normal(n)), 0.4
 
 
 def transitions() -> Iterator[tuple[str, Any, Any, Any]]:
@@ -269,7 +258,6 @@ def rejuvenations() -> Iterator[tuple[str, Any, Any, Any]]:
     exact = exact_ar1
     for scale in (0.1, 0.7, 3.0):
         yield f"random walk, {scale}", smc.RandomWalkMove(AR1, scale), numbers, exact
-    yield "program", smc.ProgramMove(ar1_program, 1.0), traces, None
     yield "user: Metropolis", other_faults.correct_kernel(), numbers, exact
     yield "nothing", other_faults.nothing(), numbers, exact
     yield "Gibbs", other_faults.gibbs(), numbers, exact

@@ -23,7 +23,7 @@ import numpy as np
 from mstfilter.errors import check_component
 from mstfilter.smc import FearnheadClifford, Gaussian, Population, Resampler, Similarity, log_mean_exp
 from mstfilter.smc.diverse_resampling import checked_similarity
-from mstfilter.smc.resampling import check_scheme, checked_weights
+from mstfilter.smc.resampling import checked_weights
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,6 @@ class KDpp(Resampler):
 
     def __post_init__(self) -> None:
         check_component("similarity", self.similarity, Similarity)
-        check_scheme(self.scheme)
 
     @property
     def properly_weighted(self) -> bool:

@@ -12,7 +12,6 @@ from mstfilter.smc import (
     Chopthin,
     ClusterStratified,
     Coalesced,
-    EnsembleTransform,
     Equivalence,
     FearnheadClifford,
     Gaussian,
@@ -53,7 +52,7 @@ def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resam
         "largest_weights": LargestWeights(),
         "keep_weights": KeepWeights(),
     }
-    for_numbers = {"sorted": Sorted(), "ensemble_transform": EnsembleTransform()}
+    for_numbers = {"sorted": Sorted()}
     return for_all | (for_numbers if isinstance(similarity, Gaussian) else {})
 
 

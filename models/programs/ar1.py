@@ -49,7 +49,6 @@ def filters(n: int) -> dict:
     return {
         "bootstrap": program.bootstrap(n),
         "guided": program.guided(guide, n),
-        "resample-move": program.resample_move(n, steps=2),
     }
 
 

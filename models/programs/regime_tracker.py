@@ -62,7 +62,7 @@ def simulate(T: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, list]:
 
 def filters(n: int) -> dict:
     """The filters of the program with `n` particles, by name."""
-    return {"bootstrap": Program(model).bootstrap(n), "resample-move": Program(model).resample_move(n, scale=0.3)}
+    return {"bootstrap": Program(model).bootstrap(n)}
 
 
 if __name__ == "__main__":

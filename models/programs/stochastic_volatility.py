@@ -39,7 +39,6 @@ def filters(n: int) -> dict:
     program = Program(model)
     return {
         "bootstrap": program.bootstrap(n),
-        "resample-move": program.resample_move(n, steps=2, scale=0.8),
     }
 
 

@@ -93,14 +93,12 @@ def new(
         str, typer.Option("--for", metavar="scenes|numbers", help="What the particles are. Default: scenes.")
     ] = "",
 ) -> None:
-    """Write a commented component that works, as a start for a new one, and its test."""
+    """Write a commented component that works, as a start for a new one."""
     from mstfilter.testing import write_starter
 
-    made = write_starter(kind, path, target)
-    print(f"component   {made.component}")
-    if made.test is not None:
-        print(f"test        {made.test}")
-    if any("demo/recording" in command for command in made.commands) and not Path("demo/recording").exists():
+    commands = write_starter(kind, path, target)
+    print(f"component   {path}")
+    if any("demo/recording" in command for command in commands) and not Path("demo/recording").exists():
         print("first       mstfilter demo")
-    for command in made.commands:
+    for command in commands:
         print(f"next        {command}")

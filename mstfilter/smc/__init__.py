@@ -15,7 +15,7 @@
 `population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep different particles, with unequal weights
-`transport_resampling`  wrappers of schemes, sorted particles, transport
+`wrapped_resampling`    wrappers of schemes: sorted, shuffled, merged, tempered
 `components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
 `streams`               random streams named by seed, step, slot and index; generators of many runs
 `history`               collectors: quantities of a run, recorded at every step
@@ -24,14 +24,13 @@
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
 `exact`                 linear-Gaussian and finite models with exact answers
-`gaussian`              models with Gaussian noise; EKF, UKF proposals, Rao-Blackwellised filters
+`gaussian`              models with Gaussian noise; UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; an adapter for those of scipy
 `smoothing`             states given all observations
 `conditional`           paths of states by conditional SMC, one at a time
-`inference`             parameters of a model: PMMH, particle Gibbs, emcee, SMC samplers
+`inference`             parameters of a model: PMMH, particle Gibbs, emcee
 `diagnostics`           variance of the estimates of a run, energy distances of populations
-`export`                tables of pandas, trees of xarray for ArviZ
 ======================  ===================================================================================
 """
 
@@ -64,7 +63,6 @@ __components__ = {
         "fearnhead_clifford": "FearnheadClifford",
         "chopthin": "Chopthin",
         "clusters": "ClusterStratified",
-        "ensemble_transform": "EnsembleTransform",
         "coalesced": "Coalesced",
         "tempered": "Tempered",
         "shuffled": "Shuffled",

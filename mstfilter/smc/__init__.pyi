@@ -44,7 +44,6 @@ from mstfilter.smc.filter import ParticleFilter as ParticleFilter
 from mstfilter.smc.gaussian import (
     ConditionallyLinear as ConditionallyLinear,
     Linear as Linear,
-    ekf_proposal as ekf_proposal,
     nonlinear_gaussian as nonlinear_gaussian,
     rao_blackwellised as rao_blackwellised,
     ukf_proposal as ukf_proposal,
@@ -60,11 +59,9 @@ from mstfilter.smc.history import (
 )
 from mstfilter.smc.inference import (
     Chains as Chains,
-    TemperedSample as TemperedSample,
     ensemble as ensemble,
     particle_gibbs as particle_gibbs,
     pmmh as pmmh,
-    smc_sampler as smc_sampler,
 )
 from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
@@ -82,7 +79,6 @@ from mstfilter.smc.interfaces import (
     Similarity as Similarity,
     Size as Size,
     State as State,
-    TransformResampler as TransformResampler,
     Transition as Transition,
     Trigger as Trigger,
     Update as Update,
@@ -98,7 +94,6 @@ from mstfilter.smc.population import (
 )
 from mstfilter.smc.programs.filters import (
     Program as Program,
-    ProgramMove as ProgramMove,
 )
 from mstfilter.smc.programs.sites import (
     observe as observe,
@@ -134,9 +129,8 @@ from mstfilter.smc.state_space import (
     resample_move as resample_move,
 )
 from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
-from mstfilter.smc.transport_resampling import (
+from mstfilter.smc.wrapped_resampling import (
     Coalesced as Coalesced,
-    EnsembleTransform as EnsembleTransform,
     KeepWeights as KeepWeights,
     ResamplerWrapper as ResamplerWrapper,
     Shuffled as Shuffled,

@@ -119,8 +119,7 @@ class _Sweep:
         self.check, self.rounding = check, rounding
         self.given = [split_input(y) for y in ys]
         self.n_steps = len(ys)
-        self.keys = [Key(seed) for seed in seeds]
-        self.streams = RunKeys(self.keys)
+        self.streams = RunKeys([Key(seed) for seed in seeds])
         self.runs = np.arange(len(seeds))  # the run of each row
         self.particles: Any = None
         self.log_weights = self.ess = self.log_mean = np.zeros(0)  # the last two after the last update
@@ -333,7 +332,7 @@ class _Sweep:
     # --- results --------------------------------------------------------------------------------------
     def key(self, t: int, slot: str, row: int) -> Key:
         """The key of a component of one run."""
-        return self.keys[self.runs[row]].child(slot, t)
+        return self.streams.keys[self.runs[row]].child(slot, t)
 
     def record(self, t: int) -> None:
         """Keep what the collectors return for each run."""
@@ -365,7 +364,7 @@ class _Sweep:
             ess=float(self.ess[row]),
             resampled=bool(self.resampled[row]),
         )
-        return State(t + 1, population, self.keys[self.runs[row]], filter.properly_weighted), info
+        return State(t + 1, population, self.streams.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
         """(T, R, ...) results of a collector; those of lost runs are undefined."""

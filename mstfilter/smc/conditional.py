@@ -20,8 +20,8 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
-from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, run_program
-from mstfilter.smc.programs.handlers import CopyHandler, GuideHandler, ReplayHandler, SampleHandler, ScoreHandler
+from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, program_step, run_program
+from mstfilter.smc.programs.handlers import CopyHandler, ScoreHandler
 from mstfilter.smc.resampling import Multinomial
 from mstfilter.smc.smoothing import draw_log
 from mstfilter.smc.state_space import Dynamics, Prior
@@ -161,12 +161,8 @@ def _drawn(
         else:
             moved = past if component is None else component.predict(rng, past, y)
         return moved.particles, moved.log_weights
-    previous = None if past is None else past.particles
-    if component.guide is None or y is None:
-        return run_program(component.model, SampleHandler(rng), previous, y, n)
-    guide = GuideHandler(rng, n)
-    run_program(component.guide, guide, previous, y, n)
-    return run_program(component.model, ReplayHandler(guide), previous, y, n)
+    guide = None if y is None else component.guide
+    return program_step(rng, component.model, guide, None if past is None else past.particles, y, n)
 
 
 def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:

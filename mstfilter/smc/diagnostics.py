@@ -24,7 +24,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.smoothing import known_parents
-from mstfilter.smc.transport_resampling import ResamplerWrapper
+from mstfilter.smc.wrapped_resampling import ResamplerWrapper
 
 
 def energy_distance(

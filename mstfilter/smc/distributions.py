@@ -130,16 +130,12 @@ class _Independent(_Checked):
         return _broadcast_shape(*vars(self).values())
 
     @abstractmethod
-    def _moments(self) -> tuple[Any, Any]:
-        """Mean and standard deviation of an entry."""
+    def _mean(self) -> Any:
+        """Mean of an entry."""
 
     @property
     def mean(self) -> np.ndarray:
-        return np.broadcast_to(np.asarray(self._moments()[0], np.float64), self.parameter_shape)
-
-    @property
-    def sd(self) -> np.ndarray:
-        return np.broadcast_to(np.asarray(self._moments()[1], np.float64), self.parameter_shape)
+        return np.broadcast_to(np.asarray(self._mean(), np.float64), self.parameter_shape)
 
 
 def _is_finite(value: Any) -> bool:
@@ -228,16 +224,13 @@ class Normal(_Independent):
             return _sum_rows(z)
         return _sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
 
-    def _moments(self) -> tuple[Any, Any]:
-        return self.loc, self.scale
+    def _mean(self) -> Any:
+        return self.loc
 
 
 @dataclass(frozen=True, eq=False)
 class Student(_Independent):
-    """Student's t with `df` > 0 degrees of freedom, centre `loc` and scale `scale` > 0.
-
-    `sd` is the scale: the standard deviation is larger, and infinite for df <= 2.
-    """
+    """Student's t with `df` > 0 degrees of freedom, centre `loc` and scale `scale` > 0."""
 
     df: Any
     loc: Any = 0.0
@@ -258,8 +251,8 @@ class Student(_Independent):
         constant = gammaln((df + 1) / 2) - gammaln(df / 2) - 0.5 * np.log(df * np.pi) - np.log(self.scale)
         return _sum_rows(constant - (df + 1) / 2 * np.log1p(z * z / df))
 
-    def _moments(self) -> tuple[Any, Any]:
-        return self.loc, self.scale
+    def _mean(self) -> Any:
+        return self.loc
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,8 +279,8 @@ class Uniform(_Independent):
         inside = (x >= self.low) & (x < self.high)
         return _sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), _impossible(x)))
 
-    def _moments(self) -> tuple[Any, Any]:
-        return (np.asarray(self.low) + self.high) / 2, (np.asarray(self.high) - self.low) / math.sqrt(12)
+    def _mean(self) -> Any:
+        return (np.asarray(self.low) + self.high) / 2
 
 
 def _cholesky(cov: np.ndarray) -> np.ndarray:
@@ -365,11 +358,6 @@ class MultivariateNormal(_Checked):
     def mean(self) -> np.ndarray:
         return np.broadcast_to(np.asarray(self.loc, np.float64), self.parameter_shape)
 
-    @property
-    def sd(self) -> np.ndarray:
-        root = self.__dict__["_root"]
-        return np.broadcast_to(np.sqrt((root * root).sum(axis=-1)), self.parameter_shape)
-
 
 @dataclass(frozen=True, eq=False)
 class Bernoulli(_Independent):
@@ -388,8 +376,8 @@ class Bernoulli(_Independent):
             log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p, np.float64)))
         return _sum_rows(np.where((x == 0) | (x == 1), log_p, _impossible(x)))
 
-    def _moments(self) -> tuple[Any, Any]:
-        return self.p, np.sqrt(np.asarray(self.p) * (1 - np.asarray(self.p)))
+    def _mean(self) -> Any:
+        return self.p
 
 
 @dataclass(frozen=True, eq=False)
@@ -441,17 +429,12 @@ class Categorical(Distribution):
     def mean(self) -> np.ndarray:
         return self.probs @ np.arange(self.probs.shape[-1], dtype=np.float64)
 
-    @property
-    def sd(self) -> np.ndarray:
-        numbers = np.arange(self.probs.shape[-1], dtype=np.float64)
-        return np.sqrt(np.maximum(self.probs @ numbers**2 - self.mean**2, 0.0))
-
 
 def as_distribution(value: Any) -> Distribution:
-    """A distribution of this package, or one of scipy.stats (frozen or new style); InputError otherwise."""
+    """A distribution of this package, or a frozen one of scipy.stats; InputError otherwise."""
     if isinstance(value, Distribution):
         return value
-    if type(value).__module__.startswith("scipy.stats"):
+    if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):
         return FromScipy(value)
     raise InputError(
         f"expected a distribution, found a {type(value).__module__}.{type(value).__qualname__}",
@@ -461,7 +444,7 @@ def as_distribution(value: Any) -> Distribution:
 
 @dataclass(frozen=True, eq=False)
 class FromScipy(Distribution):
-    """A frozen distribution of scipy.stats, uni- or multivariate, or one of its new style (``stats.Normal``)."""
+    """A frozen distribution of scipy.stats, uni- or multivariate."""
 
     wrapped: Any
 
@@ -483,10 +466,7 @@ class FromScipy(Distribution):
         wrapped, shape = self.wrapped, self.value_shape(size)
         if self.__dict__["_vector"]:
             return np.reshape(wrapped.rvs(size=size, random_state=rng), shape)
-        if hasattr(wrapped, "rvs"):
-            return np.asarray(wrapped.rvs(size=shape, random_state=rng))
-        rows = self.batch_shape not in ((), (1,))  # the new style adds a shape to that of the parameters
-        return np.reshape(wrapped.sample(() if rows else (size,), rng=rng), shape)
+        return np.asarray(wrapped.rvs(size=shape, random_state=rng))
 
     def log_prob(self, value: Any) -> np.ndarray:
         if type(self.wrapped).__name__ in _PARTICLES_LAST and np.ndim(value) == len(self.parameter_shape):
@@ -499,13 +479,6 @@ class FromScipy(Distribution):
         mean = self.wrapped.mean
         mean = np.asarray(mean() if callable(mean) else mean)
         return mean[None] if self.__dict__["_vector"] else mean
-
-    @property
-    def sd(self) -> np.ndarray:
-        wrapped = self.wrapped
-        if self.__dict__["_vector"]:
-            return np.sqrt(np.diagonal(wrapped.cov))[None]
-        return np.asarray(wrapped.std() if hasattr(wrapped, "std") else wrapped.standard_deviation())
 
 
 _PARTICLES_LAST = ("dirichlet_frozen", "wishart_frozen", "invwishart_frozen")

@@ -28,7 +28,7 @@ from mstfilter.errors import InputError
 from mstfilter.fields import Bounds
 from mstfilter.smc.interfaces import Resampler, Similarity, WeightResampler
 from mstfilter.smc.population import Population, as_matrix, log_mean_exp
-from mstfilter.smc.resampling import Systematic, check_scheme, checked_weights, inverse_cdf, systematic_copies
+from mstfilter.smc.resampling import Systematic, checked_weights, inverse_cdf, systematic_copies
 
 
 @dataclass(frozen=True)
@@ -206,9 +206,6 @@ class ClusterStratified(Resampler):
     least_mass: Annotated[float, Bounds(at_least=0, below=1, unit="share of the weight")] = 0.0
 
     exact_size: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_scheme(self.scheme)
 
     @property
     def properly_weighted(self) -> bool:

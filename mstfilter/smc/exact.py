@@ -80,7 +80,7 @@ def _entry(name: str, given: np.ndarray, t: int = 0, u: Any = None) -> np.ndarra
 
 def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
     """B u (d,). Without BLAS, whose rounding depends on the number of rows."""
-    u = vector_of("input", u, B.shape[1])
+    u = vector_of("the input", u, B.shape[1])
     return (B * u[..., None, :]).sum(axis=-1)
 
 
@@ -138,9 +138,7 @@ def _inverse(cov: np.ndarray) -> np.ndarray:
 
 
 def _observed(t: int, y: Any, k: int) -> np.ndarray:
-    vector = np.atleast_1d(np.asarray(y, dtype=np.float64))
-    if vector.shape != (k,):
-        raise InputError(f"observation {t} has shape {vector.shape}, expected ({k},)")
+    vector = vector_of(f"observation {t}", y, k)
     if not np.isfinite(vector).all():
         raise InputError(
             f"observation {t} is {vector.tolist()}, expected finite numbers", "one that is missing is None"

@@ -1,9 +1,8 @@
-"""Models with Gaussian noise, and filters that use it: EKF- and UKF-guided, Rao-Blackwellised.
+"""Models with Gaussian noise, and filters that use it: UKF-guided, Rao-Blackwellised.
 
 >>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
 
-A model with Gaussian noise and nonlinear functions has good proposals: the updates of the extended and the unscented
-Kalman filter.
+A model with Gaussian noise and nonlinear functions has a good proposal: the update of the unscented Kalman filter.
 
 >>> filter = rao_blackwellised(model, n=100)
 >>> state, infos = filter.run(observations, seed=0)
@@ -62,7 +61,7 @@ def nonlinear_gaussian(
 
     def log_likelihood(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
         noise = r.at(**step)
-        return noise.log_prob(vector_of("observation", y, noise.size) - seen(x, step))
+        return noise.log_prob(vector_of("the observation", y, noise.size) - seen(x, step))
 
     def log_transition(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
         return q.at(**step).log_prob(new - moved(old, step))
@@ -132,7 +131,7 @@ def vector_of(what: str, given: Any, size: int) -> np.ndarray:
     """An observation or input as a vector (size,); a number counts as (1,)."""
     vector = np.atleast_1d(np.asarray(given, np.float64))
     if vector.shape != (size,):
-        raise InputError(f"the {what} has shape {np.shape(given)}, expected ({size},)")
+        raise InputError(f"{what} has shape {np.shape(given)}, expected ({size},)")
     return vector
 
 
@@ -248,42 +247,21 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> 
     )
 
 
-def _definite(name: str, given: Any) -> np.ndarray:
-    """A covariance that must be positive definite."""
-    _covariance(name, given)
-    return np.asarray(given, np.float64)
-
-
-def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[np.ndarray, Any], MultivariateNormal]:
-    """A proposal for `guided`: the update of the extended Kalman filter from each particle.
-
-    Given x_{t-1} the state is N(f(x_{t-1}), Q); `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000, section
-    II D). The arguments are as in `nonlinear_gaussian`; `jacobian` gives the derivatives of `h`, (n, k, d) or (k, d).
-    It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
-    """
-    Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
-
-    def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
-        mean = f(x)
-        H = np.asarray(jacobian(mean), np.float64)
-        cross = Q @ np.swapaxes(H, -1, -2)
-        return _conditional(mean, Q, h(mean), H @ cross + R, cross, y)
-
-    return proposal
-
-
 def ukf_proposal(
     f: _Map, Q: Any, h: _Map, R: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
 
-    Needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are those of
+    Given x_{t-1} the state is N(f(x_{t-1}), Q); no derivatives are needed (van der Merwe, Doucet, de Freitas, Wan
+    2000). `alpha`, `beta` and `kappa` are those of
     filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread. The other
     arguments are as in `nonlinear_gaussian`.
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 
-    Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
+    for name, given in (("Q", Q), ("R", R)):
+        _covariance(name, given)
+    Q, R = np.asarray(Q, np.float64), np.asarray(R, np.float64)
     points = MerweScaledSigmaPoints(len(Q), alpha, beta, kappa)
     offsets = points.sigma_points(np.zeros(len(Q)), Q)
 
@@ -294,15 +272,9 @@ def ukf_proposal(
         centre = np.einsum("s,nsk->nk", points.Wm, z)
         z = z - centre[:, None]
         S = np.einsum("s,nsi,nsj->nij", points.Wc, z, z) + R
-        return _conditional(mean, Q, centre, S, np.einsum("s,si,nsj->nij", points.Wc, offsets, z), y)
+        cross = np.einsum("s,si,nsj->nij", points.Wc, offsets, z)
+        gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(cross, -1, -2)), -1, -2)
+        moved = (gain @ (np.atleast_1d(np.asarray(y, np.float64)) - centre)[..., None])[..., 0]
+        return MultivariateNormal(mean + moved, Q - gain @ S @ np.swapaxes(gain, -1, -2))
 
     return proposal
-
-
-def _conditional(
-    mean: np.ndarray, cov: np.ndarray, predicted: np.ndarray, S: np.ndarray, cross: np.ndarray, y: Any
-) -> MultivariateNormal:
-    """The normal distribution of x given y, from their joint moments."""
-    gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(cross, -1, -2)), -1, -2)
-    residual = np.atleast_1d(np.asarray(y, np.float64)) - predicted
-    return MultivariateNormal(mean + (gain @ residual[..., None])[..., 0], cov - gain @ S @ np.swapaxes(gain, -1, -2))

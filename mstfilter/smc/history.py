@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.smc.export import Table, flat_columns, library
+from mstfilter.errors import InputError, missing_library
 from mstfilter.smc.interfaces import Info, State
+from mstfilter.smc.population import flat_columns
 
 Collector = Callable[[State, Info], Any]
 
@@ -60,7 +60,7 @@ def mean(state: State, info: Info) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class History(Mapping[str, np.ndarray], Table):
+class History(Mapping[str, np.ndarray]):
     """Collected arrays by name."""
 
     values_: Mapping[str, np.ndarray]  #: name -> array whose first axes are `dims`
@@ -94,14 +94,17 @@ class History(Mapping[str, np.ndarray], Table):
         return "\n  ".join(lines if len(lines) <= 5 else [*lines[:4], "also " + ", ".join(list(self.values_)[3:])])
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns of `to_pandas`: the labels of the axes and the collected values, one row per step."""
+        """Columns of a table: the labels of the axes and the collected values, one row per step."""
         labels = np.meshgrid(*(np.asarray(self.coords[name]) for name in self.dims), indexing="ij")
         named = dict(zip(self.dims, labels, strict=True))
         return flat_columns({**named, **self.values_}, axes=len(self._shape))
 
     def to_xarray(self) -> Any:
         """An ``xarray.Dataset`` with named dimensions; MissingLibraryError if xarray is not installed."""
-        xarray = library("xarray")
+        try:
+            import xarray
+        except ImportError as error:
+            raise missing_library(error, "this export", library="xarray") from error
         data = {
             name: ((*self.dims, *(f"{name}_{k}" for k in range(a.ndim - len(self.dims)))), a)
             for name, a in self.values_.items()

@@ -1,4 +1,4 @@
-"""Parameters of a model, inferred by particle Markov chain Monte Carlo or by a sequential sampler.
+"""Parameters of a model, inferred by particle Markov chain Monte Carlo.
 
 A model with parameters is a function that returns a filter:
 
@@ -16,9 +16,6 @@ A model with parameters is a function that returns a filter:
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
   the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which
   the early states hardly change.
-- `smc_sampler` moves particles from the prior to the posterior of a likelihood that can be computed, by tempering
-  (Del Moral, Doucet, Jasra 2006). It estimates the evidence, and finds several modes. ``waste_free=True`` uses all
-  states of the moves.
 """
 
 from __future__ import annotations
@@ -32,16 +29,12 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError, check_integer, check_number
+from mstfilter.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
-from mstfilter.smc.distributions import as_distribution
-from mstfilter.smc.export import Table, flat_columns
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import log_evidence
-from mstfilter.smc.interfaces import Distribution, Resampler
-from mstfilter.smc.population import Particles, Population, take
-from mstfilter.smc.resampling import Systematic
+from mstfilter.smc.population import Particles, flat_columns
 from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key, rows_of
 
@@ -49,7 +42,7 @@ FilterOf = Callable[[np.ndarray], ParticleFilter]
 
 
 @dataclass(frozen=True, eq=False)
-class Chains(Table):
+class Chains:
     """Markov chains of parameters."""
 
     theta: np.ndarray  #: (n_iterations, n_chains, d) parameters after each iteration
@@ -65,7 +58,7 @@ class Chains(Table):
         return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns of `to_pandas`: chain, draw, parameters, log evidence and log density, chain after chain."""
+        """Columns of a table: chain, draw, parameters, log evidence and log density, chain after chain."""
         numbers = np.indices(self.log_density.shape)
         arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta, **self._stats()}
         return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
@@ -143,12 +136,6 @@ class _Posterior:
         Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
         """
         first = self._filter(thetas[0])
-        for slot in ("initial", "transition", "update"):
-            if getattr(first, slot) is not None and getattr(first, slot).batched is False:
-                raise InputError(
-                    f"with batched=True the {slot} of the filter must be batched",
-                    "see mstfilter.smc.batching; StateSpaceModel(..., batched=True) makes it so",
-                )
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:
@@ -332,147 +319,3 @@ def particle_gibbs(
         paths.append(path)
     unknown = np.full((n_iterations, 1), np.nan)
     return Chains(thetas, unknown, unknown, np.array([moved / n_iterations]), tuple(paths))
-
-
-@dataclass(frozen=True, eq=False)
-class TemperedSample:
-    """Result of `smc_sampler`."""
-
-    population: Population  #: weighted draws of the posterior, particles (n,) or (n, d)
-    temperatures: np.ndarray  #: (k,) powers of the likelihood, from 0 to 1
-    accepted: np.ndarray  #: (k - 1,) share of accepted moves at each temperature above 0
-
-    @property
-    def log_evidence(self) -> float:
-        """Log of the estimated integral of prior times likelihood."""
-        return self.population.log_mean_weight
-
-
-def smc_sampler(
-    prior: Any,
-    log_likelihood: Callable[[np.ndarray], np.ndarray],
-    n: int,
-    seed: int = 0,
-    *,
-    share: float = 0.5,
-    steps: int = 5,
-    waste_free: bool = False,
-    temperatures: Sequence[float] | None = None,
-    scale: Any = None,
-    resampler: Resampler = Systematic(),  # noqa: B008 (frozen)
-) -> TemperedSample:
-    """Sequential Monte Carlo from the prior to the posterior, by powers of the likelihood.
-
-    At each temperature the particles are weighted, resampled, and moved by Metropolis steps that leave
-    prior * likelihood^temperature invariant. With fixed `temperatures` and `scale` the estimate of the evidence is
-    unbiased; chosen from the particles, they add a bias of order 1 / n (Beskos, Jasra, Kantas, Thiery 2016).
-
-    Parameters
-    ----------
-    prior : Distribution
-        Of floating-point parameters.
-    log_likelihood : callable
-        ``(theta) -> (n,)`` of parameters (n,) or (n, d).
-    share : float
-        The next temperature is the one at which the effective sample size falls to this share of `n`.
-    steps : int
-        Metropolis steps per temperature.
-    waste_free : bool
-        Keep all states of the moves (waste-free SMC; Dau and Chopin 2022). Of n particles, n / (`steps` + 1) are
-        resampled; these and their states after each step are the next `n` particles. A temperature takes about `n`
-        evaluations of the likelihood instead of `steps` times `n`, so `n` and `steps` can be larger: for example
-        n = 5000 and steps = 99. `n` must be a multiple of `steps` + 1.
-    temperatures : sequence of float, optional
-        Increasing numbers above 0 that end with 1.
-    scale : float, (d,) or (d, d) array_like, optional
-        Standard deviations or covariance of a step. Default: 2.38 / sqrt(d) times the root of the particles'
-        covariance.
-    """
-    check_integer("n", n, at_least=2)
-    check_integer("steps", steps)
-    check_number("share", share, above=0, below=1)
-    planned = None if temperatures is None else [float(v) for v in temperatures]
-    if planned is not None and (not planned or planned[-1] != 1 or (np.diff([0.0, *planned]) <= 0).any()):
-        raise InputError(f"temperatures are {planned}, expected increasing numbers above 0 that end with 1")
-    if waste_free and n % (steps + 1):
-        raise InputError(f"n is {n}, expected a multiple of steps + 1 = {steps + 1}, as waste_free is True")
-    target, key = _Target(as_distribution(prior), log_likelihood), Key(seed).child("tempering")
-    state = target.scored(target.prior.sample(key.child("initial").generator(), n))
-    population, reached, accepted = Population(state["theta"]), [0.0], []
-    while reached[-1] < 1:
-        streams, log_l = key.child(len(reached)), state["log_likelihood"]
-        now = planned[len(reached) - 1] if planned else _next_temperature(population, log_l, reached[-1], share * n)
-        population = population.reweighted((now - reached[-1]) * log_l)
-        root = _spread(population) if scale is None else _step_root(scale, state["theta"][0].size)
-        rng = streams.child("resampler").generator()
-        chosen = resampler.resample(rng, population, n // (steps + 1) if waste_free else n)
-        start = take(state, chosen.parents["ancestor"])
-        states, share_of_moves = target.moved(streams.child("move").generator(), start, now, root, steps)
-        kept = states if waste_free else states[-1:]
-        state = {name: np.concatenate([values[name] for values in kept]) for name in start}
-        population = Population(state["theta"], np.tile(chosen.log_weights, len(kept)))
-        reached.append(now)
-        accepted.append(share_of_moves)
-    return TemperedSample(population, np.array(reached), np.array(accepted))
-
-
-@dataclass(frozen=True)
-class _Target:
-    """Prior times powers of a likelihood."""
-
-    prior: Distribution
-    log_likelihood: Callable[[np.ndarray], np.ndarray]
-
-    def scored(self, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """`theta` with its log prior and log likelihood, which is not evaluated where the prior is zero."""
-        log_prior, log_l = np.asarray(self.prior.log_prob(theta), np.float64), np.full(len(theta), -np.inf)
-        inside = log_prior > -np.inf
-        if inside.any():
-            log_l[inside] = self._checked_log_likelihood(theta[inside])
-        return {"theta": theta, "log_prior": log_prior, "log_likelihood": log_l}
-
-    def _checked_log_likelihood(self, theta: np.ndarray) -> np.ndarray:
-        found = np.asarray(self.log_likelihood(theta), np.float64)
-        if found.shape != (len(theta),) or not (found < np.inf).all():
-            raise InputError(
-                f"log likelihood has shape {found.shape} and maximum {found.max()}, expected ({len(theta)},) numbers "
-                "below infinity"
-            )
-        return found
-
-    def moved(
-        self, rng: np.random.Generator, start: dict[str, np.ndarray], temperature: float, root: np.ndarray, steps: int
-    ) -> tuple[list[dict[str, np.ndarray]], float]:
-        """States after 0 to `steps` Metropolis steps, and the share of accepted moves."""
-
-        def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-            step = rng.standard_normal((len(now["theta"]), len(root))) @ root.T
-            new = self.scored(now["theta"] + step.reshape(now["theta"].shape))
-            gain = new["log_likelihood"] - now["log_likelihood"]
-            return new, new["log_prior"] - now["log_prior"] + temperature * gain
-
-        chain = list(metropolis(rng, start, propose, steps))
-        return [start, *(state for state, _ in chain)], float(np.mean([accepted for _, accepted in chain]))
-
-
-def _next_temperature(population: Population, log_l: np.ndarray, now: float, target: float) -> float:
-    """The temperature at which the effective sample size is `target`; 1 if it stays above."""
-    from scipy.optimize import brentq
-
-    def excess(temperature: float) -> float:
-        return population.reweighted((temperature - now) * log_l).ess - target
-
-    if excess(1.0) >= 0:
-        return 1.0
-    smallest = now + 1e-9 * (1 - now)
-    return smallest if excess(smallest) <= 0 else float(brentq(excess, smallest, 1.0, xtol=1e-12))
-
-
-def _spread(population: Population) -> np.ndarray:
-    """Square root of 2.38^2 / d times the covariance of the particles (Roberts, Gelman, Gilks 1997)."""
-    theta = population.particles.reshape(len(population), -1)
-    d = theta.shape[1]
-    covariance = np.atleast_2d(np.cov(theta, rowvar=False, aweights=population.weights))
-    # A small multiple of the identity, for a covariance of fewer distinct particles than dimensions.
-    covariance += 1e-10 * (np.trace(covariance) + 1e-300) * np.eye(d)
-    return 2.38 / np.sqrt(d) * np.linalg.cholesky(covariance)

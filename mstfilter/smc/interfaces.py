@@ -36,7 +36,6 @@ import numpy as np
 from mstfilter.errors import InputError, check_integer
 from mstfilter.fields import Bounded
 from mstfilter.lazy import late, short_repr
-from mstfilter.smc.export import Table
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
@@ -134,10 +133,7 @@ class Resampler(Component):
 
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`.
-
-        A scheme that makes new particles inherits `TransformResampler`.
-        """
+        """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`."""
 
 
 class WeightResampler(Resampler):
@@ -171,23 +167,6 @@ class WeightResampler(Resampler):
         if log_weights is None:
             log_weights = np.full(len(ancestors), population.log_mean_weight)
         return population.select(ancestors, log_weights)
-
-
-class TransformResampler(Resampler):
-    """A resampler that makes new particles instead of selecting some, for example by transport. Define `resample`.
-
-    The result has n particles with equal weights, the log mean of the old ones, and no parents: a new particle has
-    several ancestors. The mean of the new particles is the weighted mean of the old ones up to rounding. Expectations
-    of other functions are not kept exactly, so it is not properly weighted.
-    """
-
-    @property
-    def properly_weighted(self) -> bool:
-        return False
-
-    @abstractmethod
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Make `n` particles of equal weight."""
 
 
 class Trigger(Bounded, ABC):
@@ -314,11 +293,6 @@ class Distribution(ABC):
     def mean(self) -> np.ndarray:
         """Expected value, of the shape of the parameters: (), (n,), (1, d) or (n, d)."""
 
-    @property
-    @abstractmethod
-    def sd(self) -> np.ndarray:
-        """Standard deviation of each entry, of the shape of the mean."""
-
 
 class Codec(ABC):
     """Converts particles to named arrays and back, bit for bit, without pickle."""
@@ -375,11 +349,11 @@ class Info:
         return "\n  ".join([*lines, f"seconds {times}"] if times else lines)
 
 
-class Infos(list[Info], Table):
+class Infos(list[Info]):
     """The records of the steps of a run: a list that can be read as a table.
 
     >>> state, infos = filter.run(observations)
-    >>> infos.to_pandas()                   # or polars.DataFrame(infos.columns())
+    >>> pandas.DataFrame(infos.columns())
     """
 
     def rows(self) -> list[dict[str, Any]]:

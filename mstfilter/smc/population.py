@@ -28,7 +28,6 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.lazy import late
-from mstfilter.smc.export import Table, flat_columns
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -193,7 +192,7 @@ def _within(index: np.ndarray, n: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Population(Table):
+class Population:
     """Weighted particles and their parents.
 
     Parameters
@@ -246,7 +245,7 @@ class Population(Table):
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns of `to_pandas`: the particles, named as their arrays, else "x" or "particle"; weights."""
+        """Columns of a table: the particles, named as their arrays, else "x" or "particle"; weights."""
         weights, columns = {"weight": self.weights, "log_weight": self.log_weights}, flat_columns(self._arrays())
         if not weights.keys().isdisjoint(columns):
             raise InputError(f"particles have arrays called {' and '.join(sorted(weights.keys() & columns))}")
@@ -376,6 +375,16 @@ class Population(Table):
         new.__dict__["log_weights"] = lw
         new.__dict__.pop("_both", None)
         return new
+
+
+def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
+    """Columns of arrays whose first `axes` axes are the rows: ``x_0``, ``x_1`` for several entries in a row."""
+    columns = {}
+    for name, a in arrays.items():
+        a = np.asarray(a)
+        for k in np.ndindex(a.shape[axes:]):
+            columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
+    return columns
 
 
 def _kind(particles: Particles) -> str:

@@ -50,7 +50,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.smc.interfaces import Resampler, TransformResampler, WeightResampler
+from mstfilter.smc.interfaces import WeightResampler
 
 
 @dataclass(frozen=True)
@@ -220,15 +220,6 @@ class LargestWeights(WeightResampler):
         # Sorted by log weight, because different weights may all underflow to zero.
         largest = np.argsort(-log_weights, kind="stable")[: np.isfinite(log_weights).sum()]
         return largest[np.arange(n) % len(largest)], None
-
-
-def check_scheme(scheme: Resampler) -> None:
-    """Raise InputError if the scheme makes new particles."""
-    if isinstance(scheme, TransformResampler):
-        raise InputError(
-            f"{type(scheme).__name__} makes new particles without ancestors",
-            "use a scheme that selects",
-        )
 
 
 # --- the inverse of the cumulative weights, for all schemes ---

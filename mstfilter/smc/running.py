@@ -23,7 +23,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -82,8 +81,6 @@ def run_many(
     if not arms:
         raise InputError("there are no filters to run")
     check_integer("workers", workers)
-    if workers > 1:
-        _check_caller()
     collectors, seeds = collectors or {"log_evidence": log_evidence}, [int(seed) for seed in seeds]
     if not seeds:
         raise InputError("there are no seeds")
@@ -235,24 +232,6 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
             "if memory ran out: use fewer workers or fewer particles",
             "workers=1 runs in this process and shows a crash of compiled code",
         ) from None
-
-
-def _check_caller() -> None:
-    """Raise InputError if a module that is being imported calls `run_many` with workers.
-
-    Workers import the modules of the functions that they get. So they would call `run_many` again, or wait for the
-    import to end.
-    """
-    frame: FrameType | None = sys._getframe(2)
-    while frame is not None:
-        name = frame.f_globals.get("__name__")
-        spec = getattr(sys.modules.get(str(name)), "__spec__", None)
-        if frame.f_code.co_name == "<module>" and (name == "__mp_main__" or getattr(spec, "_initializing", False)):
-            raise InputError(
-                f"{frame.f_code.co_filename}, line {frame.f_lineno}: run_many with workers is called in an import",
-                'put the call below `if __name__ == "__main__":`, or into a function',
-            )
-        frame = frame.f_back
 
 
 def _in_worker(job: _Job, arm: str, seeds: list[int]) -> _Part:

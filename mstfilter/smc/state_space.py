@@ -13,8 +13,8 @@
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
 
-`metropolis` is the Metropolis-Hastings kernel of all chains of this package: of particles (`RandomWalkMove`, and
-`ProgramMove` for programs), of parameters (`pmmh`, `smc_sampler`) and of the ancestors of `backward_paths`.
+`metropolis` is the Metropolis-Hastings kernel of all chains of this package: of particles (`RandomWalkMove`), of
+parameters (`pmmh`) and of the ancestors of `backward_paths`.
 """
 
 from __future__ import annotations

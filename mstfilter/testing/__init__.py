@@ -5,7 +5,7 @@
 
 `mstfilter.smc.testing` has the contracts of components of numbers, and describes how to use a contract as a test.
 `scene_example` returns hypotheses and a clip for either kind. ``mstfilter new resampler mine.py`` writes a starting
-file for a component, and its test (`write_starter`).
+file for a component (`write_starter`).
 """
 
 from mstfilter.lazy import attach

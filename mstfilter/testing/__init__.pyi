@@ -9,7 +9,6 @@ from mstfilter.testing.stages import (
     run_contract as run_contract,
 )
 from mstfilter.testing.starters import (
-    Starter as Starter,
     starter_kinds as starter_kinds,
     write_starter as write_starter,
 )

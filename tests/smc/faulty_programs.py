@@ -15,7 +15,6 @@ import numpy as np
 from scipy import stats
 
 from mstfilter.smc import (
-    Always,
     Bernoulli,
     Categorical,
     Distribution,
@@ -181,9 +180,6 @@ def a_mean_if_the_observation_is_missing(previous, y):
     seen(sample("x", Normal(m, 0.6)), y)
 
 
-in_likelihood(ALONE, "resample_move", a_mean_in_a_resample_move_filter=np.mean)
-
-
 @faulty(ALONE)
 def a_parameter_by_position(previous, y):
     x = walk(previous)
@@ -284,7 +280,6 @@ in_site("loc of a Normal is nan in row", a_location_of_nan=lambda x: Normal(np.s
 in_site(r"high of a Uniform is \S+ in row", an_empty_interval=lambda x: Uniform(0.0, x))
 in_site("df of a Student is -", negative_degrees_of_freedom=lambda x: Student(x, 0.0, 1.0))
 in_site("Domain error|is NaN|nan", a_negative_scale_of_scipy=lambda x: stats.norm(0.0, x))
-in_site("is NaN", a_negative_scale_of_new_scipy=lambda x: stats.Normal(mu=0.0, sigma=x))
 in_observation(r"p of a Bernoulli is \S+ in row", 1, a_negative_probability=Bernoulli)
 in_observation("log density is nan", 0, a_negative_rate=stats.poisson)
 in_observation(
@@ -397,8 +392,6 @@ def a_branch_returns_a_reduction(previous, y):
 # --- distributions of the user ------------------------------------------------------------------------------------
 class Mine(Distribution):
     """A Gaussian around `mean`, whose parts the cases below replace."""
-
-    sd = np.float64(0.6)
 
     def __init__(self, mean):
         self.centre_ = np.asarray(mean, np.float64)
@@ -520,13 +513,6 @@ def a_switch_with_probabilities_of_particles(previous, y):
     return z
 
 
-@correct(kind="resample_move", trigger=Always())
-def moves_beyond_the_support(previous, y):
-    s = sample("s", stats.gamma(1.0, scale=0.5) if previous is None else stats.gamma(4.0, scale=previous["s"] / 4.0))
-    x = sample("x", Normal(0.0, np.sqrt(s)))
-    seen(x, y)
-
-
 def wide(previous, y):
     sample("x", Normal(0.7 * y if previous is None else 0.5 * y + 0.5 * previous["x"], 1.0))
 
@@ -561,12 +547,6 @@ def scipy_distributions(previous, y):
     k = sample("k", stats.binom(5, 1 / (1 + np.exp(-x))))
     v = sample("v", stats.multivariate_normal([0.0, 1.0], np.eye(2)))
     observe("y", stats.norm(x + 0.1 * k + v[:, 0], 0.5), y)
-
-
-@correct()
-def scipy_distributions_of_the_new_kind(previous, y):
-    x = sample("x", stats.Normal(mu=np.zeros(200) if previous is None else 0.9 * previous["x"], sigma=0.6))
-    observe("y", stats.norm(x, 0.5), y)
 
 
 @correct(ys=[0, 1, 1, 0])
@@ -644,7 +624,7 @@ class Clipped(Distribution):
     """A mixture of a point at 0 and a half normal would have no density; this is a count with a bound."""
 
     discrete = True
-    mean, sd = np.float64(1.2), np.float64(0.9)
+    mean = np.float64(1.2)
 
     def sample(self, rng, size):
         return np.minimum(rng.poisson(1.4, size), 3)

@@ -64,24 +64,20 @@ def test_data_frames():
         {"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=lambda state, info: info.n
     )
     for table in (infos, history, CHAINS, Population(PARTICLES["mapping"])):
-        frame = table.to_pandas()
-        assert isinstance(frame, pandas.DataFrame)
+        frame = pandas.DataFrame(table.columns())
         for name, column in table.columns().items():
             np.testing.assert_array_equal(frame[name].to_numpy(), column)
-    frame = infos.to_pandas()
+    frame = pandas.DataFrame(infos.columns())
     assert frame["ess"].tolist() == [info.ess for info in infos] and frame["resampled"].dtype == bool
-    row = history.to_pandas().query("arm == 'b' and seed == 5 and time == 3").iloc[0]
+    row = pandas.DataFrame(history.columns()).query("arm == 'b' and seed == 5 and time == 3").iloc[0]
     assert (row["ess"], row["n"]) == (history["ess"][1, 1, 3], 9)
     table = history.to_xarray()
     assert table["ess"].dims == ("arm", "seed", "time") and float(table["n"].sel(arm="b", seed=5, time=3)) == 9
-    assert Infos().columns() == {} and len(Infos().to_pandas()) == 0
+    assert Infos().columns() == {}
 
 
 def test_a_missing_library(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(MissingLibraryError, match="this export needs pandas"):
-        CHAINS.to_pandas()
     with pytest.raises(MissingLibraryError, match="this export needs xarray"):
         collect([]).to_xarray()
 

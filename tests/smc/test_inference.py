@@ -18,13 +18,11 @@ from mstfilter.smc import (
     Categorical,
     Dynamics,
     LargestWeights,
-    MultivariateNormal,
     Population,
     Program,
     Proposal,
     StateSpaceModel,
     Transition,
-    Uniform,
     auxiliary,
     bootstrap,
     conditional_path,
@@ -36,7 +34,6 @@ from mstfilter.smc import (
     path_log_prob,
     pmmh,
     sample,
-    smc_sampler,
     switch,
 )
 from tests.smc.models import (
@@ -313,7 +310,7 @@ def test_what_chains_reject():
     for scale in (0.0, [0.1, 0.2], [[-1.0]]):
         with pytest.raises(InputError, match="scale is"):
             pmmh(filter_of, YS, log_prior, [0.1], scale, 5)
-    with pytest.raises(InputError, match="must be batched"):
+    with pytest.warns(UserWarning, match="one by one: initial: it is not batched"):
         pmmh(lambda theta: bootstrap(replace(AR1, batched=False), 5), YS, log_prior, [0.1], 0.5, 5, batched=True)
     with pytest.raises(InputError, match="not properly weighted"):
         pmmh(lambda theta: bootstrap(AR1, 5, LargestWeights()), YS, log_prior, [0.1], 0.5, 5)
@@ -321,74 +318,3 @@ def test_what_chains_reject():
         ensemble(filter_of, YS, log_prior, [[0.1]], 5)
     with pytest.raises(InputError, match=r"draw returned parameters of shape \(2,\)"):
         particle_gibbs(filter_of, YS, lambda rng, theta, path: [1.0, 2.0], [0.1], 5)
-
-
-# --- SMC samplers, against a conjugate normal model ---------------------------------------------------------------
-
-POINTS = np.random.default_rng(3).normal([1.0, -2.0], 1.0, (6, 2))
-NORMAL_PRIOR = MultivariateNormal(np.zeros(2), 4 * np.eye(2))
-EVIDENCE = sum(stats.multivariate_normal(np.zeros(6), 4 + np.eye(6)).logpdf(column) for column in POINTS.T)
-
-
-def log_likelihood(theta):
-    return -0.5 * ((POINTS - theta[:, None]) ** 2).sum(axis=(1, 2)) - 6 * np.log(2 * np.pi)
-
-
-@pytest.mark.parametrize("settings", [{"n": 400}, {"n": 1000, "steps": 19, "waste_free": True}])
-def test_a_tempered_sampler_finds_posterior_and_evidence(settings):
-    runs = [smc_sampler(NORMAL_PRIOR, log_likelihood, seed=seed, **settings) for seed in range(12)]
-    means = np.array([r.population.weights @ r.population.particles for r in runs])
-    spread = np.array([np.cov(r.population.particles.T, aweights=r.population.weights) for r in runs])
-    np.testing.assert_allclose(means.mean(axis=0), POINTS.sum(axis=0) / 6.25, atol=5 * 0.4 / np.sqrt(400 * 12 / 4))
-    np.testing.assert_allclose(spread.mean(axis=0), np.eye(2) / 6.25, atol=0.02)
-    assert abs(np.mean([r.log_evidence for r in runs]) - EVIDENCE) < 0.1
-    for run in runs:
-        assert run.temperatures[0] == 0 and run.temperatures[-1] == 1 and (np.diff(run.temperatures) > 0).all()
-        assert len(run.accepted) == len(run.temperatures) - 1 and (run.accepted > 0.1).all()
-
-
-@pytest.mark.parametrize("more", [{"n": 50, "steps": 2}, {"n": 100, "steps": 4, "waste_free": True}])
-def test_the_evidence_of_a_fixed_schedule_is_unbiased(more):
-    settings = {"temperatures": [0.05, 0.25, 1.0], "scale": 0.6, **more}
-    logs = [smc_sampler(NORMAL_PRIOR, log_likelihood, seed=seed, **settings).log_evidence for seed in range(150)]
-    ratio = np.exp(np.array(logs) - EVIDENCE)
-    assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(150)
-    assert ratio.std() < 0.6
-
-
-def test_waste_free_keeps_every_state_of_the_chains():
-    """120 particles are 10 chains of 12 states, which differ by accepted steps only."""
-    settings = {"temperatures": [1.0], "scale": 0.3, "steps": 11, "waste_free": True}
-    run = smc_sampler(NORMAL_PRIOR, log_likelihood, 120, 3, **settings)
-    states = run.population.particles.reshape(12, 10, 2)
-    moved = (states[1:] != states[:-1]).all(axis=2)
-    assert moved.mean() == pytest.approx(run.accepted[0]) and 0.2 < run.accepted[0] < 0.95
-    assert np.abs(np.diff(states, axis=0)).max() < 0.3 * 5 and len(set(run.population.log_weights)) == 1
-
-
-def test_a_tempered_sampler_finds_both_modes():
-    """Two separate modes of a scalar, on a bounded prior and with parts of likelihood zero."""
-
-    def log_l(theta):
-        with np.errstate(divide="ignore"):
-            two = 0.3 * stats.norm(-4, 0.3).pdf(theta) + 0.7 * stats.norm(4, 0.3).pdf(theta)
-            return np.where(np.abs(theta) < 1, -np.inf, np.log(two))
-
-    run = smc_sampler(Uniform(-6.0, 6.0), log_l, 2000, seed=1)
-    assert run.population.particles.shape == (2000,)
-    assert abs(run.population.weights @ (run.population.particles > 0) - 0.7) < 0.06
-    assert abs(run.log_evidence + np.log(12)) < 0.15
-
-
-def test_what_a_tempered_sampler_rejects():
-    for changed, message in (
-        ({"temperatures": [0.5]}, "temperatures are"),
-        ({"temperatures": [0.5, 0.5, 1.0]}, "temperatures are"),
-        ({"share": 1.5}, "share is 1.5"),
-        ({"n": 1}, "n is 1"),
-        ({"waste_free": True}, "n is 20, expected a multiple of steps . 1 = 6"),
-        ({"log_likelihood": lambda theta: np.zeros(3)}, r"log likelihood has shape \(3,\)"),
-        ({"log_likelihood": lambda theta: np.full(len(theta), np.nan)}, "maximum nan"),
-    ):
-        with pytest.raises(InputError, match=message):
-            smc_sampler(**{"prior": NORMAL_PRIOR, "log_likelihood": log_likelihood, "n": 20, **changed})

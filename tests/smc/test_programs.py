@@ -18,7 +18,6 @@ from mstfilter.smc import (
     Bernoulli,
     Categorical,
     Distribution,
-    EssBelow,
     MultivariateNormal,
     Normal,
     Program,
@@ -85,21 +84,6 @@ def test_a_guide_gives_the_draws_of_the_guided_filter():
     assert one.log_evidence == pytest.approx(kalman_ar1(YS[:1])[1], abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    "filter",
-    [
-        Program(ar1).guided(best, 600, trigger=Always()),
-        Program(ar1).resample_move(1500, steps=2, scale=0.8, trigger=EssBelow(0.5)),
-    ],
-    ids=["guided", "resample-move"],
-)
-def test_filters_of_a_program_agree_with_kalman(filter):
-    """Within 4 standard errors (false alarm 6e-5 a case); 3.5 % of bias would be seen."""
-    mean, standard, _ = mean_ratio(filter, YS, EXACT, range(220))
-    assert abs(mean - 1) < 4 * standard
-    assert standard < 0.008
-
-
 # --- a tracker that changes between two regimes -------------------------------------------------------------------
 PROBS = np.array([0.7, 0.3])
 
@@ -142,7 +126,7 @@ def exact_regimes(ys):
 TRACK = [0.2, 1.4, 1.1, None, 2.9]
 
 
-@pytest.mark.parametrize("kind", ["bootstrap", "guided", "resample-move"])
+@pytest.mark.parametrize("kind", ["bootstrap", "guided"])
 def test_switch_agrees_with_enumeration(kind):
     def guide(previous, y):
         before = None if previous is None else previous["x"]
@@ -161,7 +145,6 @@ def test_switch_agrees_with_enumeration(kind):
     filter = {
         "bootstrap": program.bootstrap(3000),
         "guided": program.guided(guide, 3000),
-        "resample-move": program.resample_move(3000, steps=2),
     }[kind]
     exact, calm = exact_regimes(TRACK)
     mean, standard, _ = mean_ratio(filter, TRACK, exact, range(90))
@@ -182,7 +165,7 @@ def test_a_hidden_chain_as_a_program():
         k = sample("k", Categorical(START if previous is None else MOVES[previous["k"]]))
         observe("y", Categorical(EMIT[k]), y)
 
-    mean, standard, _ = mean_ratio(Program(chain).resample_move(1000), SYMBOLS, forward()[1], range(180))
+    mean, standard, _ = mean_ratio(Program(chain).bootstrap(1000), SYMBOLS, forward()[1], range(180))
     assert abs(mean - 1) < 4 * standard
     assert standard < 0.008
 
@@ -465,7 +448,6 @@ def test_all_distributions_in_a_branch_without_particles():
     for make in (
         lambda p: p.bootstrap(30),
         lambda p: p.guided(guide, 30),
-        lambda p: p.resample_move(30, trigger=Always()),
     ):
         state, _ = make(Program(model)).run([0.3, -0.2], 0)
         assert state.log_evidence == pytest.approx(stats.norm(0, np.sqrt(2)).logpdf([0.3, -0.2]).sum(), abs=0.8)
@@ -496,8 +478,8 @@ def test_a_guide_may_draw_outside_of_branches_or_in_more():
         assert standard < 0.01
 
 
-def test_a_move_keeps_returned_values_and_sites_apart():
-    """E[x_2 | y] of an AR(1) model by resample-move, with a value that the program returns beside the site."""
+def test_returned_values_are_kept_beside_sites():
+    """E[x_2 | y] of an AR(1) model, with a value that the program returns beside the site."""
 
     def model(previous, y):
         x = sample("x", Normal(0.0, SD0) if previous is None else Normal(RHO * (previous["above"] - 3.0), SIGMA))
@@ -506,7 +488,7 @@ def test_a_move_keeps_returned_values_and_sites_apart():
 
     means = []
     for seed in range(60):
-        population = Program(model).resample_move(400, trigger=Always()).run(YS, seed)[0].population
+        population = Program(model).bootstrap(400, trigger=Always()).run(YS, seed)[0].population
         np.testing.assert_array_equal(population.particles["above"], population.particles["x"] + 3.0)
         means.append(population.weights @ population.particles["x"])
     standard = np.std(means, ddof=1) / np.sqrt(60)
@@ -542,7 +524,7 @@ def test_values_of_particles_that_look_like_a_shared_vector():
 
 def test_the_mean_states_the_event_shape():
     class Pair(Distribution):
-        mean = sd = np.ones((1, 2))
+        mean = np.ones((1, 2))
 
         def sample(self, rng, size):
             return rng.standard_normal((size, 2))
@@ -605,10 +587,7 @@ def test_a_program_with_time_and_inputs_is_the_state_space_model_with_both():
     np.testing.assert_array_equal(a.population.particles, b.population.particles["x"])
     assert a.log_evidence == b.log_evidence
     reference = bootstrap(exact, 20_000).run(ys, 0)[0].log_evidence
-    for filter in (
-        Program(model).guided(guide, 4000),
-        Program(model).resample_move(4000, trigger=Always()),
-    ):
+    for filter in (Program(model).guided(guide, 4000),):
         assert filter.run(ys, 1)[0].log_evidence == pytest.approx(reference, abs=0.25)
 
     def needs(previous, y, u):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import subprocess
-import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -32,7 +30,6 @@ from mstfilter.smc import (
     unique_ancestors,
 )
 from mstfilter.smc.checkpoint import load_state, save_state
-from tests.conftest import REPOSITORY
 from tests.smc.models import AR1, SYMBOLS, Box, ar1_observations, hmm
 
 YS = ar1_observations(10)
@@ -133,33 +130,6 @@ def test_a_worker_that_dies_is_named_with_its_runs():
     filter = bootstrap(replace(AR1, batched=False), 4)
     with pytest.raises(InputError, match=died):
         run_many(filter, YS[:3], [4, 5, 6], workers=2, x=ends_the_process)
-
-
-def test_workers_need_a_script_that_is_not_imported(tmp_path):
-    """On import, workers would import the module again, and wait for the import to end."""
-    pytest.importorskip("joblib")
-    lines = (
-        "from mstfilter.smc import bootstrap, linear_gaussian, run_many",
-        "model = linear_gaussian([[0.9]], [[1]], [[1]], [[1]], [0], [[1]])",
-        "def one(state, info): return 1.0",
-        "runs = run_many({'a': bootstrap(model, 5)}, [0.1], range(4), workers=2, x=one)",
-        "print('made', runs['x'].sum())",
-    )
-    (tmp_path / "script.py").write_text("\n".join(lines))
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-
-    def python(*arguments):
-        command = [sys.executable, *arguments]
-        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
-
-    found = python("-c", "import script")
-    assert "script.py, line 4: run_many with workers is called in an import" in found.stderr
-    assert (
-        found.returncode == 1
-        and found.stderr.count("\nmstfilter.errors.InputError") == 1
-        and "__main__" in found.stderr
-    )
-    assert python("script.py").stdout == "made 4.0\n"
 
 
 # --- codecs -------------------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ ASSEMBLIES = {
     "resample-move": branching(resample_move(AR1, RandomWalkMove(AR1, 0.5), 8, trigger=Always())),
     "clusters": branching(bootstrap(AR1, 8, ClusterStratified(), Always())),
     "KLD size": branching(replace(bootstrap(AR1, 8, trigger=Always()), size=Kld(n_min=2, n_max=9))),
-    "program": branching(Program(walk).resample_move(8, guide=guide, trigger=Always())),
+    "program": branching(Program(walk).guided(guide, 8, trigger=Always())),
 }
 
 

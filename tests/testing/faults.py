@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.smc import Population, Resampler, TransformResampler, WeightResampler, log_mean_exp, normalise
+from mstfilter.smc import Population, Resampler, WeightResampler, log_mean_exp, normalise
 from tests.testing import Faults, of
 
 FAULTS = Faults()
@@ -59,20 +59,6 @@ def CorrectWeighted(rng, lw, n):
 
 
 @dataclass(frozen=True)
-class MeansByOrder(TransformResampler):
-    """New particles are means of the old ones by optimal transport, in one dimension: by order (Reich 2013)."""
-
-    def resample(self, rng, population, n):
-        x, W = population.particles, population.weights
-        order = np.argsort(x)
-        # Cumulative integral of the quantile function; new particle k is its mean over [k/n, (k+1)/n].
-        ends = np.concatenate([[0.0], np.cumsum(W[order])])
-        integral = np.concatenate([[0.0], np.cumsum(W[order] * x[order])])
-        made = np.diff(np.interp(np.linspace(0, ends[-1], n + 1), ends, integral)) * n
-        return Population(made, np.full(n, population.log_mean_weight))
-
-
-@dataclass(frozen=True)
 class RareHeaps(WeightResampler):
     """In a call of a thousand, all copies are of one particle drawn by weight."""
 
@@ -115,7 +101,7 @@ def SizeChanging(rng, lw, n):
     return ancestors, lw[ancestors] + np.log((lw > -np.inf).mean())
 
 
-CORRECT = (MeansByOrder(), RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
+CORRECT = (RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
 
 _CARRIED, _NUMBER, _ZERO = "carried_weight", "gives_n_particles", "zero_weights_are_never_chosen"
 _SCALE, _PARENTS = "scale_of_weights_is_irrelevant", "keeps_parents"

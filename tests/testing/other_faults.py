@@ -447,7 +447,7 @@ def _metropolis(rng, x, previous, y, shift=0.0, temperature=1.0):
 
 def pairs_of_steps(rng, x, previous, y):
     p = optimal(previous, y)
-    return np.asarray(p.mean) + float(np.asarray(p.sd).flat[0]) * in_blocks(rng, x, 2)
+    return np.asarray(p.mean) + float(np.asarray(p.scale).flat[0]) * in_blocks(rng, x, 2)
 
 
 @kernel

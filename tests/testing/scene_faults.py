@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -27,6 +27,7 @@ from mstfilter.segmentation import (
     TreeBuilder,
 )
 from mstfilter.tracking import IDENTITY, Candidate, MaskTracker, MotionRule, MstRule, Registration, SmallGicp
+from tests.testing import of, plainly
 
 #: What a faulty component does with a correct result.
 Change = Callable[..., Any]
@@ -87,27 +88,19 @@ class CompletesEach(Completes):
         return [replace(one, probability=self.change(one.probability)) for one in found]
 
 
-@dataclass(frozen=True)
-class WritesIntoTheBox(Completer):
-    def fill(self, rng, seen):
-        seen.surface[:] = True
-        return seen.surface.astype(float)
+def writes_into_the_box(rng, seen):
+    seen.surface[:] = True
+    return seen.surface.astype(float)
 
 
-@dataclass(frozen=True)
-class DrawsUndeclared(Completer):
-    def fill(self, rng, seen):
-        return Extrude().fill(rng, seen) * rng.uniform(0.9, 1.0)
-
-
-@dataclass(frozen=True)
-class DrawsFromItsOwn(Completer):
-    """Its results differ from call to call; a run cannot know."""
-
-    stochastic: ClassVar[bool] = True
-
-    def fill(self, rng, seen):
-        return Extrude().fill(rng, seen) * np.random.default_rng().uniform(0.9, 1.0)
+WritesIntoTheBox = of(Completer, fill=plainly)(writes_into_the_box)
+DrawsUndeclared = of(Completer, fill=lambda f, rng, seen: Extrude().fill(rng, seen) * f(rng))(
+    lambda rng: rng.uniform(0.9, 1.0)
+)
+#: Its results differ from call to call; a run cannot know.
+DrawsFromItsOwn = of(Completer, {"stochastic": True}, fill=lambda f, rng, seen: Extrude().fill(rng, seen) * f())(
+    lambda: np.random.default_rng().uniform(0.9, 1.0)
+)
 
 
 @dataclass(frozen=True)
@@ -242,14 +235,14 @@ CHOICES: dict[str, tuple[Change, str]] = {
 TOO_FAR = one_with(T=RigidTransform.from_translation([15.0, 0, 0]))
 
 
-@dataclass(frozen=True)
-class WritesIntoTheTrack(MotionRule):
-    def candidates(self, rng, track):
-        track.points[:, 0] += 0.1
-        return (IDENTITY,)
+def writes_into_the_track(rng, track):
+    track.points[:, 0] += 0.1
+    return (IDENTITY,)
 
-    def choose(self, rng, candidates):
-        return candidates[0]
+
+WritesIntoTheTrack = of(MotionRule, candidates=plainly, choose=lambda f, rng, candidates: candidates[0])(
+    writes_into_the_track
+)
 
 
 @dataclass(frozen=True)

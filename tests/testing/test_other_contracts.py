@@ -14,7 +14,6 @@ from mstfilter.smc import (
     Population,
     Prior,
     PriorityLookahead,
-    ProgramMove,
     RandomWalkMove,
     Rejuvenation,
     Reweight,
@@ -22,7 +21,7 @@ from mstfilter.smc import (
     observe,
     sample,
 )
-from mstfilter.smc.testing import CodecContract, LookaheadContract, RejuvenationContract
+from mstfilter.smc.testing import CodecContract, LookaheadContract
 from mstfilter.testing import run_contract, scene_example
 from tests.smc.models import AR1, RHO, SD0, SIGMA, TAU, predictive
 from tests.testing import run_property
@@ -39,11 +38,6 @@ def traces(rng, n):
     return Population({"x": rng.standard_normal(n)}, rng.standard_normal(n)), 0.4
 
 
-def exact_traces(rng, n):
-    previous, x, y = exact_ar1(rng, n)
-    return Population({"x": previous.particles}), Population({"x": x.particles}), y
-
-
 def ar1(previous, y):
     x = sample("x", Normal(0.0, SD0) if previous is None else Normal(RHO * previous["x"], SIGMA))
     observe("y", Normal(x, TAU), y)
@@ -57,17 +51,6 @@ class TestPriority(LookaheadContract):
 class TestNumbers(CodecContract):
     def make(self):
         return ArrayCodec()
-
-
-class TestProgramMove(RejuvenationContract):
-    def make(self):
-        return ProgramMove(ar1, 1.0)
-
-    def example(self, rng, n):
-        return traces(rng, n)
-
-    def exact(self, rng, n):
-        return exact_traces(rng, n)
 
 
 OURS = {
@@ -90,7 +73,9 @@ def test_components_of_models_keep_their_contract(name):
 
 
 @pytest.mark.parametrize(
-    "kind", ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
+    "kind",
+    ["trigger", "size", "similarity", "equivalence", "evidence", "transition", "proposal", "update"]
+    + ["completer", "rule"],
 )
 def test_components_of_the_package_keep_their_contract(kind):
     """All components but oracles, which need the ground truth of a recording, and front ends, which need files."""

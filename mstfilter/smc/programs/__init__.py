@@ -14,7 +14,7 @@ entry of a mapping that the function returns. `observe` adds log p(value) to the
 and adds nothing. ``switch(name, probs, branches, ...)`` draws a branch for each particle and runs each branch on its
 particles. Particles that differ in the number of their variables are objects: see `StateSpaceModel`.
 
-The methods of `Program` make a bootstrap, a guided and a resample-move filter from the function. The guided filter
-needs a guide program that has the same sites. The resample-move filter makes Metropolis steps on all sites. `sample`
-and `observe` happen in one pass, so a program is a Transition that weights its particles; the filter has no Update.
+The methods of `Program` make a bootstrap and a guided filter from the function; the latter needs a guide program that
+has the same sites. `sample` and `observe` happen in one pass, so a program is a Transition that weights its
+particles; the filter has no Update.
 """

@@ -1,10 +1,10 @@
-"""Filters from a program: bootstrap, guided and resample-move."""
+"""Filters from a program: bootstrap and guided."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -13,10 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.fields import PositiveFloat, PositiveInt
-from mstfilter.smc.distributions import Normal, hypothetical
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.interfaces import Component, Proposal, Rejuvenation, Transition
+from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
@@ -24,15 +22,12 @@ from mstfilter.smc.programs.handlers import (
     ReplayHandler,
     SampleHandler,
     ScoreHandler,
-    Site,
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import ProgramRun, active_run
-from mstfilter.smc.state_space import choose_rows, moved
 from mstfilter.smc.streams import RunGenerators
 
 Model = Callable[..., Any]
-_Scored = tuple[ProgramRun, list[Site]]
 _HERE = str(Path(__file__).parent)
 
 
@@ -65,12 +60,6 @@ class Program:
         """
         return self._filter(guide, n, components)
 
-    def resample_move(
-        self, n: int, steps: int = 1, scale: float = 0.5, guide: Model | None = None, **components: Any
-    ) -> ParticleFilter:
-        """Resample-move filter; see `ProgramMove`."""
-        return replace(self._filter(guide, n, components), rejuvenation=ProgramMove(self.model, scale, steps))
-
     def _filter(self, guide: Model | None, n: int, components: dict[str, Any]) -> ParticleFilter:
         initial, transition = ProgramInitial(self.model, guide), ProgramTransition(self.model, guide)
         return ParticleFilter(initial=initial, transition=transition, n=n, **components)
@@ -100,7 +89,7 @@ class _ProgramStep(Component):
         guard = None if in_batch else self.schedule.guard(rng, past, observation, model, guide)
 
         def step() -> tuple[Particles, np.ndarray]:
-            return _step(rng, model, guide, previous, observation, n)
+            return program_step(rng, model, guide, previous, observation, n)
 
         try:
             particles, gain = step() if guard is None else guard.checked(_run_once, step)
@@ -132,7 +121,7 @@ class ProgramTransition(_ProgramStep, Transition):
         return self._advance(rng, population, observation, len(population))
 
 
-def _step(
+def program_step(
     rng: np.random.Generator, model: Model, guide: Model | None, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
     """Particles, drawn by the guide if there is one, and gains of the log weights."""
@@ -141,88 +130,6 @@ def _step(
     proposed = GuideHandler(rng, n)
     run_program(guide, proposed, previous, observation, n)
     return run_program(model, ReplayHandler(proposed), previous, observation, n)
-
-
-@dataclass(frozen=True)
-class ProgramMove(Rejuvenation):
-    """Metropolis-Hastings on all sites of a step at once.
-
-    Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution; discrete sites
-    are drawn from theirs. Both distributions depend on earlier sites, so the reverse density takes a second run at
-    the proposed values. The branches of `switch` stay. ``notes["accepted"]`` is the rate of accepted steps.
-
-    Parameters
-    ----------
-    scale : float
-        Standard deviation of a step relative to that of the site.
-    steps : int
-        Steps per move.
-    """
-
-    model: Model
-    scale: PositiveFloat = 0.5
-    steps: PositiveInt = 1
-
-    step_functions: ClassVar = {"model": 2}
-
-    def move(
-        self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
-    ) -> Population:
-        past, n = None if previous is None else previous.particles, len(population)
-
-        def score(values: Mapping[str, np.ndarray]) -> _Scored:
-            handler = ScoreHandler(values)
-            with hypothetical():
-                return _run_once(self.model, handler, past, observation, n), handler.sites
-
-        def propose(rng: np.random.Generator, state: _Scored) -> tuple[_Scored, np.ndarray]:
-            now, sites = state
-            values = self._propose(rng, now.values, sites)
-            new, new_sites = score(values)
-            forward = self._log_density(now.values, values, sites, n)
-            backward = self._log_density(values, now.values, new_sites, n)
-            with np.errstate(invalid="ignore"):
-                return (new, new_sites), new.gain - now.gain + backward - forward
-
-        def choose(accepted: np.ndarray, new: _Scored, old: _Scored) -> _Scored:
-            if accepted.all() or not accepted.any():
-                return new if accepted.any() else old
-            return score(choose_rows(accepted, new[0].values, old[0].values))
-
-        (now, _), accepted = moved(rng, score(population.particles), propose, self.steps, choose)
-        return Population(_values_of(now), population.log_weights, population.parents, {"accepted": accepted})
-
-    def _propose(
-        self, rng: np.random.Generator, x: Mapping[str, np.ndarray], sites: list[Site]
-    ) -> dict[str, np.ndarray]:
-        """New values of all sites."""
-        values = {name: np.array(a) for name, a in x.items()}
-        for site in sites:
-            old = x[site.name][site.index]
-            if site.branch:
-                continue
-            if site.distribution.discrete:
-                new = site.distribution.sample(rng, len(old))
-            else:
-                new = old + self.scale * site.distribution.sd * rng.standard_normal(old.shape)
-            values[site.name][site.index] = new
-        return values
-
-    def _log_density(
-        self, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], sites: list[Site], n: int
-    ) -> np.ndarray:
-        """(n,) log density of proposing `new` at `old`, for the given sites."""
-        total = np.zeros(n)
-        for site in sites:
-            if site.branch:
-                continue
-            if site.distribution.discrete:
-                step = site.distribution
-            else:
-                with hypothetical():
-                    step = Normal(old[site.name][site.index], self.scale * site.distribution.sd)
-            total[site.index] += step.log_prob(new[site.name][site.index])
-        return total
 
 
 def run_program(

@@ -14,7 +14,6 @@ from mstfilter.smc.testing.moves import (
 )
 from mstfilter.smc.testing.resampling import (
     ResamplerContract as ResamplerContract,
-    TransformResamplerContract as TransformResamplerContract,
     WeightResamplerContract as WeightResamplerContract,
 )
 from mstfilter.smc.testing.values import (

@@ -1,4 +1,4 @@
-"""Sorted particles and optimal transport: deterministic properties, a filter against the Kalman filter, errors."""
+"""Sorted particles and bounded ratios of weights: deterministic properties and errors."""
 
 from __future__ import annotations
 
@@ -6,25 +6,17 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
-    Always,
     Chopthin,
-    ClusterStratified,
-    EnsembleTransform,
     Population,
-    Shuffled,
     Sorted,
     Ssp,
     Stratified,
     Systematic,
-    auxiliary,
-    bootstrap,
 )
-from mstfilter.smc.transport_resampling import hilbert_position
-from tests.smc.models import AR1, ar1_observations, kalman_ar1, predictive
+from mstfilter.smc.wrapped_resampling import hilbert_position
 
 
 def random_population(rng, m, shape=()):
@@ -119,71 +111,3 @@ def test_chopthin_keeps_half_of_the_effective_sample_size():
 
 
 # --- ensemble transform -------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("n", [1, 7, 40, 90])
-@pytest.mark.parametrize("shape", [(), (1,), (2,)])
-def test_transport_keeps_the_weighted_mean(n, shape):
-    rng = np.random.default_rng(n)
-    population = random_population(rng, 40, shape)
-    made = EnsembleTransform().resample(rng, population, n)
-    expected = np.tensordot(population.weights, population.particles, 1)
-    np.testing.assert_allclose(made.particles.mean(axis=0), expected, atol=1e-12)
-    np.testing.assert_allclose(made.log_weights, population.log_mean_weight, atol=1e-12)
-    assert made.particles.shape == (n, *shape) and "ancestor" not in made.parents
-    assert (made.particles.max(axis=0) <= population.particles.max(axis=0) + 1e-9).all()
-
-
-def test_transport_in_one_dimension_is_that_of_the_linear_program():
-    """The same particles with a second coordinate of zero are transported by the linear program."""
-    rng = np.random.default_rng(2)
-    for m in (1, 2, 25):
-        population = random_population(rng, m)
-        plane = Population(np.stack([population.particles, np.zeros(m)], axis=1), population.log_weights)
-        line, program = (EnsembleTransform().resample(rng, p, m).particles for p in (population, plane))
-        np.testing.assert_allclose(program[:, 0], line, atol=1e-9)
-
-
-def test_transport_to_more_particles_is_the_quantile_function():
-    """New particle j is the mean of the quantile function over [j / n, (j + 1) / n], here by the trapezoid rule."""
-    population = Population(np.array([3.0, 1.0, 2.0]), np.log([1.0, 2.0, 1.0]))
-    made = EnsembleTransform().resample(np.random.default_rng(0), population, 8).particles
-    np.testing.assert_allclose(made, [1, 1, 1, 1, 2, 2, 3, 3])
-    made = EnsembleTransform().resample(np.random.default_rng(0), population, 2).particles
-    np.testing.assert_allclose(made, [1, 2.5])
-
-
-def test_transport_of_equal_weights_changes_nothing():
-    x = np.random.default_rng(3).standard_normal((30, 2))
-    mapping = Population({"a": x[:, 0], "b": x[:, 1:]})
-    made = EnsembleTransform().resample(np.random.default_rng(0), mapping, 30).particles
-    np.testing.assert_allclose(made["a"], x[:, 0], atol=1e-9)
-    np.testing.assert_allclose(made["b"], x[:, 1:], atol=1e-9)
-
-
-def test_filter_by_transport_follows_the_kalman_filter():
-    """Filtered means of 20 runs, in their standard errors (3.5) and a bias of .02; no evidence, no ancestors."""
-    ys = ar1_observations(12)
-    exact = kalman_ar1(ys)[0][-1, 0]
-    filter = bootstrap(AR1, 200, EnsembleTransform(), Always())
-    means, runs = [], [filter.run(ys, seed) for seed in range(20)]
-    for state, _ in runs:
-        means.append(state.population.weights @ state.population.particles)
-        assert state.log_evidence is None
-        assert (state.population.parents["previous"] == -1).all() and state.population.unique_ancestors == 0
-    assert abs(np.mean(means) - exact) <= 3.5 * stats.sem(means) + 0.02
-    with pytest.raises(InputError, match="a lookahead needs a resampler that reports ancestors"):
-        auxiliary(AR1, predictive, 20, resampler=EnsembleTransform(), trigger=Always()).run(ys, 0)
-
-
-def test_what_cannot_be_transported_is_an_error():
-    rng = np.random.default_rng(0)
-    with pytest.raises(InputError, match="int64 cannot be mixed"):
-        EnsembleTransform().resample(rng, Population(np.arange(4)), 4)
-    with pytest.raises(InputError, match="objects"):
-        EnsembleTransform().resample(rng, Population(("a", "b")), 2)
-    with pytest.raises(InputError, match="linear program of 160000 variables"):
-        EnsembleTransform().resample(rng, random_population(rng, 400, (2,)), 400)
-    for wrapper in (Shuffled, Sorted):
-        with pytest.raises(InputError, match="EnsembleTransform makes new particles"):
-            wrapper(EnsembleTransform())
-    with pytest.raises(InputError, match="without ancestors"):
-        ClusterStratified(scheme=EnsembleTransform())

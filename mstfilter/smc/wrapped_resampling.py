@@ -1,26 +1,20 @@
-"""Resampling around another scheme, and by transport.
+"""Resampling around another scheme.
 
 `Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme: they change the order of the particles,
 merge equal ones, or change the weights.
 
 >>> import numpy as np
->>> from mstfilter.smc import Coalesced, EnsembleTransform, FearnheadClifford, Population
+>>> from mstfilter.smc import Coalesced, FearnheadClifford, Population
 >>> rng = np.random.default_rng(0)
 >>> doubled = Population(np.array([1.0, 2.0, 1.0, 3.0]), np.log([1.0, 1.0, 2.0, 4.0]))
 >>> Coalesced(FearnheadClifford()).resample(rng, doubled, 3).particles
 array([2., 1., 3.])
-
-`EnsembleTransform` makes new particles of equal weight whose mean is the weighted mean of the old ones.
-
->>> EnsembleTransform().resample(rng, doubled, 4).particles
-array([1. , 3. , 1.5, 3. ])
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -28,12 +22,9 @@ from mstfilter.errors import InputError
 from mstfilter.fields import Share
 from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
-from mstfilter.smc.interfaces import Equivalence, Resampler, TransformResampler
+from mstfilter.smc.interfaces import Equivalence, Resampler
 from mstfilter.smc.population import Population, as_matrix
-from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, check_scheme, checked_weights
-
-#: Linear programs of more variables than this are not solved: they take longer than some seconds.
-MAX_TRANSPORT = 100_000
+from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, checked_weights
 
 
 @dataclass(frozen=True)
@@ -44,9 +35,6 @@ class ResamplerWrapper(Resampler):
     """
 
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
-
-    def __post_init__(self) -> None:
-        check_scheme(self.scheme)
 
     @property
     def properly_weighted(self) -> bool:
@@ -215,85 +203,3 @@ class KeepWeights(ResamplerWrapper):
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         chosen = self.scheme.resample(rng, population, n)
         return replace(chosen, log_weights=population.log_weights[chosen.parents["ancestor"]])
-
-
-@dataclass(frozen=True)
-class EnsembleTransform(TransformResampler):
-    """Moves the particles to equal weights by optimal transport: new particles are mixtures of old ones.
-
-    T_ij minimises the sum of ``T_ij |x_i - y_j|^2`` with row sums W_i and column sums 1 / n; the new particles are
-    n sum_i T_ij x_i. The targets y_j are the old particles; for n different from m, equally spaced ones in their
-    order. In one dimension T is the monotone transport, found by sorting in O(m log m); otherwise a linear program of
-    m n variables, so use a few hundred particles. Draws nothing. Mixtures have less variance than the weighted
-    particles. Particles are arrays of floats, or mappings of such arrays.
-
-    Reference: Reich (2013), "A nonparametric ensemble transform method for Bayesian inference", SIAM Journal on
-    Scientific Computing 35.
-    """
-
-    @property
-    def draws(self) -> bool:
-        return False
-
-    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        weights = checked_weights(population.log_weights, n)
-        particles, x = population.particles, as_matrix(population.particles)
-        weights /= weights.sum()
-        i, j, mass = _monotone_transport(x[:, 0], weights, n) if x.shape[1] == 1 else _transport(x, weights, n)
-        mass /= np.bincount(j, mass, minlength=n)[j]
-
-        def mixed(name: str, old: np.ndarray) -> np.ndarray:
-            if not np.issubdtype(old.dtype, np.floating):
-                raise InputError(f"{name} of type {old.dtype} cannot be mixed, expected floats")
-            rows = old.reshape(len(old), -1)
-            new = np.stack([np.bincount(j, mass * column[i], minlength=n) for column in rows.T], axis=1)
-            new += weights @ rows - new.mean(axis=0)  # rounding, or the tolerance of the linear program
-            return new.reshape(n, *old.shape[1:])
-
-        if isinstance(particles, Mapping):
-            made: Any = {name: mixed(f"array {name!r}", np.asarray(old)) for name, old in particles.items()}
-        else:
-            made = mixed("an array", particles)
-        return Population(made, np.full(n, population.log_mean_weight))
-
-
-def _monotone_transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns and masses of the transport of weighted numbers to n of equal weight that keeps their order."""
-    order = np.argsort(x, kind="stable")
-    ends = np.cumsum(weights[order])
-    ends /= ends[-1]
-    cuts = np.sort(np.concatenate([[0.0], ends, np.arange(1, n) / n]))
-    mass, middle = np.diff(cuts), (cuts[1:] + cuts[:-1]) / 2
-    some = mass > 0
-    mass, middle = mass[some], middle[some]
-    columns = np.minimum((middle * n).astype(np.int64), n - 1)
-    # The new particle of a rank takes the position of the old one of this rank.
-    return order[ends.searchsorted(middle)], order[columns] if n == len(x) else columns, mass
-
-
-def _transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns and masses of the optimal transport of weighted (m, d) rows to n of equal weight."""
-    from scipy import optimize, sparse
-
-    rows = np.flatnonzero(weights)
-    if len(rows) * n > MAX_TRANSPORT:
-        raise InputError(
-            f"transport of {len(rows)} particles to {n} is a linear program of {len(rows) * n} variables, at most "
-            f"{MAX_TRANSPORT} are solved",
-            "use fewer particles, or Sorted(Stratified()), which selects particles",
-        )
-    targets = x[((np.arange(n) + 0.5) * (len(x) / n)).astype(np.int64)]
-    cost = ((x[rows, None, :] - targets[None, :, :]) ** 2).sum(axis=2)
-    by_row = sparse.kron(sparse.eye_array(len(rows)), np.ones((1, n)))
-    by_column = sparse.kron(np.ones((1, len(rows))), sparse.eye_array(n))
-    found = optimize.linprog(
-        cost.ravel() / max(cost.max(), np.finfo(float).tiny),
-        A_eq=sparse.vstack([by_row, by_column]).tocsr(),
-        b_eq=np.concatenate([weights[rows] * n, np.ones(n)]),
-        method="highs-ds",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
-    if found.x is None:
-        raise InputError(f"the transport was not found: {found.message}")
-    i, j = np.nonzero(found.x.reshape(len(rows), n) > 0)
-    return rows[i], j, found.x.reshape(len(rows), n)[i, j]
