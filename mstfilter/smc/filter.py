@@ -192,6 +192,7 @@ class ParticleFilter(AtStep):
         total = len(observations) if isinstance(observations, Sized) else None
         last, infos = seed if isinstance(seed, State) else self.start(seed), Infos()
         with progress_of(progress, "filter") as advance:
+            advance(0, total)
             for state, info in self.iterate(observations, last):
                 last = state
                 infos.append(info)

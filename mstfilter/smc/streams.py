@@ -246,8 +246,8 @@ class RunGenerators:
         if not inner:
             return np.array([draw(rng) for rng in self._generators])
         out = np.empty((len(self), *inner))
-        for row, rng in zip(out, self._generators, strict=True):
-            row[...] = draw(rng, inner)  # takes less time than out=row
+        for row, rng in zip(out.reshape(len(self), -1), self._generators, strict=True):
+            draw(rng, out=row)
         return self._joined(out)
 
 
