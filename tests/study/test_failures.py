@@ -9,7 +9,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -17,7 +16,6 @@ from mstfilter.errors import InputError
 from mstfilter.files import locked
 from mstfilter.study.config import load_study, study_of
 from mstfilter.study.executors import Executor, Local
-from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
 from tests.conftest import REPOSITORY
 from tests.study.scenes import InProcess, metrics, slide, table
@@ -72,20 +70,6 @@ def test_only_failed_runs_are_repeated(folder, tmp_path):
     again = run_study(wanted, out, InProcess(), cache=tmp_path)
     assert (again.done, again.repeated, again.failed) == (2, 1, ())
     assert table(out, "failures.csv") == []
-
-
-def test_a_failure_that_could_not_be_written_down_is_written_later(folder, tmp_path, monkeypatch):
-    write, calls = StudyFolder.write_failure, []
-
-    def full_at_first(self, folder, identity, outcome):
-        calls.append(folder)
-        if len(calls) == 1:
-            raise OSError(28, "No space left on device")
-        write(self, folder, identity, outcome)
-
-    monkeypatch.setattr(StudyFolder, "write_failure", full_at_first)
-    run_study(study(folder, "full", seeds=[0]), tmp_path / "out", InProcess(), cache=tmp_path)
-    assert "no space left" in table(tmp_path / "out", "failures.csv")[0]["error"]
 
 
 def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
@@ -240,7 +224,7 @@ def test_a_wrong_study_is_one_clear_error_before_any_run(folder, tmp_path, line)
     assert not (tmp_path / "out").exists()
 
 
-def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
+def test_folders_that_will_not_do(folder, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is not a study folder"):
         run_study(study(folder, "good"), tmp_path / "file", cache=tmp_path)
@@ -251,8 +235,3 @@ def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="is not a study folder"):
         run_study(study(folder, "good"), tmp_path / "mine", cache=tmp_path)
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["precious.txt"]
-    monkeypatch.setattr("mstfilter.study.study.shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
-    begun = []
-    with pytest.raises(InputError, match=r"full: the disk has 1e-06 GB free, expected at least"):
-        run_study(study(folder, "good"), tmp_path / "full", cache=tmp_path, progress=begun.append)
-    assert begun == []
