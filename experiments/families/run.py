@@ -26,7 +26,6 @@ from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import OptimalCut, TreeCutProposal, optimal_cut
 from mstfilter.simulation import (
     FIRST_REPORTED_SEED,
-    DepthSensor,
     SceneFamily,
     SimulatedScene,
     play_push,
@@ -221,7 +220,6 @@ def main() -> None:
         summarise(options.out / "summary.csv", tables)
     if "pictures" in parts and not options.smoke:
         picture(options.out, small)
-    print("axial noise of the sensor at 1 m:", f"{1000 * DepthSensor().axial_sigma:.2f} mm")
 
 
 if __name__ == "__main__":

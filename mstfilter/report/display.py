@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 
 from mstfilter.belief import Belief
 from mstfilter.report.identities import match_objects, weigh_distinct
+from mstfilter.report.page import short_text
 from mstfilter.report.pictures import (
     Colour,
     colour,
@@ -32,7 +33,7 @@ from mstfilter.report.pictures import (
     voxel_picture,
 )
 from mstfilter.scene import Clip, Frame, Hypothesis, Recording
-from mstfilter.smc import Candidates, Population, State, as_matrix
+from mstfilter.smc import Candidates, Infos, Population, State, as_matrix
 
 _MOST_PICTURES = 6
 
@@ -130,7 +131,7 @@ def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
 
 
 def to_html(value: Any) -> str:
-    """What a notebook shows for an object of the package: its text and pictures."""
+    """What a notebook shows for an object of the package: its text, and pictures or a table of steps."""
     text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
     style = "display:inline-block;margin:4px 8px 4px 0"
     cells = [
@@ -138,7 +139,15 @@ def to_html(value: Any) -> str:
         f"<figcaption>{html.escape(words)}</figcaption></figure>"
         for uri, words, height in _pictures(value)
     ]
-    return f'<div style="max-width:60em">{text}<div>{"".join(cells)}</div></div>'
+    more = _table(value.rows()) if isinstance(value, Infos) else "".join(cells)
+    return f'<div style="max-width:60em">{text}<div style="overflow-x:auto">{more}</div></div>'
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table of rows with the same keys."""
+    lines = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
+    cells = ["".join(f"<td>{html.escape(short_text(v))}</td>" for v in line) for line in lines]
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in cells)}</table>"
 
 
 #: Data URI, caption and height in pixels.

@@ -20,7 +20,6 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
@@ -28,9 +27,9 @@ from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, write_csv, writing
 from mstfilter.open3d_import import import_open3d
 from mstfilter.report.identities import assign_identities
-from mstfilter.report.pictures import UNASSIGNED_COLOUR, Colour, colour, hexadecimal
+from mstfilter.report.pictures import Colour, colour, hexadecimal
 from mstfilter.runs import RunFolder
-from mstfilter.scene import Hypothesis, VoxelGrid, project, write_image
+from mstfilter.scene import Hypothesis, project, write_image
 
 MESH_FORMATS = ("ply", "obj")
 
@@ -62,37 +61,21 @@ def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, index.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
-def hypothesis_mesh(hypothesis: Hypothesis, colours: Mapping[int, Colour] | None = None) -> Any:
-    """Meshes of all objects of a hypothesis as one ``open3d.geometry.TriangleMesh``, in world metres.
+def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
+    """Write the mesh of a hypothesis that has objects, in world metres; `path` ends in ply or obj.
 
     The triangles are the faces of the voxels; the mesh of an object encloses exactly the volume of its voxels.
     `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. Raises MissingLibraryError if
     open3d cannot be imported.
     """
-    o3d = import_open3d()
-    if colours is None:
-        colours = {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
+    path, o3d, grid = Path(path), import_open3d(), hypothesis.grid
     mesh = o3d.geometry.TriangleMesh()
-    for record in hypothesis.objects:
-        part = _voxel_mesh(o3d, hypothesis.labels == record.label, hypothesis.grid)
-        part.paint_uniform_color(np.array(colours.get(record.label, UNASSIGNED_COLOUR)) / 255)
+    for k, record in enumerate(hypothesis.objects):
+        corners, triangles = voxel_faces(hypothesis.labels == record.label)
+        vertices = o3d.utility.Vector3dVector(grid.origin + corners * grid.voxel_size)
+        part = o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
+        part.paint_uniform_color(np.array(colour(k) if colours is None else colours[record.label]) / 255)
         mesh += part
-    return mesh
-
-
-def _voxel_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
-    corners, triangles = voxel_faces(mask)
-    vertices = o3d.utility.Vector3dVector(grid.origin + corners * grid.voxel_size)
-    return o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
-
-
-def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write the mesh of a hypothesis that has objects; the ending of `path` (ply, obj) chooses the format.
-
-    `colours` are those of `hypothesis_mesh`.
-    """
-    path, o3d = Path(path), import_open3d()
-    mesh = hypothesis_mesh(hypothesis, colours)
     with atomic_path(path) as partial, TemporaryDirectory(dir=partial.parent) as folder:
         work = str(Path(folder) / path.name)  # open3d writes the name into OBJ files
         if not o3d.io.write_triangle_mesh(work, mesh):

@@ -61,8 +61,7 @@ def write_report(
         figures=_figures(numbers),
         rotatable=Markup(run_page(run, photos=False, head=False).frame(640)) if numbers.steps else "",
         parts=[_part(numbers, slot) for slot in numbers.slots],
-        config=_config_rows(numbers.description["config"]),
-        facts=_facts(numbers.description),
+        config=flatten(numbers.description["config"]),
     )
     return write_page(run.path / "report.html" if out is None else Path(out), page)
 
@@ -160,29 +159,3 @@ def _part(numbers: RunNumbers, slot: str) -> dict[str, Any]:
         "rows": note_rows([step.notes(slot) for step in numbers.steps]),
         "seconds": [step.seconds.get(slot, 0.0) for step in numbers.steps],
     }
-
-
-def _config_rows(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Configuration as ``path = value``, grouped by slot; first the values of the filter."""
-    plain = [(k, short_text(v)) for k, v in config.items() if not isinstance(v, Mapping)]
-    groups = [("filter", plain)] if plain else []
-    for slot, part in config.items():
-        if isinstance(part, Mapping):
-            rows = [(k.removesuffix(".component"), short_text(v)) for k, v in flatten(part, slot).items()]
-            groups.append((SLOT_TITLES.get(slot, slot), rows))
-    return groups
-
-
-def _facts(description: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Preset, seed, recording, hashes of files and weights, and versions."""
-    recording = description["recording"]
-    facts = [
-        ("preset", str(description["description"])),
-        ("seed", short_text(description["seed"])),
-        ("status", str(description["status"])),
-        ("recording", str(recording["name"])),
-        ("recording key", str(recording["key"])),
-        ("generator", short_text(recording["generator"])),
-    ]
-    facts += [(name, str(one)) for name, one in (description.get("files", {}) | description["versions"]).items()]
-    return [fact for fact in facts if fact[1] not in ("", "–")]

@@ -246,7 +246,7 @@ def _comparable(
     if camera is None:
         if grid is not None and truth.grid is not None and not _same_grid(grid, truth.grid):
             raise InputError(
-                f"pause {pause}: hypotheses are on a grid {_grid_text(grid)}, truth on {_grid_text(truth.grid)}",
+                f"pause {pause}: hypotheses are on {grid}, truth on {truth.grid}",
                 "run the filter on the recording that has the ground truth, or give it the same workspace",
             )
         return lambda labels: labels, truth.labels
@@ -257,10 +257,5 @@ def _comparable(
 
 
 def _same_grid(a: VoxelGrid, b: VoxelGrid) -> bool:
-    return (
-        a.shape == b.shape and np.allclose(a.origin, b.origin, atol=1e-6) and abs(a.voxel_size - b.voxel_size) < 1e-9
-    )
-
-
-def _grid_text(grid: VoxelGrid) -> str:
-    return f"{' x '.join(map(str, grid.shape))} at {np.round(grid.origin, 4).tolist()} of {grid.voxel_size:g} m"
+    ends = np.allclose([a.origin, a.upper], [b.origin, b.upper], atol=1e-6)  # up to single precision
+    return a.shape == b.shape and bool(ends)

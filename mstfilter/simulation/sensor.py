@@ -58,11 +58,6 @@ class DepthSensor(Bounded):
     edge_dropout: Share = 0.12
     fill: NonNegativeFloat = 2.5
 
-    @property
-    def axial_sigma(self) -> float:
-        """Standard deviation of a reading at one metre, rounding included, in metres."""
-        return float(np.hypot(_DISPARITY_NOISE, 1 / np.sqrt(12.0)) / _EIGHTHS)
-
     def read(self, rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray) -> np.ndarray:
         """Depth image (H, W) float32 in metres, NaN for no reading.
 

@@ -379,3 +379,5 @@ class Infos(list[Info]):
         ess, seconds = [info.ess for info in self], sum(sum(info.seconds.values()) for info in self)
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
         return f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
+
+    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")

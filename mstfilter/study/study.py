@@ -10,7 +10,6 @@ not repeated; the tables are the same as those of an uninterrupted study.
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,8 +25,6 @@ from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Executor, Local, Tell
 from mstfilter.study.plan import Plan, StudyRun, StudyScene, make_plan
 from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
-
-_LEAST_FREE_GB = 0.5
 
 
 @dataclass(frozen=True)
@@ -103,8 +100,6 @@ def run_study(
 
 def _prepare(folder: StudyFolder, cache: Path, description: dict[str, Any]) -> None:
     """Check the folders and write study.json."""
-    for target in (folder.path, cache):
-        _check_free_space(target)
     for part in ("recordings", "work"):
         check_private(cache / part)
     with writing(f"study folder {folder.path}", "choose another with --out"):
@@ -147,14 +142,12 @@ class _Call:
         def tell(k: int, outcome: JobOutcome | None) -> None:
             if outcome is None:
                 sweep(self.folder.path / "runs", runs[k].folder)
-            elif outcome.status != "done":
-                _write_failure(self.folder, runs[k], outcome)
             count(k, outcome)
 
         outcomes = self.executor.run(jobs, tell)
         failed = [(run, outcome) for run, outcome in zip(runs, outcomes, strict=True) if outcome.status != "done"]
         for run, outcome in failed:
-            _write_failure(self.folder, run, outcome)  # repeated, because the disk may have been full before
+            _write_failure(self.folder, run, outcome)
         return {run.name: outcome for run, outcome in failed}
 
     def _job(self, kind: str, name: str, scene: StudyScene, more: dict[str, Any]) -> Job:
@@ -212,19 +205,6 @@ def _locked(path: Path) -> Iterator[StudyFolder]:
             yield StudyFolder(path)
         finally:
             sweep(path / "runs")
-
-
-def _check_free_space(folder: Path) -> None:
-    """Raise InputError if the disk of a folder, which need not exist yet, is nearly full."""
-    existing = folder.absolute()
-    while not existing.exists():
-        existing = existing.parent
-    free_gb = shutil.disk_usage(existing).free / 1e9
-    if free_gb < _LEAST_FREE_GB:
-        raise InputError(
-            f"{folder}: the disk has {free_gb:.2g} GB free, expected at least {_LEAST_FREE_GB} GB",
-            'free disk space, choose another folder, or set keep = "tables" in the study',
-        )
 
 
 def _description(plan: Plan) -> dict[str, Any]:

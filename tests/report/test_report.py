@@ -247,14 +247,6 @@ def test_compared_runs_stand_beside_the_run(tmp_path):
     assert "without past" in re.search(r'<svg class="figure".*?</svg>', text, flags=re.S)[0]
 
 
-def test_text_of_the_figures_is_large_enough(finished):
-    """At least 9 pixels where a figure is 840 pixels wide."""
-    for svg in re.findall(r'<svg class="figure".*?</svg>', finished[1].read_text(), flags=re.S):
-        width = float(re.search(r'viewBox="\S+ \S+ (\S+) ', svg)[1])
-        sizes = [float(size) for size in re.findall(r"font-size: ?([\d.]+)px", svg)]
-        assert sizes and min(sizes) * 840 / width >= 9
-
-
 def test_hidden_objects_are_named(tmp_path, monkeypatch):
     """The second box stands behind a wall from pause 1 on, which the first box has become."""
     hidden = labels_of((12, 8, 3))

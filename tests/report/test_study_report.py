@@ -8,10 +8,9 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.report.figures import SERIES, figure_groups
+from mstfilter.report.figures import SERIES
 from mstfilter.report.study_report import write_study_report
 from mstfilter.study import RESULT, StudyFolder, summarise
 from mstfilter.study.summary import ArmMetric
@@ -112,15 +111,6 @@ def test_more_arms_than_colours_are_drawn_in_several_figures(tmp_path):
         assert set(re.findall(r">(arm \d+)<", svg)) == {arms[0], *others}
         assert svg.count("<use") >= points * (1 + len(others))
     assert text.count("<figcaption>Each point") == 1
-
-
-@given(st.lists(st.integers(), unique=True, min_size=1, max_size=60), st.data())
-def test_groups_hold_every_arm_once_and_the_reference_always(numbers, data):
-    arms = [str(k) for k in numbers]
-    reference = data.draw(st.sampled_from(arms))
-    groups = figure_groups(arms, reference)
-    assert all(reference in group and len(group) == len(set(group)) <= len(SERIES) for group in groups)
-    assert [a for group in groups for a in group if a != reference] == [a for a in arms if a != reference]
 
 
 def test_conclusions_leave_out_arms_that_are_reported_only(tmp_path):

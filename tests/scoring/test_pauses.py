@@ -111,7 +111,7 @@ def test_input_that_does_not_match_is_an_error(tmp_path):
     other = VoxelGrid((1, 1, 0), 0.01, GRID.shape)
     labels = table_scene(0)[2]
     for estimate, message in (
-        ([PauseEstimate([labels], np.ones(1), 0, other)], "on a grid 60 x 60 x 30 at .* truth on"),
+        ([PauseEstimate([labels], np.ones(1), 0, other)], r"on VoxelGrid\(.*shape=\(60, 60, 30\)\), truth on"),
         ([PauseEstimate([labels], np.ones(1), 7, GRID)], "no pause has both"),
         ([PauseEstimate([labels], np.ones(1))], "1 pauses with hypotheses and 2 with truth"),
     ):

@@ -9,7 +9,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -17,7 +16,6 @@ from mstfilter.errors import InputError
 from mstfilter.files import locked
 from mstfilter.study.config import load_study, study_of
 from mstfilter.study.executors import Executor, Local
-from mstfilter.study.results import StudyFolder
 from mstfilter.study.study import run_study
 from tests.conftest import REPOSITORY
 from tests.study.scenes import InProcess, metrics, slide, table
@@ -48,13 +46,13 @@ def study(folder, *arms, **more):
 def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
     out = tmp_path / "out"
     result = run_study(
-        study(folder, "good", "raise", "full", "die", "print", seeds=[0]), out, Local(2), cache=tmp_path
+        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=2), out, Local(2), cache=tmp_path
     )
     assert result.done == 2
     errors = {(r["run"], r["tries"]): r["error"] for r in table(out, "failures.csv")}
     assert "RuntimeError: the component broke" in errors["raise on slide, seed 0", "1"]
     assert "no space left" in errors["full on slide, seed 0", "1"]
-    assert errors["die on slide, seed 0", "3"] == "its worker died 3 times, the last time by signal 9"
+    assert errors["die on slide, seed 0", "2"] == "its worker died 2 times, the last time by signal 9"
     assert len(errors) == 3
     assert {r["arm"] for r in table(out)} == {"good", "print"}  # the output of a component has no effect
     trace = next(f["trace"] for f in result.folder.failures() if f["arm"] == "raise")
@@ -72,20 +70,6 @@ def test_only_failed_runs_are_repeated(folder, tmp_path):
     again = run_study(wanted, out, InProcess(), cache=tmp_path)
     assert (again.done, again.repeated, again.failed) == (2, 1, ())
     assert table(out, "failures.csv") == []
-
-
-def test_a_failure_that_could_not_be_written_down_is_written_later(folder, tmp_path, monkeypatch):
-    write, calls = StudyFolder.write_failure, []
-
-    def full_at_first(self, folder, identity, outcome):
-        calls.append(folder)
-        if len(calls) == 1:
-            raise OSError(28, "No space left on device")
-        write(self, folder, identity, outcome)
-
-    monkeypatch.setattr(StudyFolder, "write_failure", full_at_first)
-    run_study(study(folder, "full", seeds=[0]), tmp_path / "out", InProcess(), cache=tmp_path)
-    assert "no space left" in table(tmp_path / "out", "failures.csv")[0]["error"]
 
 
 def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
@@ -111,10 +95,10 @@ class LimitHanging(Executor):
 def test_a_run_that_takes_too_long_is_named(folder, tmp_path):
     """The run hangs until it is killed, so the test does not depend on the speed of the machine."""
     executor = LimitHanging(Local(1), timeout_s=1)
-    wanted = study(folder, "hang", "good", seeds=[0], tries=2)
+    wanted = study(folder, "hang", "good", seeds=[0], tries=1)
     result = run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
     assert [(n, o.error, o.tries) for n, o in result.failed] == [
-        ("hang on slide, seed 0", "its worker died 2 times, the last time because it took longer than 1 s", 2)
+        ("hang on slide, seed 0", "its worker died 1 time, the last time because it took longer than 1 s", 1)
     ]
     assert result.done == 1
 
@@ -240,7 +224,7 @@ def test_a_wrong_study_is_one_clear_error_before_any_run(folder, tmp_path, line)
     assert not (tmp_path / "out").exists()
 
 
-def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
+def test_folders_that_will_not_do(folder, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is not a study folder"):
         run_study(study(folder, "good"), tmp_path / "file", cache=tmp_path)
@@ -251,8 +235,3 @@ def test_folders_that_will_not_do(folder, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="is not a study folder"):
         run_study(study(folder, "good"), tmp_path / "mine", cache=tmp_path)
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["precious.txt"]
-    monkeypatch.setattr("mstfilter.study.study.shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
-    begun = []
-    with pytest.raises(InputError, match=r"full: the disk has 1e-06 GB free, expected at least"):
-        run_study(study(folder, "good"), tmp_path / "full", cache=tmp_path, progress=begun.append)
-    assert begun == []
