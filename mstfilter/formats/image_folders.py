@@ -30,18 +30,16 @@ class PairedImages(RecordingFormat):
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
     depth images. There is no pose: the world is found from the support plane. Label images NAME_label.png (8 or 16
-    bits, one number for each object) become the true instances.
+    bits, one number for each object) become the true instances. Labels with most of their readings on the support
+    plane, and 0, are no objects.
 
     Parameters
     ----------
     frames : tuple of str
         Names of the frames in order. Default: all, by name; numbers in names count as numbers.
-    background : tuple of int
-        Labels that are no objects, besides 0. Default: those with most of their readings on the support plane.
     """
 
     frames: tuple[str | int, ...] = ()
-    background: tuple[int, ...] = ()
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -68,24 +66,23 @@ class PairedImages(RecordingFormat):
         made = video.recording(EveryNth(), KnownWorld())
 
         def instance(index: int) -> np.ndarray | None:
-            return self._instance(made.frames[index], path / f"{chosen[index]}_label.png")
+            return _instance(made.frames[index], path / f"{chosen[index]}_label.png")
 
         return replace(made, instance=instance)
 
-    def _instance(self, frame: Frame, file: Path) -> np.ndarray | None:
-        """The true objects (H, W) of a frame; None if there is no label image."""
-        if not file.is_file():
-            return None
-        labels = read_labels(file)
-        if labels.shape != frame.depth.shape:
-            raise InputError(f"label image {file} has shape {labels.shape}, its frame has {frame.depth.shape}")
-        background = self.background
-        if not background:
-            with np.errstate(invalid="ignore"):
-                on_plane = np.abs(table_residual(frame)) < _ON_PLANE
-            known = np.unique(labels[frame.valid])
-            background = tuple(int(k) for k in known if on_plane[frame.valid & (labels == k)].mean() > 0.5)
-        return object_numbers(np.where(np.isin(labels, background), 0, labels))
+
+def _instance(frame: Frame, file: Path) -> np.ndarray | None:
+    """The true objects (H, W) of a frame; None if there is no label image."""
+    if not file.is_file():
+        return None
+    labels = read_labels(file)
+    if labels.shape != frame.depth.shape:
+        raise InputError(f"label image {file} has shape {labels.shape}, its frame has {frame.depth.shape}")
+    with np.errstate(invalid="ignore"):
+        on_plane = np.abs(table_residual(frame)) < _ON_PLANE
+    known = np.unique(labels[frame.valid])
+    background = [k for k in known if on_plane[frame.valid & (labels == k)].mean() > 0.5]
+    return object_numbers(np.where(np.isin(labels, background), 0, labels))
 
 
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
@@ -102,7 +99,8 @@ class Redwood(VideoFormat):
     Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix``, column by column. Images are paired by the last number in their names, or by time
-    if these are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera stands still.
+    if these are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera
+    stands still.
     Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
