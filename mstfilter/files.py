@@ -302,12 +302,23 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     made_in = existing.parent if existing.is_file() else existing
     for name in [place.name for place in places[: places.index(existing)]] or [existing.name]:
         try:
-            trial = _temporary(made_in / name, "partial")
-            trial.touch()
-            trial.unlink()
+            _try_to_write(made_in, _temporary(made_in / name, "partial"))
         except OSError as error:
             problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
             raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
+
+
+def _try_to_write(folder: Path, temporary: Path) -> None:
+    """Make a file in a folder and remove it, without a name where that is possible: a kill then leaves nothing."""
+    if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+    try:
+        os.close(os.open(folder, os.O_WRONLY | os.O_TMPFILE))
+    except (AttributeError, OSError) as error:
+        if getattr(error, "errno", None) not in (None, errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT):
+            raise
+        temporary.touch()
+        temporary.unlink()
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -7,13 +7,10 @@ import re
 import shlex
 import shutil
 import warnings
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import mstfilter
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, open_recording
 from mstfilter.scene import (
@@ -29,7 +26,6 @@ from mstfilter.scene import (
     report_findings,
     write_image,
 )
-from mstfilter.smc import bootstrap, linear_gaussian
 from tests.conftest import REPOSITORY
 from tests.formats import layouts
 from tests.formats.bags import scene_messages, write as write_bag
@@ -183,69 +179,3 @@ def test_right_real_recordings_are_silent(name, shared_data):
         warnings.simplefilter("error")
         recording = PairedImages(frames=frames).open(path) if name != "jack" else open_recording(path)
         recording.clips()
-
-
-def _filter(observations):
-    one = np.eye(1)
-    return bootstrap(linear_gaussian(one, one, one, one, np.zeros(1), one), n=5).run(observations, seed=0)
-
-
-def _rename_images(path, name):
-    for part in ("color", "depth"):
-        for k, file in enumerate(sorted((path / part).iterdir())):
-            file.rename(file.with_name(name(k)))
-
-
-def _of_another_workspace(here):
-    recording = open_recording(here / "table-7")
-    grid = VoxelGrid(recording.grid.origin + 0.1, 0.01, (4, 4, 4))
-    filter = mstfilter.preset("mst")
-    state, _ = filter.step(filter.start(0), recording.clips()[0])
-    particles = tuple(Hypothesis.from_labels(np.ones(grid.shape, int), grid) for _ in state.population.particles)
-    return filter.step(
-        replace(state, population=replace(state.population, particles=particles)), recording.clips()[1]
-    )
-
-
-WRONG_FILES = {
-    "`rgb/` and `depth/` without intrinsics": lambda here: (here / "bedroom/intrinsic.json").unlink(),
-    "numbered images, one is missing": lambda here: next((here / "bedroom/depth").iterdir()).unlink(),
-    "names of images without numbers": lambda here: _rename_images(here / "bedroom", lambda k: f"{chr(97 + k)}.png"),
-    "intrinsics file without a camera matrix": lambda here: (here / "bedroom/intrinsic.json").write_text("{}"),
-}
-COMMAND_LINE = {
-    "`-o background=x`": ["convert", "frames", "t", "-o", "background=x"],
-    "`--out /proc/x`": ["run", "table-7", "--out", "/proc/x"],
-    "`--out` below a file": ["run", "table-7", "--out", "mine.py/run"],
-    "`--out` with a name of 300 characters": ["run", "table-7", "--out", "x" * 300],
-}
-PYTHON = {
-    "a data frame as observations of a filter": lambda here: _filter(SimpleNamespace(columns=["y"])),
-    "an observation that is NaN": lambda here: _filter([1.0, np.nan]),
-    "a hypothesis of another workspace": _of_another_workspace,
-}
-SECTION = PAGE.partition("## Files, options and arrays that cannot be used")[2].partition("\n## ")[0]
-FILE_ROWS = [
-    tuple(cell.strip() for cell in line.strip("|").split(" | ")) for line in SECTION.splitlines() if line[:2] == "| "
-]
-
-
-def test_the_table_has_the_inputs_of_the_test():
-    assert [row[0] for row in FILE_ROWS[1:]] == [*WRONG_FILES, *COMMAND_LINE, *PYTHON]
-
-
-@pytest.mark.parametrize(("wrong", "message"), FILE_ROWS[1:])
-def test_what_the_program_says(here, capsys, wrong, message):
-    if wrong in WRONG_FILES:
-        WRONG_FILES[wrong](here)
-    files = sorted(here.rglob("*"))
-    if wrong in PYTHON:
-        with pytest.raises(InputError) as caught:
-            PYTHON[wrong](here)
-        said = "\n".join((caught.value.message, *caught.value.hints))
-    else:
-        words = COMMAND_LINE.get(wrong, ["convert", "bedroom", "t", "-o", "fps=10"])
-        code, _, said = call(*words, capsys=capsys)
-        assert code == 2
-    assert message.strip("`") in said
-    assert sorted(here.rglob("*")) == files

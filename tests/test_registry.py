@@ -174,18 +174,6 @@ def test_a_file_is_executed_once_for_all_spellings_of_its_path(tmp_path, monkeyp
     assert REGISTRY.build("resampler", REGISTRY.describe(made[0]), allow_files=True) == made[0]
 
 
-def test_equal_configurations_of_a_file_give_equal_filters(tmp_path):
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "from dataclasses import dataclass\nfrom mstfilter.segmentation import TreeCutProposal\n"
-        "@dataclass(frozen=True)\nclass Mine(TreeCutProposal):\n    pass\n"
-    )
-    arguments = ("mst_rules", f"initial={path}:Mine", f"proposal={path}:Mine")
-    filter = preset(*arguments)
-    assert filter.initial == filter.proposal
-    assert filter == preset(*arguments)
-
-
 def test_an_edited_file_is_loaded_again(tmp_path):
     path = mine(tmp_path / "a", "a")
     before = load(path)

@@ -87,7 +87,7 @@ def flows(recording: Recording) -> list[Flow]:
         Flow("study", study),
         Flow("simulate", lambda root: cached_recording("demo", 3, root / "cache", **TINY), leaves=True),
         Flow("save_recording", lambda root: save_recording(recording, root / "copies" / "one")),
-        Flow("demo", lambda root: demo(recording, root, 2), lambda root: demo(recording, root, 1)),
+        Flow("demo", lambda root: demo(recording, root, 2)),
         Flow("write_masks", lambda root: masks(root, 2), masks),
     ]
 

@@ -194,18 +194,14 @@ class RecordingWriter:
     def _writing(self) -> AbstractContextManager[None]:
         return writing(f"recording {self.path}", "the unfinished files are removed")
 
-    def discard(self) -> None:
-        """Remove all files written so far."""
-        self._open.__exit__(InterruptedError, InterruptedError(), None)
-
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
-        if kind is not None:
-            self.discard()
-        else:
+        if kind is None:
             self.close()
+        else:
+            self._open.__exit__(kind, *error)  # removes all files written so far
 
 
 def save_recording(

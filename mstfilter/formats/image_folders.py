@@ -21,7 +21,7 @@ from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
 from mstfilter.reading import read_json, read_text
-from mstfilter.scene import Frame, Recording, read_labels, rigid_from_matrix, table_residual
+from mstfilter.scene import Frame, Recording, read_labels, table_residual
 
 
 @dataclass(frozen=True)
@@ -30,18 +30,16 @@ class PairedImages(RecordingFormat):
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
     depth images. There is no pose: the world is found from the support plane. Label images NAME_label.png (8 or 16
-    bits, one number for each object) become the true instances.
+    bits, one number for each object) become the true instances. Labels with most of their readings on the support
+    plane, and 0, are no objects.
 
     Parameters
     ----------
     frames : tuple of str
         Names of the frames in order. Default: all, by name; numbers in names count as numbers.
-    background : tuple of int
-        Labels that are no objects, besides 0. Default: those with most of their readings on the support plane.
     """
 
     frames: tuple[str | int, ...] = ()
-    background: tuple[int, ...] = ()
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -68,31 +66,30 @@ class PairedImages(RecordingFormat):
         made = video.recording(EveryNth(), KnownWorld())
 
         def instance(index: int) -> np.ndarray | None:
-            return self._instance(made.frames[index], path / f"{chosen[index]}_label.png")
+            return _instance(made.frames[index], path / f"{chosen[index]}_label.png")
 
         return replace(made, instance=instance)
 
-    def _instance(self, frame: Frame, file: Path) -> np.ndarray | None:
-        """The true objects (H, W) of a frame; None if there is no label image."""
-        if not file.is_file():
-            return None
-        labels = read_labels(file)
-        if labels.shape != frame.depth.shape:
-            raise InputError(f"label image {file} has shape {labels.shape}, its frame has {frame.depth.shape}")
-        background = self.background
-        if not background:
-            with np.errstate(invalid="ignore"):
-                on_plane = np.abs(table_residual(frame)) < _ON_PLANE
-            known = np.unique(labels[frame.valid])
-            background = tuple(int(k) for k in known if on_plane[frame.valid & (labels == k)].mean() > 0.5)
-        return object_numbers(np.where(np.isin(labels, background), 0, labels))
+
+def _instance(frame: Frame, file: Path) -> np.ndarray | None:
+    """The true objects (H, W) of a frame; None if there is no label image."""
+    if not file.is_file():
+        return None
+    labels = read_labels(file)
+    if labels.shape != frame.depth.shape:
+        raise InputError(f"label image {file} has shape {labels.shape}, its frame has {frame.depth.shape}")
+    with np.errstate(invalid="ignore"):
+        on_plane = np.abs(table_residual(frame)) < _ON_PLANE
+    known = np.unique(labels[frame.valid])
+    background = [k for k in known if on_plane[frame.valid & (labels == k)].mean() > 0.5]
+    return object_numbers(np.where(np.isin(labels, background), 0, labels))
 
 
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _STILL = "remove the file if the camera stands still"
-_INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json", "camera_info.yaml")
+_INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
 
 
 @dataclass(frozen=True)
@@ -101,10 +98,10 @@ class Redwood(VideoFormat):
 
     Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
-    Open3D's ``intrinsic_matrix``, column by column. ``camera_info.yaml`` is a message or a calibration file of ROS.
-    Images are paired by the last number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
-    16 bits, or float in metres (.npy, .tif). A trajectory ``.log`` of a moving camera has five lines per frame: three
-    numbers, then a 4 x 4 camera-to-world matrix. Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
+    Open3D's ``intrinsic_matrix``, column by column. Images are paired by the last number in their names, or by time
+    if these are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera
+    stands still.
+    Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
@@ -130,11 +127,6 @@ class Redwood(VideoFormat):
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         colour, depth = _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
-        logs = sorted(path.glob("*.log"))
-        if len(logs) > 1:
-            raise InputError(
-                f"{path} has {len(logs)} trajectories: {', '.join(p.name for p in logs)}", "remove all but one"
-            )
         file, stored = _read_intrinsics(path)
         K = self.K or _stored_matrix(path, file, stored)
         scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
@@ -146,7 +138,6 @@ class Redwood(VideoFormat):
             K,
             path,
             scale,
-            motion=_trajectory(logs[0], len(pairs)) if logs else None,
             distortion=self.distortion or tuple(stored.get("distortion", ())),
         )
         for name, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
@@ -225,26 +216,10 @@ def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
         return None, {}
     kind = "a file of intrinsics"
     with reading(file, kind):
-        stored = read_json(file, kind) if file.suffix == ".json" else _camera_info(read_text(file, kind))
+        stored = read_json(file, kind)
         if not isinstance(stored, dict):
             raise TypeError(f"it holds a {type(stored).__name__}, expected an object with the entry K")
     return file, stored
-
-
-def _numbers(text: str) -> list[float]:
-    return [float(word) for word in re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text)]
-
-
-def _camera_info(text: str) -> dict[str, Any]:
-    """``K``, size and ``distortion`` of a calibration file of ROS, or of a message of ROS 1 or 2."""
-
-    def entry(names: str) -> list[float]:
-        found = re.search(rf"(?ms)^(?:{names})\s*:(.*?)(?=^[A-Za-z_]|\Z)", re.sub("#.*", "", text))
-        return _numbers(re.sub(r"(?s).*data\s*:", "", found.group(1))) if found else []
-
-    sizes = {name: entry(f"image_{name}|{name}") for name in ("width", "height")}
-    found: dict[str, Any] = {name: value[0] for name, value in sizes.items() if value}
-    return found | {"K": entry("camera_matrix|K|k"), "distortion": entry("distortion_coefficients|D|d")}
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
@@ -283,19 +258,6 @@ def _four(K: Any) -> tuple[float, ...]:
     if not np.allclose(matrix[2], (0, 0, 1)):
         raise ValueError(f"the matrix is {matrix.tolist()}, expected the rows fx 0 cx, 0 fy cy, 0 0 1")
     return tuple(matrix[(0, 1, 0, 1), (0, 1, 2, 2)].tolist())
-
-
-def _trajectory(path: Path, n: int) -> list[RigidTransform]:
-    """Camera-to-world poses of a .log file, one per frame."""
-    with reading(path, "a trajectory", _STILL):
-        lines = read_text(path, "a trajectory").splitlines()
-        rows = [[float(v) for v in line.split()] for line in lines if line.strip()]
-    if len(rows) != 5 * n or any(len(row) != (3 if k % 5 == 0 else 4) for k, row in enumerate(rows)):
-        raise InputError(
-            f"trajectory {path} has {len(rows)} lines for {n} frames, expected five per frame: 3 numbers, then 4 x 4",
-            _STILL,
-        )
-    return [rigid_from_matrix(np.array(rows[5 * k + 1 : 5 * k + 5]), f"{path}: pose of frame {k}") for k in range(n)]
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def open_recording(
         more = fields.get("pauses")
         fields["pauses"] = {**rule, **more} if isinstance(more, dict) else rule
     name = format or detect_format(path)
-    cls = _reader(name, allow_files)
+    cls = _REGISTRY.find_class("format", name, "format", allow_files)
     if not path.exists():
         raise InputError(f"recording does not exist: {path}")
     reader: RecordingFormat = _REGISTRY.make(cls, fields, "", allow_files)
@@ -64,19 +64,12 @@ def pause_rule(text: str) -> PauseRule:
     return rule
 
 
-def _reader(name: str, allow_files: bool = False) -> type[RecordingFormat]:
-    cls = _REGISTRY.find_class("format", name, "format", allow_files)
-    if not issubclass(cls, RecordingFormat):
-        raise InputError(f"{name} is not a reader of recordings", "subclass mstfilter.formats.RecordingFormat")
-    return cls
-
-
 def detect_format(path: Path) -> str:
     """The name of the format of a file or folder."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
     names = _REGISTRY.known("format")
-    found = [name for name in names if _reader(name).detects(path)]
+    found = [name for name in names if _REGISTRY.find_class("format", name).detects(path)]  # type: ignore[attr-defined]
     if len(found) == 1:
         return found[0]
     if found:

@@ -249,10 +249,10 @@ def _read_npz(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarr
     if masks.ndim != ndim or masks.dtype.kind not in types:
         raise InputError(f"{path}: {kind} has shape {masks.shape} and type {masks.dtype}, expected {expected}")
     _check_shape(path, masks.shape[-2:], shape)
-    numbers = masks if kind == "labels" else np.array(len(masks))
-    if numbers.min(initial=0) < 0 or numbers.max(initial=0) > MAX_MASKS:
+    low, high = (masks.min(initial=0), masks.max(initial=0)) if kind == "labels" else (0, len(masks))
+    if low < 0 or high > MAX_MASKS:
         raise InputError(
-            f"{path}: labels are {numbers.min()} to {numbers.max()}, expected 0 to {MAX_MASKS}",
+            f"{path}: labels are {low} to {high}, expected 0 to {MAX_MASKS}",
             "labels have 16 bits; number the masks from 1",
         )
     n = len(masks) if kind == "masks" else len(np.unique(masks[masks > 0]))

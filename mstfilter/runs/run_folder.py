@@ -133,21 +133,6 @@ class _InfoFile(BaseModel):
     quality: dict[str, list[float]] | None
     notes: dict[str, Any]
 
-    @model_validator(mode="after")
-    def _agree(self) -> _InfoFile:
-        lists: dict[str, list[Any]] = {
-            "parents": list(self.parents.values()),
-            "quality": list((self.quality or {}).values()),
-        }
-        for name, found in lists.items():
-            if any(len(values) != len(self.weights) for values in found):
-                raise ValueError(f"{name} has not one value for each of the {len(self.weights)} weights")
-        if self.quality is not None and set(self.quality) != set(FORMS):
-            raise ValueError(f"quality has {sorted(self.quality)}, expected {list(FORMS)}")
-        if any(not k >= -1 for parents in self.parents.values() for k in parents):
-            raise ValueError("a parent is below -1")
-        return self
-
 
 class _PosedCamera(CameraFile):
     T_world_camera: list[list[float]]
@@ -220,10 +205,16 @@ class RunFolder:
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
         _ = self.seconds(t), self.questions(t)
+        parents, quality = info["parents"], info["quality"]
+        if quality is None:  # no ground truth
+            quality = dict.fromkeys(FORMS, info["weights"])
+        lists = (info["weights"], *parents.values(), *quality.values())
         wrong = (
             (info["t"] != t, f"info.json is of step {info['t']}"),
-            (len(info["weights"]) != len(hypotheses), f"info.json has {len(info['weights'])} weights"),
-            (max(info["parents"].get("previous", [-1])) >= n_before, "info.json has parents that are not there"),
+            (any(len(values) != len(hypotheses) for values in lists), "info.json has lists of another length"),
+            (set(quality) != set(FORMS), f"info.json has the quality {sorted(quality)}, expected {list(FORMS)}"),
+            (any(k < -1 for values in parents.values() for k in values), "info.json has a parent below -1"),
+            (max(parents.get("previous", [-1])) >= n_before, "info.json has parents that are not there"),
             (image.shape[:2] != (camera.height, camera.width), f"rgb.png has the shape {image.shape}"),
             (
                 (labels is None) != (info["quality"] is None),
