@@ -340,7 +340,7 @@ def _stacked(images: Any, what: str) -> np.ndarray:
 
 
 def check_depth(depth: np.ndarray, where: str) -> None:
-    """Raise InputError if a depth image (H, W) is empty, or its median cannot be the distance of a table in metres."""
+    """Raise InputError if a depth image (H, W) is empty, or its median cannot be a distance of a table in metres."""
     with np.errstate(invalid="ignore"):
         metres = depth[np.isfinite(depth) & (depth > 0)]
     if metres.size == 0:

@@ -127,7 +127,7 @@ class MotionCluster:
 
 
 def ransac(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float) -> MotionCluster | None:
-    """The motion with most pairs within ``eps`` metres, refitted to these pairs; None if there are fewer than three."""
+    """The motion with most pairs within ``eps`` metres, refitted to these pairs; None if there are fewer than 3."""
     models = minimal_models(rng, p, q, eps, 300)
     if not len(models):
         return None

@@ -293,8 +293,8 @@ class TrackingTransition(Transition):
         - ``segments``: number of distinct segments;
         - ``voxels_left`` (the grid), ``voxels_contested`` and ``objects_dropped``.
 
-        An object is *invisible* if it is hidden in the first frame, *unsupported* if the depth image disagrees with
-        it, and *lost* if it is not found in the last frame. Objects of these three kinds keep their position.
+        *Invisible* objects are hidden in the first frame, and *unsupported* objects disagree with the depth image.
+        *Lost* objects are not found in the last frame. Objects of these three kinds keep their position.
         """
         particles: tuple[Hypothesis, ...] = tuple(population.particles)
         if observation is None or len(observation.frames) < 2:
