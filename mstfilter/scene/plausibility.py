@@ -327,7 +327,7 @@ class _Corners:
         self.points, self.camera = points[row, column], frame.camera
 
     def moved(self, other: _Corners) -> tuple[int, int, float]:
-        """Corners that agree with the poses of two cameras, corners that agree on another camera, and its shift (m)."""
+        """Corners that agree with the poses of two cameras, corners that agree on another camera, its shift (m)."""
         import cv2
 
         if self.features is None or other.features is None:
