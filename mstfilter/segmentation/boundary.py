@@ -3,11 +3,11 @@
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 >>> height = above_table(frame)                            # (H, W), > 0 above the table, NaN without reading
 
-Objects are mostly convex. So depth has a concave crease or a step where two objects meet and where an object meets
+Most objects are convex. So depth has a concave crease or a step where two objects touch, and where an object touches
 the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
 length, b baseline, z depth) is affine on every plane, and its noise does not depend on the range. So the largest
-eigenvalue of its Hessian responds to creases and steps only. Colour adds boundaries that depth does not show. Its
-weight is lower, because print on a box is not a boundary.
+eigenvalue of its Hessian responds to creases and steps only. Colour adds boundaries that are not visible in depth.
+Its weight is lower, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE L
 
 
 def above_table(frame: Frame) -> np.ndarray:
-    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
+    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without a reading.
 
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
-    most readings.
+    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, and else the plane with the most
+    readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
 
 
 def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame; without a pose, with that relative to the fitted table (`fit_support_plane`)."""
+    """The camera of a frame. Without a pose, it gets the pose relative to the fitted table (`fit_support_plane`)."""
     camera = frame.camera
     return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
 
@@ -67,7 +67,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model of the clip's last frame. Its `component_key` includes the content that it uses."""
+        """The model for the clip's last frame. Its `component_key` includes the content that it uses."""
 
 
 @dataclass(frozen=True)
@@ -79,15 +79,15 @@ class ColourDepthBoundary(BoundaryModel):
     colour_weight : float
         Weight of the colour edges; 0 disables them.
     quiet_table : float
-        Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table, so that
-        print, grain and shadows on the table do not enter the tree. Negative values disable the rule.
+        Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table. So print,
+        grain and shadows on the table are ignored. A negative value disables the rule.
     """
 
     colour_weight: float = 0.4
     quiet_table: float = 12.0
 
     def boundary(self, frame: Frame) -> np.ndarray:
-        """Boundary strength (H, W). Robot pixels are 1 at their rim and 0 inside, so that they separate regions."""
+        """Boundary strength (H, W). The robot has 1 at its rim and 0 inside, so that it separates regions."""
         resize = scaled_length(1, frame.camera.width)
         edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
@@ -121,7 +121,7 @@ def _share_beside(valid: np.ndarray) -> float:
 
 
 def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
-    """e / (1 + e) with e the strength of the Lab structure tensor, averaged over three scales."""
+    """e / (1 + e), where e is the strength of the Lab structure tensor, averaged over three scales."""
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab /= np.array([_LIGHTNESS_UNIT, _CHROMA_UNIT, _CHROMA_UNIT], np.float32)
     xx = np.zeros(rgb.shape[:2], np.float32)
@@ -141,15 +141,15 @@ def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
 
 
 def filled_disparity(frame: Frame) -> np.ndarray:
-    """Disparity (H, W) float32 in sensor units; missing readings take the nearest one."""
+    """Disparity (H, W) float32 in sensor units. Missing readings take the nearest value."""
     return (8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)).astype(np.float32)
 
 
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
 
-    Concave curvature is the largest eigenvalue of the Hessian, convex curvature minus the smallest. `resize` is the
-    image width / 640.
+    Concave curvature is the largest eigenvalue of the Hessian, and convex curvature is minus the smallest. `resize`
+    is the image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

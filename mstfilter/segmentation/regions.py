@@ -1,6 +1,6 @@
 """Measurements of image regions and of their common borders.
 
-Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows. Disparity
+Regions and borders are measured as sums over pixels. So the row of a merged region is the sum of two rows. Disparity
 is in sensor units (1/8 px at f = 525 px), lengths are in metres.
 
 >>> regions = measure_regions(leaves, frame, boundary)
@@ -73,7 +73,7 @@ _MOST_LOG_ODDS = 6.0  # of a seen border
 
 @dataclass(frozen=True, eq=False)
 class SeenBorders:
-    """What a border network sees in a frame."""
+    """The output of a border network for a frame."""
 
     border: np.ndarray  #: (H, W) float32, calibrated log odds that the pixel is at the border of an object
     foreground: np.ndarray  #: (H, W) float32, log odds that the pixel belongs to an object
@@ -82,7 +82,7 @@ class SeenBorders:
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Measured leaves of a tree. All leaves of the table form one region."""
+    """The measured leaves of a tree. All leaves of the table form one region."""
 
     of_leaf: np.ndarray  #: (n_leaves,) int, region of every leaf; 0 is the table
     sums: np.ndarray  #: (R, C) columns `REGION`
@@ -94,7 +94,7 @@ class Regions:
 def measure_regions(
     leaves: np.ndarray, frame: Frame, boundary: np.ndarray, seen: SeenBorders | None = None
 ) -> Regions:
-    """Measure the leaves (H, W) of a tree of a boundary map (H, W), and what a network sees.
+    """Measure the leaves (H, W) of a tree of a boundary map (H, W), with the output of a network.
 
     A leaf belongs to the table if most of its pixels do.
     """
@@ -116,7 +116,7 @@ def measure_regions(
 
 
 def _region_of_leaf(leaves: np.ndarray, frame: Frame) -> np.ndarray:
-    """Region (n_leaves,) of every leaf; 0 is the table, the others are numbered in order of their leaves."""
+    """Region (n_leaves,) of every leaf; 0 is the table, and the others are numbered in order of their leaves."""
     flat, above, raised = leaves.ravel(), above_table(frame), pixels_above_table(frame)
     areas = np.bincount(flat)
     # A leaf that contains object and table pixels is an object. Rays above the horizon of the table (infinite
@@ -127,7 +127,7 @@ def _region_of_leaf(leaves: np.ndarray, frame: Frame) -> np.ndarray:
 
 
 def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, seen: SeenBorders | None) -> np.ndarray:
-    """Sums (n, C), columns `REGION`, over the raised pixels of each region (H, W); the perimeter is missing.
+    """Sums (n, C), with columns `REGION`, over the raised pixels of each region (H, W). The perimeter is missing.
 
     `bend` (H, W) is the concave minus the convex curvature.
     """
@@ -171,7 +171,7 @@ def _raised(flat: np.ndarray, above: np.ndarray, mask: np.ndarray, areas: np.nda
 
 
 def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:
-    """For every region its neighbours and the border rows (columns `BORDER`).
+    """For every region, its neighbours and the border rows (columns `BORDER`).
 
     `maps` (H, W, 4) are the boundary strength, the concave and the convex curvature, and the log odds of a border.
     """
@@ -216,7 +216,7 @@ def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray
 
 
 def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: int) -> np.ndarray:
-    """Values of an image (H, W) at pixels moved along an axis; pixels outside take the value at the edge."""
+    """Values of an image (H, W) at pixels moved along an axis. Pixels outside take the value at the edge."""
     index = list(at)
     index[axis] = np.clip(at[axis] + shift, 0, image.shape[axis] - 1)
     return image[tuple(index)]
