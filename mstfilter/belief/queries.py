@@ -9,17 +9,17 @@
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
 Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
-compares them, and renaming them changes no result. Probabilities of voxels also use how sure a hypothesis is of each
-(`Hypothesis.occupancy`); queries of segmentations and actions use the labels. Voxels are integer indices (x, y, z);
-`Belief.voxel` and `Belief.box` convert metres. Pixels are (column, row). A region is a bool array of the grid's
-shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
+compares them, and renaming them changes no result. Probabilities of voxels also use the probabilities of each
+hypothesis (`Hypothesis.occupancy`). Queries of segmentations and actions use only the labels. Voxels are integer
+indices (x, y, z); `Belief.voxel` and `Belief.box` convert metres. Pixels are (column, row). A region is a bool array
+of the grid's shape, or voxels (..., 3). Entropy and information are in nats; divide by log 2 for bits.
 
 **Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. Its
 expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
-weights summed over equal outcomes, at most `partition_entropy()`, which is at most log n. It measures only what the
-hypotheses disagree on; errors that all of them share do not appear. Outcomes that differ in one voxel are different.
-With `tolerance` (in voxels or pixels), outcomes that differ by much less than it count as equal (formula in
-`mstfilter.belief.information`).
+weights summed over equal outcomes. It is at most `partition_entropy()`, which is at most log n. It measures only
+differences between the hypotheses. Errors that all of them share have no effect. Outcomes that differ in one voxel
+are different. With `tolerance` (in voxels or pixels), outcomes that differ by much less than the tolerance count as
+equal (formula in `mstfilter.belief.information`).
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Belief:
     # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that hold world points (..., 3) in metres. Raises InputError if a point is outside."""
+        """Voxels (..., 3) that contain world points (..., 3) in metres. Raises InputError if a point is outside."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
@@ -158,7 +158,7 @@ class Belief:
         return inside
 
     def _region(self, region: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Cells with voxels in a region, and the number of these voxels; None is the whole grid."""
+        """Cells with voxels in a region, and their numbers of these voxels. None is the whole grid."""
         counts = self._refined.sizes
         if region is not None:
             inside = self._refined.cells.ravel()[_flat_region(self.grid, region)]
@@ -177,16 +177,16 @@ class Belief:
         return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
 
     def occupancy_entropy(self) -> np.ndarray:
-        """Entropy (X, Y, Z) of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, p the `occupancy`."""
+        """Entropy (X, Y, Z) of "occupied or free": ``-p log p - (1 - p) log(1 - p)``, where p is the `occupancy`."""
         return binary_entropy(self.occupancy())
 
     def same_object(self, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two voxels belong to the same object.
 
-        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, with k_i the most probable object of a voxel in
-        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities: a
-        voxel is in it whenever a less probable one is. `a` and `b` (..., 3) are broadcast against each other. For a
-        = b the result is the occupancy, and for all voxels b it is the extent of the object at a.
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where k_i is the most probable object of a voxel in
+        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities, so
+        it contains a voxel whenever it contains a less probable one. `a` and `b` (..., 3) are broadcast against each
+        other. For a = b the result is the occupancy. For all voxels b it is the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -212,7 +212,7 @@ class Belief:
     def object_count(self, region: Any = None) -> np.ndarray:
         """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``.
 
-        With a region, only objects with a voxel in it count.
+        With a region, only objects with a voxel in it are counted.
         """
         count = np.cumsum(self._refined.objects_in(self._region(region)[0]))
         return np.bincount(np.diff(count[self._refined.first]), self._mass)
@@ -220,10 +220,10 @@ class Belief:
     # Boundaries and entropy -----------------------------------------------------------------------------------
 
     def boundary_entropy(self) -> np.ndarray:
-        """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
+        """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
-        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
-        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
+        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))``. B: both voxels are occupied. S: they belong to
+        the same object. ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
         (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
@@ -234,7 +234,7 @@ class Belief:
         return largest
 
     def _entropy_of_faces(self, axis: int) -> np.ndarray:
-        """H(S | B) of the faces between voxels and the next ones along an axis, which comes first."""
+        """H(S | B) of the faces between voxels and the next ones along an axis. This axis comes first."""
         cells = np.moveaxis(self._refined.cells, axis, 0)
         lower, upper = cells[:-1], cells[1:]
         differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
@@ -247,9 +247,9 @@ class Belief:
     def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of a region (default: the whole grid).
 
-        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s of the region. This is also
-        the information of the true segmentation of the region. Without region and tolerance it is an upper bound of
-        the information of every outcome that the labels determine. The distance for the tolerance is
+        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s of the region. This
+        is also the information of the true segmentation of the region. Without region and tolerance it is an upper
+        bound of the information of every outcome that the labels determine. The distance for the tolerance is
         `information.partition_distance`.
         """
         cells, sizes = self._region(region)
@@ -259,7 +259,7 @@ class Belief:
     # Expected information of actions --------------------------------------------------------------------------
 
     def look_information(self, region: Any, tolerance: float = 0.0) -> float:
-        """Information of the occupancy of a region, occluded voxels included.
+        """Information of the occupancy of a region, including occluded voxels.
 
         Outcome: ``{v in region: L_i(v) > 0}``. For one voxel of certain hypotheses this is `occupancy_entropy`.
         """
@@ -267,9 +267,9 @@ class Belief:
         return outcome_information(self._mass, self._refined.objects[:, cells] > 0, hamming, sizes, tolerance)
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
-        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` is faster.
+        """Information of an image from a camera; `tolerance` in pixels. To save time, use ``camera.scaled(0.25)``.
 
-        The outcome is the depth image of the objects (rounded to a hundredth of a voxel, without the table).
+        The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
         """
         step = _DEPTH_STEP * self.grid.voxel_size
         check_component("camera", camera, Camera)
@@ -281,8 +281,8 @@ class Belief:
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects with a voxel in the region.
-        Further objects that these objects push are left out.
+        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``. These are all voxels of all objects with a voxel in
+        the region. Other objects that these objects would push are ignored.
         """
         moved = self._refined.objects_in(self._region(region)[0])[self._refined.objects]
         return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
@@ -304,9 +304,10 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information in nats, the first of equal ones.
+        """The action of largest expected information in nats; the first one if several are equal.
 
-        None if no action has `at_least` nats: the hypotheses agree on all outcomes, so none can be preferred.
+        None if no action has `at_least` nats. Then the hypotheses agree on all outcomes, and no action is better than
+        another.
         """
         values = [information(action) for action in actions]
         if np.isnan(values).any():
@@ -317,7 +318,8 @@ class Belief:
     def best_push(self, tolerance: float = 0.0, where: Any = None, at_least: float = 1e-9) -> np.ndarray | None:
         """Voxel (3,) at which a push has the largest information (`push_map`).
 
-        `where` is a region that the finger can reach; default: all voxels. None if no push has `at_least` nats.
+        `where` is a region that the finger can reach. By default it contains all voxels. None if no push has
+        `at_least` nats.
         """
         information = self.push_map(tolerance).ravel()
         reachable = np.arange(information.size) if where is None else _flat_region(self.grid, where)
@@ -329,15 +331,15 @@ class Belief:
     # Functions of the user ------------------------------------------------------------------------------------
 
     def expect(self, function: Callable[[Hypothesis], Any]) -> Any:
-        """Expectation ``sum_i w_i f(h_i)`` of numbers or arrays, such as the probability that a path is free."""
+        """Expectation ``sum_i w_i f(h_i)`` of numbers or arrays, for example the probability that a path is free."""
         pairs = zip(self.weights, self.hypotheses, strict=True)
         return sum(w * np.asarray(function(h), dtype=np.float64) for w, h in pairs if w > 0)
 
     def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
-        """Information of an action with an outcome that the hypothesis determines.
+        """Information of an action whose outcome is determined by the hypothesis.
 
-        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which differ
-        between hypotheses without a meaning.
+        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which are
+        arbitrary in each hypothesis.
         """
         outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
         try:
@@ -349,8 +351,8 @@ class Belief:
     def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
-        Default: the loss is 1 - quality (weighted coverage in the form ``objects``). The result is then the best
-        single answer among the hypotheses, if the true scene is distributed as they are.
+        By default, the loss is 1 - quality (weighted coverage in the form ``objects``). Then the result is the best
+        single answer among the hypotheses, if the true scene has their distribution.
         """
         hypotheses, mass = self._merged
         if loss is None:
@@ -359,7 +361,7 @@ class Belief:
         return hypotheses[int(np.argmin(expected))]
 
     def reweighted(self, log_likelihood: Callable[[Hypothesis], float]) -> Belief:
-        """The belief after an observation: adds ``log p(observation | h_i)`` to the log weights; -inf rules out."""
+        """The belief with ``log p(observation | h_i)`` added to the log weights; -inf excludes a hypothesis."""
         return Belief(self.population.reweighted(np.array([float(log_likelihood(h)) for h in self.hypotheses])))
 
     def sample(self, rng: np.random.Generator, n: int = 1) -> tuple[Hypothesis, ...]:
