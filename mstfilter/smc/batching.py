@@ -1,17 +1,20 @@
-"""Many runs of one filter together, as arrays (run, particle, ...); `mstfilter.smc.run_many` uses it where it can.
+"""Many runs of one filter together, as arrays (run, particle, ...).
 
-Run r equals ``filter.run(observations, seeds[r])`` bit for bit: it draws from the same streams.
+`mstfilter.smc.run_many` uses this module where possible.
+
+Run r equals ``filter.run(observations, seeds[r])`` bit for bit, because it draws from the same streams.
 
 The components are called once per step with the particles of all runs, as one population of R n particles. This is
-done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
-programs). A component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its
-arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
-Observations and inputs that differ between runs are repeated for each row.
+possible if the `batched` of each component is True (stated by its author) or None (tried; models of
+`StateSpaceModel.of`, programs). A component gets no axis of runs. It must treat each row independently, and take the
+shape of its draws from its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of
+each run from the stream of this run. Observations and inputs that differ between runs are repeated for each row.
 
-This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
-compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a call for
-them in another order. If they differ, a component that states ``batched=True`` raises InputError. Otherwise, and if
-they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
+The results are checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number of runs changes, some
+runs are compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a
+call for the same runs in another order. If the results differ, a component that states ``batched=True`` raises
+InputError. Otherwise, or if they differ only by rounding, `NotTogether` states the reason, and the runs must be made
+one by one.
 """
 
 from __future__ import annotations
@@ -52,7 +55,7 @@ _SLOTS = ("initial", "transition", "update")
 
 
 class NotTogether(Exception):
-    """The runs have to be made one by one."""
+    """The runs must be made one by one."""
 
     def __init__(self, slot: str, reason: str) -> None:
         super().__init__(slot, reason)
@@ -61,7 +64,7 @@ class NotTogether(Exception):
 
 @dataclass(frozen=True)
 class RunFilters:
-    """The filters of some runs, which may differ in the numbers that their components hold."""
+    """The filters of some runs, whose components may hold different numbers."""
 
     one: Callable[[int], ParticleFilter]  #: the filter of a run
     rows: Callable[[np.ndarray], ParticleFilter]  #: one filter of the rows of some runs, in their order
@@ -69,7 +72,7 @@ class RunFilters:
 
 @dataclass(frozen=True)
 class Collected:
-    """What was collected in one run."""
+    """The collected values of one run."""
 
     rows: dict[str, np.ndarray]  #: name -> (t, ...), up to the last step, or to the one at which the run is lost
     lost: str = ""  #: why the run is lost, "" if it is not
@@ -96,11 +99,11 @@ def run_together(
     check: bool = True,
     rounding: bool = False,
 ) -> list[Collected]:
-    """The runs of some seeds; `ys` has one sequence of observations for all runs, or one for each.
+    """The runs of some seeds. `ys` has one sequence of observations for all runs, or one sequence for each.
 
-    Without `check`, runs are not compared with single runs; with `rounding`, differences by rounding are accepted.
+    Without `check`, runs are not compared with single runs. With `rounding`, differences by rounding are accepted.
 
-    Raises `NotTogether` if the runs have to be made one by one, and InputError if a component that states
+    Raises `NotTogether` if the runs must be made one by one, and InputError if a component that states
     ``batched=True`` mixes runs.
     """
     keep_freed_memory()
@@ -118,7 +121,7 @@ class _RunInfo(Info):
 
 
 class _Sweep:
-    """The steps of R runs; rows are runs that are not lost, with particles (R, n, ...) and log weights (R, n)."""
+    """The steps of R runs. Rows are runs that are not lost, with particles (R, n, ...) and log weights (R, n)."""
 
     def __init__(
         self,
@@ -210,7 +213,7 @@ class _Sweep:
 
     # --- calls of components --------------------------------------------------------------------------------------
     def call(self, t: int, slot: str) -> None:
-        """Call a component for all runs; those that it loses are removed."""
+        """Call a component for all runs, and remove the runs that it loses."""
         rows = np.arange(len(self.runs))
         try:
             particles, log_weights = self.of_rows(t, slot, rows)
@@ -255,7 +258,7 @@ class _Sweep:
         return by_run(found.particles, n), log_weights if same else found.log_weights.reshape(-1, n)
 
     def alone(self, t: int, slot: str, row: int) -> Population:
-        """What a component returns for one run; LostRunError, or `NotTogether` if it raises another error."""
+        """The result of a component for one run. Raises LostRunError, or `NotTogether` for another error."""
         y, u = self.of_run(t, row)
         component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = self.key(t, slot, row).generator() if component.draws else None
@@ -282,7 +285,7 @@ class _Sweep:
 
     # --- checks ---------------------------------------------------------------------------------------------------
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with single runs: the first and the last, or one in turn; at first all with another order."""
+        """Compare runs in turn with single runs; at the first call, compare all runs in another order."""
         last, count = self.checked.get(slot, (0, 0))
         if t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == len(rows):
             return
@@ -299,7 +302,7 @@ class _Sweep:
             self.compare_order(t, slot, rows, particles, log_weights)
 
     def compare_order(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with a call for them in another order."""
+        """Compare runs with a call for the same runs in another order."""
         order = np.roll(np.arange(0, len(rows), math.ceil(len(rows) / _MOST_COMPARED)), 1)
         try:
             others = self.of_rows(t, slot, rows[order])
@@ -310,7 +313,7 @@ class _Sweep:
             self.agree(t, slot, row, ours, (of_runs(others[0], k), others[1][k]), "with the runs in another order")
 
     def same_scheme(self, other: ParticleFilter) -> None:
-        """Make single runs if the filter of a run has another number of particles, resampler or trigger."""
+        """Raise `NotTogether` if the filter of a run has another number of particles, resampler or trigger."""
         for name in ("n", "resample", "resampler", "trigger"):
             if other is not self.filter and getattr(other, name) != getattr(self.filter, name):
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
@@ -327,14 +330,14 @@ class _Sweep:
             self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} {how}")
 
     def refuse_error(self, t: int, slot: str, error: Exception) -> NoReturn:
-        """Make single runs if one of them raises an error too; else refuse the component."""
+        """Raise `NotTogether` if a single run raises an error too, and else refuse the component."""
         for row in range(len(self.runs)):
             with suppress(LostRunError):
                 self.alone(t, slot, row)
         self.refuse(t, slot, f"a call for all runs raises {type(error).__name__}: {error}; single runs do not")
 
     def refuse(self, t: int, slot: str, reason: str) -> NoReturn:
-        """Raise InputError if the component states that it is batched; else make single runs."""
+        """Raise InputError if the component states that it is batched, and else `NotTogether`."""
         if getattr(self.filter, slot).batched is True:
             raise InputError(
                 f"step {t}, {slot}: {reason}",
@@ -346,7 +349,7 @@ class _Sweep:
 
     # --- resampling -----------------------------------------------------------------------------------------------
     def select(self, t: int) -> None:
-        """Resample the runs whose trigger asks for it."""
+        """Resample the runs for which the trigger requires it."""
         self.resampled = np.array(np.broadcast_to(self.wanted(t), len(self.runs)))
         rows = np.flatnonzero(self.resampled)
         if not len(rows):
@@ -361,7 +364,7 @@ class _Sweep:
         self.particles = resampled_runs(self.particles, rows, index)
 
     def wanted(self, t: int) -> Any:
-        """(R,) bool, or one: the runs to resample."""
+        """(R,) bool, or a single bool: the runs to resample."""
         trigger = self.filter.trigger
         if trigger.batched:
             runs: Any = SimpleNamespace(
@@ -372,7 +375,7 @@ class _Sweep:
         return [trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t) for row in rows]
 
     def selected(self, t: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Ancestors (len(rows), n) and log weights of some runs, as `WeightResampler.select` returns them."""
+        """Ancestors (len(rows), n) and log weights of some runs, in the form of `WeightResampler.select`."""
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
         if resampler.batched:
@@ -395,7 +398,7 @@ class _Sweep:
         return generators_of_step([self.keys[run] for run in self.runs[rows].tolist()], slot, t)
 
     def record(self, t: int) -> None:
-        """Keep what the collectors return for each run."""
+        """Store the results of the collectors for each run."""
         log_mean = self.log_mean if self.filter.properly_weighted else np.full(len(self.runs), np.nan)
         quick: dict[Collector, np.ndarray] = {log_evidence: log_mean, ess: self.ess, resampled: self.resampled}
         steps = [self.seen(t, row) for row in range(len(self.runs))] if self.traced else []
@@ -427,7 +430,7 @@ class _Sweep:
         return State(t + 1, population, self.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
-        """(T, R, ...) results of a collector; those of lost runs are undefined."""
+        """(T, R, ...) results of a collector. The results of lost runs are undefined."""
         steps = self.found[name]
         check_one_shape(name, [values.shape[1:] for _, values in steps])
         shape = steps[0][1].shape[1:] if steps else ()
@@ -448,7 +451,8 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 
 def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
-    """The first difference of two arrays or mappings of arrays, and whether it is rounding; None if there is none."""
+    """The first difference of two arrays or mappings of arrays, and whether it is rounding; None if they are
+    equal."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

@@ -1,14 +1,14 @@
-"""Storing the state of a run, so that a new process continues it to the identical result.
+"""Storage of the state of a run, so that a new process continues the run with identical results.
 
 >>> state, infos = filter.run(observations, seed=0, checkpoint="run.npz")     # run it again after an interruption
 
 The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
-renamed, so that a process that is killed leaves the state of a complete step. All draws depend on the seed and the
-step only, so a continued run equals an uninterrupted one. A run with another seed, filter, model or observation is
-refused; so is one with another version of Python if the filter contains functions.
+renamed. So a process that is killed leaves the state of a complete step. All draws depend on the seed and the step
+only, so a continued run equals an uninterrupted one. A run with another seed, filter, model or observation is
+refused. If the filter contains functions, another version of Python is refused too.
 
 `ArrayCodec` stores particles that are arrays, mappings of arrays, or traces of arrays, numbers, strings and None.
-Particles of another kind need a `Codec`; stored data never import code.
+Other particles need a `Codec`. Reading a file never imports code.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _FORMAT = 1
 def save_state(
     path: Path, state: State, codec: Codec | None = None, *, compress: bool = False, **description: Any
 ) -> None:
-    """Write a state after at least one step to an .npz file, atomically. The folder exists.
+    """Write a state after at least one step to an .npz file, atomically. The folder must exist.
 
-    `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and slower to
-    write. Further values, of types that JSON represents, are stored by name. Raises InputError if the particles
-    cannot be stored or the file cannot be written.
+    `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and writing is
+    slower. Other values, of types that JSON represents, are stored by name. Raises InputError if the particles cannot
+    be stored or the file cannot be written.
     """
     population = state.population
     if population is None:
@@ -68,7 +68,8 @@ def save_state(
 def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> tuple[State, dict[str, Any]]:
     """The state in a file, and the description stored with it.
 
-    Raises InputError if the file is missing or damaged, is no checkpoint, or its arrays need more than `limit` bytes.
+    Raises InputError if the file is missing or damaged, is not a checkpoint, or its arrays need more than `limit`
+    bytes.
     """
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")
@@ -122,9 +123,9 @@ class Checkpoint:
         save_state(self.path, state, self.codec, **description)
 
     def resume(self, observations: Iterator[Any]) -> State:
-        """The stored state, after removing the observations that it contains; `start` if there is no file.
+        """The stored state, after removal of the observations that it contains; `start` if there is no file.
 
-        Raises InputError if the file is of another run: another seed, first step, filter or observation.
+        Raises InputError if the file belongs to another run, with another seed, first step, filter or observation.
         """
         if not self.path.exists():
             if not self.path.parent.is_dir():
@@ -160,7 +161,7 @@ def digest(value: Any) -> str:
     """A hash of data, functions and components that is the same in every process with the same Python version.
 
     Functions are described by their code, the values that they enclose, and the numbers, arrays and functions of
-    their module that they use; objects by their fields. Names of files and addresses do not count.
+    their module that they use. Objects are described by their fields. File names and addresses have no effect.
     """
     found = blake2b(digest_size=8)
     _describe_to(found.update, value, frozenset())
@@ -168,7 +169,7 @@ def digest(value: Any) -> str:
 
 
 def _describe_to(add: Callable[[bytes], None], value: Any, outer: frozenset[int]) -> None:
-    """Add the description of a value to a hash; `outer` are the ids of the objects that contain it."""
+    """Add the description of a value to a hash. `outer` has the ids of the objects that contain it."""
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         add(f"array {value.dtype.str} {value.shape}".encode())
         add(np.ascontiguousarray(value).tobytes())
@@ -184,7 +185,7 @@ def _describe_to(add: Callable[[bytes], None], value: Any, outer: frozenset[int]
 
 
 def _parts(value: Any) -> Iterable[Any]:
-    """What describes a value besides its type."""
+    """The parts that describe a value in addition to its type."""
     if isinstance(value, Mapping):
         return (part for pair in value.items() for part in pair)
     if isinstance(value, (Sequence, np.ndarray)):
@@ -225,7 +226,7 @@ def _name(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON stores it; functions, arrays and other objects by name and hash."""
+    """A value as JSON stores it. Functions, arrays and other objects are stored by name and hash."""
     if isinstance(value, np.generic):
         return _plain(value.item())
     if value is None or isinstance(value, (bool, int, float, str)):

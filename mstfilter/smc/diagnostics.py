@@ -1,11 +1,12 @@
-"""How good the estimates of a run are: Monte Carlo variances from the run itself, and scores against the truth.
+"""The quality of the estimates of a run: Monte Carlo variances from the run itself, and scores against the truth.
 
 >>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
 >>> coalescence(keep(bootstrap(model, n=1000), observations)).ancestors     # (T,) of the last particles
 
-Both follow ancestors, so they need a filter whose particles all have known parents. What a selection changes is
-measured by a resampler that notes the energy distance between the particles before and after it:
+The variances and the coalescence follow ancestors, so they need a filter whose particles all have known parents. To
+measure the change by a selection, wrap the resampler. The wrapper records the energy distance between the particles
+before and after the selection:
 
 >>> filter = bootstrap(model, n=1000, resampler=Measured(Systematic()))
 >>> run_many(filter, observations, seeds=range(20), distance=selection_distance)
@@ -40,12 +41,13 @@ def energy_distance(
 ) -> float:
     """Energy distance between two weighted populations (Szekely and Rizzo 2013), in the units of the distance.
 
-    2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second; the square of
-    `scipy.stats.energy_distance` for numbers. It is 0 if both represent the same distribution, else positive.
+    2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second population. For numbers
+    it is the square of `scipy.stats.energy_distance`. It is 0 if both populations represent the same distribution,
+    and else positive.
 
-    ``distance(particles)`` is (n, n), such as ``lambda p: 1 - Gaussian().matrix(p)``, and must be of negative type
-    (`mstfilter.forecasts.is_negative_type`); otherwise the result can be 0 for different distributions.
-    Default: Euclidean, for arrays and mappings of arrays.
+    ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. It must be of negative
+    type (`mstfilter.forecasts.is_negative_type`). Otherwise the result can be 0 for different distributions. Default:
+    The default is Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -77,8 +79,8 @@ class Measured(ResamplerWrapper):
     """Measures the energy distance between the weighted particles before a selection and the particles after it.
 
     The selection itself does not change. ``notes["energy_distance"]`` is the distance, which `selection_distance`
-    collects. Its mean over seeds is the squared error that the selection adds: for numbers, twice the integral over z
-    of the variance of the share of particles below z. `distance` is as for `energy_distance`.
+    collects. Its mean over seeds is the squared error that the selection adds. For numbers, this is twice the
+    integral over z of the variance of the share of particles below z. `distance` is defined as for `energy_distance`.
     """
 
     distance: Callable[[Any], np.ndarray] | None = None
@@ -95,7 +97,7 @@ class Measured(ResamplerWrapper):
 
 
 def selection_distance(state: State, info: Info) -> float:
-    """The distance that `Measured` notes; 0 if the step did not resample, NaN if the resampler is not `Measured`."""
+    """The distance that `Measured` records; 0 if the step did not resample, NaN for other resamplers."""
     if not info.resampled:
         return 0.0
     return float(info.notes.get("resampler", {}).get("energy_distance", np.nan))
@@ -113,7 +115,8 @@ class Coalescence:
 
     @property
     def time(self) -> int | None:
-        """Steps from the last time back to the latest common ancestor of all particles; None if there is none."""
+        """Number of steps from the last time back to the latest common ancestor of all particles; None if none
+        exists."""
         common = np.flatnonzero(self.ancestors == 1)
         return len(self.ancestors) - 1 - int(common[-1]) if len(common) else None
 
@@ -121,7 +124,7 @@ class Coalescence:
     def pair_time(self) -> float:
         """Mean number of steps back to the latest common ancestor of two particles drawn by weight.
 
-        Pairs without one count as T steps, so the mean is a lower bound unless ``shared[0]`` is 1.
+        A pair without a common ancestor counts as T steps. So the mean is a lower bound unless ``shared[0]`` is 1.
         """
         return float((1.0 - self.shared).sum())
 
@@ -129,8 +132,8 @@ class Coalescence:
 def coalescence(record: Record) -> Coalescence:
     """How fast the paths of the last particles coalesce (Jacob, Murray, Rubenthaler 2015).
 
-    For equal weights and independent selections at every step, the genealogy is that of Wright and Fisher: two
-    particles share their ancestor s steps before with probability 1 - (1 - 1/n)^s.
+    For equal weights and independent selections at every step, the genealogy is that of Wright and Fisher. Two
+    particles then share their ancestor s steps before with probability 1 - (1 - 1/n)^s.
     """
     last = record.populations[-1]
     index, weights = np.flatnonzero(last.weights > 0), last.weights[last.weights > 0]
@@ -168,39 +171,40 @@ def run_variance(
     Let A_e be the weight of the particles at time t whose ancestor at time 0 is e; all weights sum to 1. The relative
     variance of the evidence, and so the variance of its log, is estimated by
 
-        V = 1 - f (1 - sum_e A_e^2),    f = N / (N - 1) * product of f_s over the selections s,
+        V = 1 - f (1 - sum_e A_e^2), where f = N / (N - 1) * product of f_s over the selections s.
 
-    and the variance of a weighted mean by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the particles
-    of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
-    unbiased. Other schemes make fewer duplicates, so f_s is measured here:
+    The variance of a weighted mean is estimated by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the
+    particles of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
+    unbiased. Other schemes make fewer duplicates, so f_s is computed from the weights:
 
         f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
 
     W_e and V_e are the weights of the descendants of e before and after the selection. This is the ratio of the
-    probabilities that two draws have different ancestors; it is N / (N - 1) on average for independent selections of
-    particles with different ancestors. For other schemes than `Multinomial` it is an approximation: it takes pairs of
-    particles with different ancestors as equally likely to be selected together, in proportion to their weights.
+    probabilities that two draws have different ancestors. For independent selections of particles with different
+    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` it is an approximation. It assumes
+    that pairs of particles with different ancestors are selected together in proportion to their weights.
 
-    With a lag L (Olsson and Douc 2019), ancestors L steps earlier take the place of those at time 0 for the mean. For
-    the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts are
-    added. This reduces the noise of the estimates and keeps them valid when all particles share one ancestor. The
+    With a lag L (Olsson and Douc 2019), ancestors L steps earlier replace those at time 0 in the estimate for the
+    mean. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts
+    are added. This reduces the noise of the estimates and keeps them valid when all particles share one ancestor. The
     bias is small if the model forgets its state in L steps.
 
     All estimates are of first order in 1 / n, and too low for small n. With 300 particles they are within 15 % of the
-    variance over seeds. Where 30 particles give the log evidence a variance of 2, those of means are 90 % too low
-    (`experiments/run_variance/sizes.csv`). Take more particles if the variance of the log evidence is above .3.
+    variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of means are
+    90 % too low (`experiments/run_variance/sizes.csv`). Take more particles if the variance of the log evidence is
+    above .3.
 
     Parameters
     ----------
     filter : ParticleFilter
-        Properly weighted, with n of at least 2.
+        A properly weighted filter with n of at least 2.
     observations : iterable
     seed : int
     lag : int, optional
-        Steps, at least 1. Default: all. Time and memory grow with n times the lag.
+        Number of steps, at least 1. By default, all steps. Time and memory grow with n times the lag.
     function : callable, optional
-        ``(particles) -> (n, ...)``, whose weighted mean is estimated. Default: the particles, if they are an array;
-        else means are of shape (T, 0).
+        ``(particles) -> (n, ...)``, whose weighted mean is estimated. By default, the particles if they are an array.
+        Otherwise means have the shape (T, 0).
 
     Returns
     -------
@@ -285,11 +289,11 @@ class _Ancestry:
         self.weights = np.zeros(0)
 
     def begin(self, n: int) -> None:
-        """Take the present particles as n independent draws."""
+        """Start with the present particles as n independent draws."""
         self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
 
     def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:
-        """Go to the next population."""
+        """Continue with the next population."""
         if self.lag is not None and len(self.window) > self.lag:
             self.past += self._relative(0) - self._relative(1)
             self.window.popleft()
@@ -303,7 +307,7 @@ class _Ancestry:
         self.weights = weights
 
     def _relative(self, place: int) -> float:
-        """Relative variance of the evidence that arises from the time of `place` to now."""
+        """Relative variance of the evidence that arises from the time of `place` to the present."""
         index, f = self.window[place]
         return 1.0 - f * _differ(index, self.weights)
 
@@ -311,7 +315,7 @@ class _Ancestry:
         return self.past + self._relative(0)
 
     def mean(self, centred: np.ndarray) -> np.ndarray:
-        """(...) variance of the weighted mean of (n, ...) values minus that mean."""
+        """(...) variance of the weighted mean of values (n, ...) from which that mean is subtracted."""
         index, f = self.window[0]
         columns = (self.weights[:, None] * centred.reshape(len(centred), -1)).T
         squares = [float(np.square(np.bincount(index, column)).sum()) for column in columns]
@@ -319,7 +323,7 @@ class _Ancestry:
 
 
 def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
-    """Probability that two draws by weight are of different groups."""
+    """Probability that two draws by weight belong to different groups."""
     masses = np.bincount(groups, weights)
     return 1.0 - float(masses @ masses)
 
@@ -327,8 +331,8 @@ def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
 def log_score(population: Population, log_density: Callable[[Any], np.ndarray]) -> float:
     """Log score ``-log sum_i w_i p(y | x_i)`` of a population in nats.
 
-    ``log_density(particles)`` gives (n,) ``log p(y | x_i)``: of an observation, of the true state under a kernel
-    around each particle, or 0 and -inf for equal and different discrete states.
+    ``log_density(particles)`` returns (n,) ``log p(y | x_i)``. y is an observation, or the true state under a kernel
+    around each particle. For discrete states it is 0 if equal and -inf if different.
     """
     values = np.asarray(log_density(population.particles), dtype=np.float64)
     if values.shape != (len(population),):
@@ -341,9 +345,10 @@ def set_energy_score(
 ) -> float:
     """Energy score of a population against the true particle (Gneiting and Raftery 2007); lower is better.
 
-    ``sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``: half the `energy_distance` to a population of the truth
-    alone. `truth` is one particle: an array (...), a mapping of arrays, or an object. ``distance(particles)`` is as
-    for `energy_distance`; `mstfilter.forecasts.is_negative_type` checks whether it makes the score proper.
+    ``sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``, which is half the `energy_distance` to a population that
+    consists of the truth. `truth` is one particle: an array (...), a mapping of arrays, or an object.
+    ``distance(particles)`` is defined as for `energy_distance`. `mstfilter.forecasts.is_negative_type` checks whether
+    it makes the score proper.
     """
     particles = population.particles
     if isinstance(particles, Mapping):
@@ -356,8 +361,8 @@ def set_energy_score(
 def pit(population: Population, truth: Any, rng: np.random.Generator) -> np.ndarray:
     """Probability integral transform (d,) of the true vector under a population of vectors, coordinate by coordinate.
 
-    ``F(y-) + U (F(y) - F(y-))`` with F the weighted distribution function and U uniform. It is uniform on [0, 1] if
-    the truth is distributed as the population is (Czado, Gneiting, Held 2009); over many data sets,
+    ``F(y-) + U (F(y) - F(y-))``, where F is the weighted distribution function and U is uniform. It is uniform on [0,
+    1] if the truth has the distribution of the population (Czado, Gneiting, Held 2009). Over many data sets,
     ``scipy.stats.kstest(values, "uniform")`` tests the calibration of a filter.
     """
     x, y = as_matrix(population.particles), np.asarray(truth, dtype=np.float64).reshape(-1)

@@ -1,22 +1,22 @@
-"""Models with Gaussian noise, and filters that use it: EKF- and UKF-guided, Rao-Blackwellised.
+"""Models with Gaussian noise, and filters for them: EKF- and UKF-guided, Rao-Blackwellised.
 
 >>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
 
-A model with Gaussian noise and nonlinear functions has good proposals: the updates of the extended and the unscented
-Kalman filter.
+For a model with Gaussian noise and nonlinear functions, the updates of the extended and the unscented Kalman filter
+are good proposals.
 
 >>> filter = rao_blackwellised(model, n=100)
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.particles["mean"].shape           # (n, d)
 
-In a Rao-Blackwellised filter part of the state, u_t (a regime, a contact, an association), is drawn. Given u_0 .. u_t
-the rest is linear and Gaussian:
+A Rao-Blackwellised filter draws a part of the state, u_t (a regime, a contact, an association). Given u_0 .. u_t, the
+other part z is linear and Gaussian:
 
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
-A particle holds u with the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
-arrays, moved by a Transition (draw u, predict z) and an Update (weight by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}),
-correct z). Reference: Doucet, de Freitas, Murphy, Russell (2000).
+A particle holds u, and the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
+arrays. A Transition draws u and predicts z, and an Update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) and corrects
+z. Reference: Doucet, de Freitas, Murphy, Russell (2000).
 
 `mstfilter.smc.exact` has linear models and their exact answers.
 """
@@ -46,12 +46,12 @@ def nonlinear_gaussian(
 ) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
 
-    `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
-    row. They may have the further parameters ``t`` and ``u``; `Q` and `R` may have a first axis of T entries.
+    `f` and `h` return the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
+    row. They may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of T entries.
 
-    `Q` and `P0` may be singular, as that of noise that acts on the velocity only. Then x_t has no density given
-    x_{t-1}: the model has no `log_transition` (for `P0`: no `log_initial`), and what needs it raises InputError. A
-    conditional path is then drawn without ancestor sampling.
+    `Q` and `P0` may be singular, for example if noise acts only on the velocity. Then x_t has no density given
+    x_{t-1}. The model has no `log_transition` (for `P0`: no `log_initial`), and functions that need it raise
+    InputError. A conditional path is then drawn without ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
@@ -79,7 +79,7 @@ def nonlinear_gaussian(
 
 
 class _Noise:
-    """Normal noise of mean 0 and one covariance (k, k)."""
+    """Normal noise with mean 0 and covariance (k, k)."""
 
     def __init__(self, name: str, cov: np.ndarray, k: int | None, semidefinite: bool) -> None:
         root, self.singular = _covariance(name, cov, k, semidefinite)
@@ -99,7 +99,7 @@ class _Noise:
 
 
 class _Noises:
-    """Noise with one covariance (k, k) for all steps, or with one for each step, (T, k, k)."""
+    """Noise with one covariance (k, k) for all steps, or one for each step, (T, k, k)."""
 
     def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
         cov = np.asarray(given, np.float64)
@@ -111,7 +111,7 @@ class _Noises:
 
 
 class _OfStep:
-    """A function of particles and, if it has such parameters, of the step `t` and its input `u`."""
+    """A function of particles, and of the step `t` and its input `u` if it has such parameters."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.parameters = function, step_parameters(function, 1)
@@ -143,7 +143,7 @@ def vectors(what: str, given: Any, size: int) -> np.ndarray:
 
 
 def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool = False) -> tuple[np.ndarray, bool]:
-    """A square root of a covariance: the Cholesky factor, or one by eigenvalues if it is singular; whether it is."""
+    """A square root of a covariance (Cholesky, or from eigenvalues if singular), and whether it is singular."""
     cov = np.asarray(given, dtype=np.float64)
     if cov.ndim != 2 or cov.shape != (d or len(cov), d or len(cov)):
         expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
@@ -160,7 +160,7 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
 
 
 class Linear(NamedTuple):
-    """Matrices of the linear part for each particle, or without the particle axis if shared by all."""
+    """Matrices of the linear part for each particle, or without the particle axis if all particles share them."""
 
     F: Any  #: (n, d, d)
     Q: Any
@@ -174,8 +174,9 @@ class ConditionallyLinear(AtStep):
     """A model that is linear and Gaussian given the part u, which is drawn.
 
     ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
-    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
-    have a further parameter ``t``, the index of the step, or ``u`` after a first one of another name, its input.
+    ``linear(u)`` returns the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
+    also have a parameter ``t``, the index of the step. If their first parameter has another name, a parameter ``u``
+    gets the input.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -247,7 +248,7 @@ class _Correct(Update):
 def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> ParticleFilter:
     """The Rao-Blackwellised filter of a model with `n` particles.
 
-    `components` are further fields of `ParticleFilter`, such as ``resampler``.
+    `components` are other fields of `ParticleFilter`, such as ``resampler``.
     """
     return ParticleFilter(
         initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **components
@@ -263,9 +264,9 @@ def _definite(name: str, given: Any) -> np.ndarray:
 def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the extended Kalman filter from each particle.
 
-    Given x_{t-1} the state is N(f(x_{t-1}), Q); `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000, section
-    II D). The arguments are as in `nonlinear_gaussian`; `jacobian` gives the derivatives of `h`, (n, k, d) or (k, d).
-    It is computed for all particles at once; filterpy's ExtendedKalmanFilter holds a single state.
+    Given x_{t-1} the state is N(f(x_{t-1}), Q), and `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000,
+    section II D). The arguments are as in `nonlinear_gaussian`. `jacobian` returns the derivatives of `h`, (n, k, d)
+    or (k, d). It is computed for all particles together. The ExtendedKalmanFilter of filterpy holds a single state.
     """
     Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
 
@@ -283,9 +284,9 @@ def ukf_proposal(
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
 
-    Needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are those of
-    filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread. The other
-    arguments are as in `nonlinear_gaussian`.
+    It needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are those of
+    filterpy's MerweScaledSigmaPoints: the spread of the points, the weight of the central point, and the secondary
+    spread. The other arguments are as in `nonlinear_gaussian`.
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 

@@ -1,4 +1,4 @@
-"""Parameters of a model, inferred by particle Markov chain Monte Carlo or by a sequential sampler.
+"""Estimation of the parameters of a model by particle Markov chain Monte Carlo or by a sequential sampler.
 
 A model with parameters is a function that returns a filter:
 
@@ -8,16 +8,16 @@ A model with parameters is a function that returns a filter:
 >>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
 >>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
 
-- `pmmh` is a Metropolis chain whose likelihood is the filter's unbiased estimate. The estimate of the current
-  parameters is kept until a proposal is accepted; so the chain has the exact posterior, for any number of particles
+- `pmmh` is a Metropolis chain whose likelihood is the filter's unbiased estimate. The estimate for the current
+  parameters is kept until a proposal is accepted. So the chain has the exact posterior, for any number of particles
   (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` does the same with the walkers of emcee, without a scale to choose.
-- `particle_gibbs` alternates draws of parameters given the path of states, and of the path given the parameters.
+- `ensemble` does the same with the walkers of emcee, which need no scale.
+- `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which
-  the early states hardly change.
-- `smc_sampler` moves particles from the prior to the posterior of a likelihood that can be computed, by tempering
-  (Del Moral, Doucet, Jasra 2006). It estimates the evidence, and finds several modes. ``waste_free=True`` uses all
+  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Otherwise the
+  early states hardly change.
+- `smc_sampler` moves particles from the prior to the posterior by tempering (Del Moral, Doucet, Jasra 2006). The
+  likelihood must be computable. It estimates the evidence, and can find several modes. ``waste_free=True`` uses all
   states of the moves.
 """
 
@@ -81,13 +81,13 @@ class Chains(Table):
         names : sequence of str
             One name per parameter. Default: one variable ``theta`` (chain, draw, d).
         discard : int
-            Iterations left out at the beginning.
+            Number of iterations to discard at the beginning.
 
         Returns
         -------
-        xarray.DataTree
-            Groups ``posterior`` and ``sample_stats`` (``log_evidence``, and ``lp`` for the log density; none of
-            `particle_gibbs`, where they are unknown). Draws are equally weighted. Paths are left out.
+        xarray.DataTree Groups ``posterior`` and ``sample_stats``. The latter has ``log_evidence``, and ``lp`` for the
+        log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted. Paths are not
+        included.
         """
         theta = self.theta[discard:].swapaxes(0, 1)
         if names and len(names) != theta.shape[2]:
@@ -99,14 +99,14 @@ class Chains(Table):
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
 
-        emcee logs a warning if the chains are shorter than 50 times the result, which is then too low.
+        emcee logs a warning if the chains are shorter than 50 times the result, since the result is then too low.
         """
         from emcee.autocorr import integrated_time
 
         return integrated_time(self.theta[discard:], quiet=True)
 
     def effective_sizes(self, discard: int = 0) -> np.ndarray:
-        """(d,) numbers of independent draws that estimate a mean equally well; parameters as above."""
+        """(d,) numbers of independent draws that estimate a mean equally well. The parameters are as above."""
         n_iterations, n_chains, _ = self.theta[discard:].shape
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 
@@ -128,7 +128,7 @@ class _Posterior:
     def __call__(
         self, rng: np.random.Generator, theta: np.ndarray, chains: np.ndarray | None = None
     ) -> dict[str, np.ndarray]:
-        """``theta`` (R, d) of some chains, all by default, with ``log_density`` and ``log_evidence`` (R,)."""
+        """``theta`` (R, d) of some chains (by default all), with ``log_density`` and ``log_evidence`` (R,)."""
         seeds = rng.integers(2**63, size=len(theta))
         log_prior = np.array([float(self.log_prior(row)) for row in theta])
         if np.isnan(log_prior).any():
@@ -141,7 +141,7 @@ class _Posterior:
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
     def _estimates(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
-        """Log evidences of filters in one sweep, or one by one if this is impossible."""
+        """Log evidences of filters in one batch, or one by one if a batch is impossible."""
         if self.batched:
             try:
                 return self._in_one_sweep(thetas, data, seeds)
@@ -167,7 +167,7 @@ class _Posterior:
     def _in_one_sweep(self, thetas: np.ndarray, data: list[list[Any]], seeds: list[int]) -> np.ndarray:
         """The estimates of a batch whose components hold the parameters of each row.
 
-        Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
+        Batches 0, 1, 2, 4, 8, ... are compared with single runs.
         """
         first = self._filter(thetas[0])
         for slot in ("initial", "transition", "update"):
@@ -202,7 +202,7 @@ def pmmh(
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
-    The number of particles decides how well the chain mixes: the log evidence should have a standard deviation of
+    The number of particles determines how well the chain mixes. The log evidence should have a standard deviation of
     about 1 at the posterior mean (Doucet, Pitt, Deligiannidis, Kohn 2015).
 
     Parameters
@@ -216,10 +216,11 @@ def pmmh(
     scale : (d,) or (d, d) array_like
         Standard deviations, or covariance, of a step. 2.4 / sqrt(d) posterior standard deviations are a good choice.
     batched : bool
-        Whether ``filter_of`` also takes parameters (d, m), a column for each of m particles of several chains. All
-        chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
+        Whether ``filter_of`` also accepts parameters (d, m), with a column for each of m particles of several chains.
+        All chains then move in one batch of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
-        parameters; some are compared. If they differ, InputError, or a warning and single runs.
+        parameters. Some of them are compared. If they differ, InputError is raised, or the runs are made one by one
+        with a warning.
     paired : bool
         If True, `observations` are sequences of observations, one for each chain.
 
@@ -250,7 +251,7 @@ def pmmh(
 
 
 def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
-    """The first parameters with their estimates; those that are lost are drawn again."""
+    """The first parameters with their estimates. Lost estimates are drawn again."""
     state = posterior(key.generator(), theta)
     for attempt in range(1, _N_STARTS + 1):
         lost = np.flatnonzero(~np.isfinite(state["log_density"]))
@@ -297,17 +298,17 @@ def ensemble(
 ) -> Chains:
     """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
 
-    emcee keeps the log density of a walker until the walker moves, and the estimated evidence beside it (as a blob).
-    No estimate is drawn again for parameters that stay, so the chain has the exact posterior.
+    emcee keeps the log density of a walker until the walker moves, together with the estimated evidence (as a blob).
+    For parameters that do not change, no estimate is drawn again. So the chain has the exact posterior.
 
     Parameters
     ----------
     filter_of, observations, log_prior, batched
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
-        First parameters: different ones, at least 2 d.
+        First parameters. They must be different, and at least 2 d.
     moves : optional
-        Of emcee; default its stretch move.
+        Moves of emcee; the default is its stretch move.
     """
     import emcee
 
@@ -344,8 +345,8 @@ def particle_gibbs(
     filter_of : callable
         ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
     draw : callable
-        ``(rng, theta, path) -> theta`` (d,), by a kernel that leaves p(theta | path, y) invariant: an exact draw
-        where the prior is conjugate, or a Metropolis step with `path_log_prob`.
+        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. It is an exact draw
+        if the prior is conjugate, or a Metropolis step with `path_log_prob`.
     start : (d,) array_like
         First parameters.
     """
@@ -396,25 +397,25 @@ def smc_sampler(
 ) -> TemperedSample:
     """Sequential Monte Carlo from the prior to the posterior, by powers of the likelihood.
 
-    At each temperature the particles are weighted, resampled, and moved by Metropolis steps that leave
-    prior * likelihood^temperature invariant. With fixed `temperatures` and `scale` the estimate of the evidence is
-    unbiased; chosen from the particles, they add a bias of order 1 / n (Beskos, Jasra, Kantas, Thiery 2016).
+    At each temperature the particles are weighted, resampled, and moved by Metropolis steps that leave prior *
+    likelihood^temperature invariant. With fixed `temperatures` and `scale`, the estimate of the evidence is unbiased.
+    If they are chosen from the particles, they add a bias of order 1 / n (Beskos, Jasra, Kantas, Thiery 2016).
 
     Parameters
     ----------
     prior : Distribution
-        Of floating-point parameters.
+        Prior of floating-point parameters.
     log_likelihood : callable
         ``(theta) -> (n,)`` of parameters (n,) or (n, d).
     share : float
-        The next temperature is the one at which the effective sample size falls to this share of `n`.
+        At the next temperature, the effective sample size falls to this share of `n`.
     steps : int
-        Metropolis steps per temperature.
+        Number of Metropolis steps per temperature.
     waste_free : bool
-        Keep all states of the moves (waste-free SMC; Dau and Chopin 2022). Of n particles, n / (`steps` + 1) are
-        resampled; these and their states after each step are the next `n` particles. A temperature takes about `n`
-        evaluations of the likelihood instead of `steps` times `n`, so `n` and `steps` can be larger: for example
-        n = 5000 and steps = 99. `n` must be a multiple of `steps` + 1.
+        If True, keep all states of the moves (waste-free SMC; Dau and Chopin 2022). n / (`steps` + 1) of n particles
+        are resampled. The next `n` particles are these and their states after each step. A temperature then takes
+        about `n` evaluations of the likelihood instead of `steps` times `n`. So `n` and `steps` can be larger, for
+        example n = 5000 and steps = 99. `n` must be a multiple of `steps` + 1.
     temperatures : sequence of float, optional
         Increasing numbers above 0 that end with 1.
     scale : float, (d,) or (d, d) array_like, optional
@@ -457,7 +458,7 @@ class _Target:
     log_likelihood: Callable[[np.ndarray], np.ndarray]
 
     def scored(self, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """`theta` with its log prior and log likelihood, which is not evaluated where the prior is zero."""
+        """`theta` with its log prior and log likelihood. The likelihood is not evaluated where the prior is zero."""
         log_prior, log_l = np.asarray(self.prior.log_prob(theta), np.float64), np.full(len(theta), -np.inf)
         inside = log_prior > -np.inf
         if inside.any():
@@ -476,7 +477,7 @@ class _Target:
     def moved(
         self, rng: np.random.Generator, start: dict[str, np.ndarray], temperature: float, root: np.ndarray, steps: int
     ) -> tuple[list[dict[str, np.ndarray]], float]:
-        """States after 0 to `steps` Metropolis steps, and the share of accepted moves."""
+        """The states after 0 to `steps` Metropolis steps, and the share of accepted moves."""
 
         def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
             step = rng.standard_normal((len(now["theta"]), len(root))) @ root.T
@@ -489,7 +490,7 @@ class _Target:
 
 
 def _next_temperature(population: Population, log_l: np.ndarray, now: float, target: float) -> float:
-    """The temperature at which the effective sample size is `target`; 1 if it stays above."""
+    """The temperature at which the effective sample size is `target`; 1 if the size stays above."""
     from scipy.optimize import brentq
 
     def excess(temperature: float) -> float:

@@ -10,10 +10,10 @@
 >>> runs["log_evidence"].shape                         # (arm, seed, time)
 (2, 20, 50)
 
-Every run equals ``filter.run(observations, seed)`` bit for bit, whatever the number of workers and the other arms.
-The runs of an arm are processed together, as arrays of the particles of all runs, if its components treat each
-particle by itself (see `mstfilter.smc.batching`); otherwise one by one. Run k of every arm has the same seed and so
-the same random streams, which makes differences between arms less noisy than those of independent runs.
+Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. The
+runs of an arm are processed together, as arrays of the particles of all runs, if its components treat each particle
+independently (see `mstfilter.smc.batching`). Otherwise they are made one by one. Run k of every arm has the same seed
+and so the same random streams. So differences between arms have less noise than those of independent runs.
 """
 
 from __future__ import annotations
@@ -60,33 +60,33 @@ def run_many(
     Parameters
     ----------
     filters : ParticleFilter or mapping
-        A filter, or name of an arm -> filter. All arms get the same observations and seeds.
+        A filter, or a mapping from names of arms to filters. All arms get the same observations and seeds.
     observations : iterable
-        T observations, the same for all runs; None if missing, `WithInput` with an input.
+        T observations, the same for all runs. None is a missing observation; use `WithInput` for an input.
     seeds : iterable of int
         Different non-negative integers.
     paired : bool
-        If True, `observations` are sequences of T observations, one for each seed. Components that are called with
-        all runs get the observations of a step by row.
+        If True, `observations` is a list of sequences of T observations, one for each seed. Components that are
+        called with all runs get the observations of a step by row.
     workers : int
-        Number of processes; 1 uses the calling process. More are started by joblib's loky, as new interpreters that
-        get the filters by cloudpickle, and limit the numerical libraries to one thread. InputError if a worker dies,
-        with the runs that may have ended it.
+        Number of processes. With 1, the calling process is used. Other numbers start processes by joblib's loky.
+        These are new interpreters that get the filters by cloudpickle and limit the numerical libraries to one
+        thread. InputError if a worker dies, with the runs that may have caused it.
     folder : path, optional
-        Every finished run is stored there, as ``arm/seed.npz``; characters of an arm other than lower-case letters,
-        digits, ``_`` and ``-`` are replaced by a hash. The same call runs only those that are missing. InputError if
-        a stored run was made by another filter, other observations or other collectors, or if its file is damaged.
+        Every finished run is stored in this folder, as ``arm/seed.npz``. Characters of an arm other than lower-case
+        letters, digits, ``_`` and ``-`` are replaced by a hash. The same call makes only the missing runs. InputError
+        if a stored run was made with another filter, other observations or other collectors, or if its file is
+        damaged.
     progress : bool or callable
-        True shows a progress bar; a function is called as ``progress(done, total)`` when runs finish.
-    **collectors
-        As for `collect`; default `log_evidence`.
+        True shows a progress bar. A function is called as ``progress(done, total)`` when runs finish. **collectors As
+        for `collect`; default `log_evidence`.
 
     Returns
     -------
-    History
-        Arrays (arm, seed, time, ...), or (seed, time, ...) of a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). From that step on, its log evidence is -inf and other results are NaN.
-        `History.lost` has the reasons, and `History.single` says why the runs of an arm were made one by one.
+    History Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle
+    explains
+        an observation (`LostRunError`). From that step on, its log evidence is -inf and the other results are NaN.
+        `History.lost` has the reasons. `History.single` states why the runs of an arm were made one by one.
 
     Warns
     -----
@@ -125,7 +125,7 @@ _ALONE = "filter"  # the arm of a single filter
 
 
 def _sequences(observations: Iterable[Any], paired: bool) -> list[list[Any]]:
-    """The sequences of observations: one for all runs, or one for each."""
+    """The sequences of observations: one for all runs, or one for each run."""
     given = enumerate(observations if paired else [observations])
     return [list(check_observations(ys, f"run {run}, " if paired else "")) for run, ys in given]
 
@@ -149,7 +149,7 @@ _Chunk = tuple[str, list[int]]  # an arm and some seeds
 
 @dataclass(frozen=True)
 class _Part:
-    """Some finished runs, and why those of an arm were made one by one."""
+    """Some finished runs, and the reason if they were made one by one."""
 
     runs: dict[_Task, Collected]
     single: dict[str, str]
@@ -157,7 +157,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Job:
-    """What `run_many` runs."""
+    """The task of `run_many`."""
 
     arms: dict[str, ParticleFilter]
     ys: list[list[Any]]
@@ -167,14 +167,14 @@ class _Job:
     hashes: dict[_Task, str] = field(default_factory=dict)  #: of what a stored run depends on
 
     def where(self, arm: str, seed: int | None = None) -> str:
-        """What an error is about; a single filter has no name."""
+        """Place for error messages; a single filter has no name."""
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
     def observations(self, seed: int) -> list[Any]:
         return self.ys[self.seeds.index(seed) % len(self.ys)]
 
     def chunks(self, found: Mapping[_Task, Collected], workers: int) -> list[_Chunk]:
-        """Missing runs that a worker makes in one go: many seeds if they can be processed together."""
+        """Missing runs for one call of a worker. They contain many seeds if these can be processed together."""
         chunks = []
         for arm in self.arms:
             missing = [seed for seed in self.seeds if (arm, seed) not in found]
@@ -196,7 +196,7 @@ class _Job:
         return _Part(found, {arm: why} if why else {})
 
     def made(self, arm: str, seeds: list[int]) -> tuple[list[Collected], str]:
-        """Some runs of an arm, and why they were made one by one; "" if they were made together, or there is one."""
+        """Some runs of an arm, and the reason if several runs were made one by one, or else ""."""
         filter, why = self.arms[arm], ""
         ys = self.ys if len(self.ys) == 1 else [self.observations(seed) for seed in seeds]
         try:
@@ -267,7 +267,7 @@ class _Job:
             np.savez(file, **arrays)
 
     def load(self, arm: str, seed: int) -> Collected | None:
-        """A stored run; None if there is none. InputError if the file is damaged, or of another run."""
+        """A stored run; None if it does not exist. InputError if the file is damaged or belongs to another run."""
         if self.folder is None or not self.path(arm, seed).exists():
             return None
         path = self.path(arm, seed)
@@ -308,7 +308,7 @@ _DAMAGED = "remove the file and call run_many again: it runs what is missing, wi
 
 
 def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
-    """The steps of a run; if it is lost, the reason is appended."""
+    """The steps of a run. If the run is lost, the reason is appended."""
     try:
         yield from steps
     except LostRunError as error:
@@ -319,7 +319,7 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
 def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
     """Results of chunks of runs in the order in which they finish.
 
-    Workers are new processes: a fork of a process with threads can deadlock.
+    Workers are new processes, since a fork of a process with threads can deadlock.
     """
     if workers == 1:
         yield from (job.run(*chunk) for chunk in chunks)
@@ -351,7 +351,7 @@ def _check_caller() -> None:
     """Raise InputError if a module that is being imported calls `run_many` with workers.
 
     Workers import the modules of the functions that they get. So they would call `run_many` again, or wait for the
-    import to end.
+    end of the import.
     """
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:

@@ -6,10 +6,10 @@
 
 Three smoothers of a record return a tuple with one population per time:
 
-- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record; after many
-  resamplings all paths share their beginning.
+- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record. After many
+  resamplings all paths have the same beginning.
 - `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It has more distinct
-  particles, and a bias if the state depends on observations more than `lag` steps later.
+  particles. It has a bias if the state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
   path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"`` or ``"rejection"``.
 
@@ -55,12 +55,12 @@ class Record:
         return len(self.populations)
 
     def parents(self, t: int) -> np.ndarray:
-        """(n,) indices into population t - 1 of the particles at time t."""
+        """(n,) indices in population t - 1 of the parents of the particles at time t."""
         return known_parents(self.populations[t], t)
 
 
 def known_parents(population: Population, t: int) -> np.ndarray:
-    """(n,) indices into the population before; InputError if a particle has no known parent."""
+    """(n,) indices of the parents in the previous population; InputError if a particle has no known parent."""
     index = population.parents.get("previous")
     if index is None or (index < 0).any():
         raise InputError(
@@ -71,7 +71,7 @@ def known_parents(population: Population, t: int) -> np.ndarray:
 
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
-    """Run a filter and keep every population; memory grows with n times the number of steps."""
+    """Run a filter and store every population. Memory grows with n times the number of steps."""
     ys = tuple(check_observations(observations))
     if not ys:
         raise InputError("there are no observations to smooth over")
@@ -83,12 +83,12 @@ def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State 
 
 
 def genealogy(record: Record) -> tuple[Population, ...]:
-    """Paths of the last particles: row k of all populations is one path, weighted by the last particle."""
+    """Paths of the last particles. Row k of all populations is one path, weighted by the last particle."""
     return _traced(record, len(record) - 1, 0)
 
 
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
-    """At each time t the ancestors of the particles at t + `lag` (or the end), with their weights.
+    """At each time t, the ancestors of the particles at t + `lag` (or the end), with the weights of these particles.
 
     A lag of 0 steps returns the filter's populations.
     """
@@ -119,15 +119,15 @@ def backward_paths(
     steps: int = 1,
     log_bound: float | None = None,
 ) -> tuple[Population, ...]:
-    """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
+    """Draw `n` equally weighted paths from the smoothing distribution. Row k of all populations is a path.
 
     The predecessor of a state x_{t+1} is particle i at time t with probability proportional to w_i f(x_{t+1} | x_i).
 
     Parameters
     ----------
     transition : DensityTransition
-        That of the model, ``Dynamics(model)``. One with a proposal cannot be used: its density is that of the
-        proposal.
+        The transition of the model, ``Dynamics(model)``. A transition with a proposal cannot be used, since its
+        density is that of the proposal.
     method : "exact", "mcmc" or "rejection"
         "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
 
@@ -138,11 +138,12 @@ def backward_paths(
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
         steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
-        The steps need not converge. Given x_{t+1}, a parent has the law of "exact" already after independent
-        selections of a bootstrap filter, and up to order 1 / N after others. So there is no further bias (Dau and
-        Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
+        The chain need not converge. Given x_{t+1}, a parent already has the distribution of "exact" after independent
+        selections of a bootstrap filter, and up to order 1 / N after other selections. So a small number of steps
+        causes no additional bias (Dau and Chopin 2023). Steps reduce the variance. Without accepted steps, the paths
+        are those of `genealogy`.
     steps : int
-        Metropolis steps of "mcmc".
+        Number of Metropolis steps of "mcmc".
     log_bound : float
         For "rejection": an upper bound of ``transition.log_prob``. InputError if a density exceeds it.
     """
@@ -194,7 +195,7 @@ class _Move:
         return index
 
     def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int, n_draws: int) -> np.ndarray:
-        """(n, n_draws) states of chains that start at the parents, every `steps` steps."""
+        """(n, n_draws) states of chains that start at the parents, taken every `steps` steps."""
         density = self.log_density(parents)
         if not (density > -np.inf).all():
             raise _impossible(self.t)
@@ -230,7 +231,7 @@ class _Move:
 
 @dataclass(frozen=True)
 class _Backward(Bounded):
-    """Draws predecessors of later particles; the fields are arguments of `backward_paths`."""
+    """Draws predecessors of later particles. The fields are arguments of `backward_paths`."""
 
     transition: DensityTransition
     method: BackwardMethod
@@ -247,7 +248,7 @@ class _Backward(Bounded):
         return _Move(population, later, self.transition.at_step(t + 1, u), y, t)
 
     def draw(self, rng: np.random.Generator, move: _Move, parents: np.ndarray | None, n_draws: int) -> np.ndarray:
-        """(n, n_draws) indices; `parents` (n,) of the later particles are for "mcmc"."""
+        """(n, n_draws) indices. `parents` (n,) of the later particles are for "mcmc"."""
         if parents is not None:
             return move.metropolis(rng, parents, self.steps, n_draws)
         n = count_particles(move.later)
@@ -271,21 +272,20 @@ def paris(
     """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
 
     After each observation it yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the last
-    population is kept, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A step
-    takes n^2 densities, with "mcmc" (1 + `steps` `n_draws`) n.
+    population is stored, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A
+    step takes n^2 densities, or (1 + `steps` `n_draws`) n with "mcmc".
 
     Parameters
     ----------
     filter : ParticleFilter
-        With proper weights.
+        A filter with proper weights.
     functional : callable
-        ``(t, previous, particles) -> (n,) or (n, k)`` is h_t of paired rows; `previous` is None at t = 0.
+        ``(t, previous, particles) -> (n,) or (n, k)`` is h_t of paired rows. `previous` is None at t = 0.
     transition : DensityTransition
         The transition of the model, ``Dynamics(model)``.
     n_draws : int
-        At least 2: with one the variance grows as that of the genealogy.
-    method, steps, log_bound
-        As in `backward_paths`.
+        At least 2, since with one the variance grows as that of the genealogy. method, steps, log_bound As in
+        `backward_paths`.
 
     Yields
     ------
@@ -317,7 +317,8 @@ def paris(
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight, in random order: those of `independent_draws` are nearly sorted."""
+    """(n,) indices drawn independently by weight, in random order (`independent_draws` returns nearly sorted
+    ones)."""
     index = independent_draws(rng, population.weights, n)
     rng.shuffle(index)
     return index

@@ -1,6 +1,6 @@
-"""Resampling around another scheme, and by transport.
+"""Resampling schemes that wrap another scheme, and resampling by transport.
 
-`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme: they change the order of the particles,
+`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme. They change the order of the particles,
 merge equal ones, or change the weights.
 
 >>> import numpy as np
@@ -64,13 +64,14 @@ class Sorted(ResamplerWrapper):
     Parameters
     ----------
     order : {"position", "mean_partition"}
-        "position": by value; particles that are vectors, along a Hilbert curve. In one dimension, the distribution
-        function of the particles that `Systematic` or `Stratified` select differs from the weighted one by at most
-        1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of resampling
-        methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte Carlo".
-        With "mean_partition", particles of at most the mean weight come first, then the others, each in its order.
-        `Systematic` then keeps as many of the light particles as on average, rounded up or down. Chopin, Singh, Soto,
-        Vihola (2022), "On resampling schemes for particle filters with weakly informative observations".
+        "position": by value, or along a Hilbert curve for particles that are vectors. In one dimension, the
+        distribution function of the particles that `Systematic` or `Stratified` select differs from the weighted one
+        by at most 1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of
+        resampling methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte
+        Carlo". With "mean_partition", particles of at most the mean weight are first, then the others. The order
+        inside each group does not change. `Systematic` then keeps the expected number of light particles, rounded up
+        or down. Chopin, Singh, Soto, Vihola (2022), "On resampling schemes for particle filters with weakly
+        informative observations".
     """
 
     scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
@@ -87,7 +88,7 @@ class Sorted(ResamplerWrapper):
 
 
 def _line(x: np.ndarray) -> np.ndarray:
-    """(n,) numbers that order (n, d) rows: the value if d = 1, else the position along a Hilbert curve."""
+    """(n,) numbers that order (n, d) rows: the value if d = 1, and else the position along a Hilbert curve."""
     d = x.shape[1]
     if d == 1:
         return x[:, 0]
@@ -143,11 +144,11 @@ class Shuffled(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class Coalesced(ResamplerWrapper):
-    """Merges particles that `equivalence` takes as equal, with the sum of their weights, before the selection.
+    """Merges particles that are equal by `equivalence`, with the sum of their weights, before the selection.
 
-    The heaviest particle of a class is kept, the first of several. The result represents the same distribution with
-    fewer particles. The population grows again only if a transition or update makes more candidates.
-    ``notes["distinct"]`` is the number of different particles of positive weight.
+    The heaviest particle of a class is kept; if several have equal weights, the first. The result represents the same
+    distribution with fewer particles. The population grows again only if a transition or update makes more
+    candidates. ``notes["distinct"]`` is the number of different particles of positive weight.
     """
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
@@ -165,9 +166,9 @@ class Coalesced(ResamplerWrapper):
 def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Select one particle for each class: the heaviest, with the weight of the class.
 
-    Returns the representatives (k,), ascending, the first if several have equal weights, and their log weights (k,).
-    A log weight is the log of the summed weights times k / m, which keeps the log mean. Classes of weight zero are
-    left out.
+    Returns the representatives (k,) in ascending order and their log weights (k,). If several particles have equal
+    weights, the first is the representative. A log weight is the log of the summed weights times k / m, which keeps
+    the log mean. Classes of weight zero are omitted.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)
@@ -182,9 +183,9 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Tempered(ResamplerWrapper):
-    """Selects by w^power and multiplies the selected weights by w^(1 - power): light particles survive longer.
+    """Selects by w^power and multiplies selected weights by w^(1 - power), so that light particles survive longer.
 
-    `power` is in [0, 1]. With 1 this is the wrapped scheme; with 0 all particles of positive weight are equally
+    `power` is in [0, 1]. With 1 this is the wrapped scheme. With 0 all particles of positive weight are equally
     likely.
     """
 
@@ -205,7 +206,8 @@ class Tempered(ResamplerWrapper):
 class KeepWeights(ResamplerWrapper):
     """Selected particles keep their weights, as in the program of the MST authors.
 
-    Selecting by weight and keeping the weight counts the same evidence twice, so this is not properly weighted.
+    Selecting by weight and keeping the weight counts the same evidence twice, so this scheme is not properly
+    weighted.
     """
 
     scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)
@@ -219,13 +221,13 @@ class KeepWeights(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class EnsembleTransform(TransformResampler):
-    """Moves the particles to equal weights by optimal transport: new particles are mixtures of old ones.
+    """Moves the particles to equal weights by optimal transport. New particles are mixtures of old ones.
 
-    T_ij minimises the sum of ``T_ij |x_i - y_j|^2`` with row sums W_i and column sums 1 / n; the new particles are
-    n sum_i T_ij x_i. The targets y_j are the old particles; for n different from m, equally spaced ones in their
-    order. In one dimension T is the monotone transport, found by sorting in O(m log m); otherwise a linear program of
-    m n variables, so use a few hundred particles. Draws nothing. Mixtures have less variance than the weighted
-    particles. Particles are arrays of floats, or mappings of such arrays.
+    T_ij minimises the sum of ``T_ij |x_i - y_j|^2`` with row sums W_i and column sums 1 / n. The new particles are n
+    sum_i T_ij x_i. The targets y_j are the old particles. If n differs from m, they are equally spaced ones in their
+    order. In one dimension T is the monotone transport, found by sorting in O(m log m). Otherwise it is a linear
+    program of m n variables, so use a few hundred particles. It draws no random numbers. Mixtures have less variance
+    than the weighted particles. Particles are arrays of floats, or mappings of such arrays.
 
     Reference: Reich (2013), "A nonparametric ensemble transform method for Bayesian inference", SIAM Journal on
     Scientific Computing 35.
@@ -258,7 +260,7 @@ class EnsembleTransform(TransformResampler):
 
 
 def _monotone_transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns and masses of the transport of weighted numbers to n of equal weight that keeps their order."""
+    """Rows, columns and masses of the order-keeping transport of weighted numbers to n numbers of equal weight."""
     order = np.argsort(x, kind="stable")
     ends = np.cumsum(weights[order])
     ends /= ends[-1]
@@ -272,7 +274,7 @@ def _monotone_transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.
 
 
 def _transport(x: np.ndarray, weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns and masses of the optimal transport of weighted (m, d) rows to n of equal weight."""
+    """Rows, columns and masses of the optimal transport of weighted rows (m, d) to n rows of equal weight."""
     from scipy import optimize, sparse
 
     rows = np.flatnonzero(weights)

@@ -43,8 +43,8 @@ class Program:
     """A model given as a function, and its filters with `n` particles.
 
     ``model(previous, observation)`` calls `sample` and `observe`, and returns None or a mapping of further values to
-    keep. A model or guide with a further parameter ``t`` gets the index of the step, one with ``u`` the input that
-    `WithInput` gives. The methods take further fields of `ParticleFilter` by name, such as ``resampler``.
+    keep. If the model or guide also has a parameter ``t``, it gets the index of the step. A parameter ``u`` gets the
+    input of `WithInput`. The methods accept other fields of `ParticleFilter` by name, such as ``resampler``.
     """
 
     model: Model
@@ -56,14 +56,14 @@ class Program:
             )
 
     def bootstrap(self, n: int, **components: Any) -> ParticleFilter:
-        """Bootstrap filter: draws from the model, weights by the observations."""
+        """Bootstrap filter, which draws from the model and weights by the observations."""
         return self._filter(None, n, components)
 
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
-        """Guided filter.
+        """Guided filter, which draws from the guide.
 
         The guide is a program that draws every site of the model, by name, given the observation. If the observation
-        is missing, the model draws.
+        is missing, particles are drawn from the model.
         """
         return self._filter(guide, n, components)
 
@@ -83,7 +83,7 @@ class Program:
 
 
 class _OfProgram(AtStep):
-    """A component with a model, and perhaps a guide, that may depend on the step."""
+    """A component with a model, and optionally a guide, that may depend on the step."""
 
     @property
     def step_functions(self) -> Mapping[str, int | None]:  # type: ignore[override]
@@ -93,7 +93,7 @@ class _OfProgram(AtStep):
 
 @dataclass(frozen=True)
 class _ProgramStep(_OfProgram, Component):
-    """A step of a program: draws, by the guide if there is one, and weights."""
+    """A step of a program. Draws values, from the guide if there is one, and weights them."""
 
     model: Model
     guide: Model | None = None
@@ -104,7 +104,7 @@ class _ProgramStep(_OfProgram, Component):
 
     @cached_property
     def schedule(self) -> Schedule:
-        """Which steps are checked."""
+        """The steps that are checked."""
         return Schedule.of(self.model, self.guide)
 
     def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
@@ -134,7 +134,7 @@ class _ProgramStep(_OfProgram, Component):
 
 @dataclass(frozen=True)
 class ProgramInitial(_ProgramStep, Proposal):
-    """First step of a program: draws, by the guide if there is one, and weights."""
+    """First step of a program. Draws values, from the guide if there is one, and weights them."""
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         return self._advance(rng, None, observation, n)
@@ -142,7 +142,7 @@ class ProgramInitial(_ProgramStep, Proposal):
 
 @dataclass(frozen=True)
 class ProgramTransition(_ProgramStep, Transition):
-    """A step of a program: draws, by the guide if there is one, and weights."""
+    """A step of a program. Draws values, from the guide if there is one, and weights them."""
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         return self._advance(rng, population, observation, len(population))
@@ -151,7 +151,7 @@ class ProgramTransition(_ProgramStep, Transition):
 def _step(
     rng: np.random.Generator, model: Model, guide: Model | None, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Particles, drawn by the guide if there is one, and gains of the log weights."""
+    """Particles, drawn from the guide if there is one, and the changes of the log weights."""
     if guide is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
     if isinstance(guide, PerParticle) != isinstance(model, PerParticle):
@@ -163,9 +163,9 @@ def _step(
 
 @dataclass(frozen=True)
 class ProgramLookahead(_OfProgram, Lookahead):
-    """Priority from a run with the mean (mode of a discrete site) instead of each draw.
+    """Priority from a run with the mean (or the mode of a discrete site) instead of each draw.
 
-    It is raised to `power`; below 1 if the lookahead at the mean is too confident.
+    The priority is raised to `power`. Use a value below 1 if the priority is too concentrated.
     """
 
     model: Model
@@ -186,16 +186,17 @@ class ProgramLookahead(_OfProgram, Lookahead):
 class ProgramMove(_OfProgram, Rejuvenation):
     """Metropolis-Hastings on all sites of a step at once.
 
-    Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution; discrete sites
-    are drawn from theirs. Both distributions depend on earlier sites, so the reverse density takes a second run at
-    the proposed values. The branches of `switch` stay. ``notes["accepted"]`` is the rate of accepted steps.
+    Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution. Discrete sites
+    are drawn from their distribution. Both distributions depend on earlier sites, so the reverse density takes a
+    second run at the proposed values. The branches of `switch` do not change. ``notes["accepted"]`` is the rate of
+    accepted steps.
 
     Parameters
     ----------
     scale : float
         Standard deviation of a step relative to that of the site.
     steps : int
-        Steps per move.
+        Number of steps per move.
     """
 
     model: Model
@@ -222,7 +223,7 @@ class ProgramMove(_OfProgram, Rejuvenation):
     def _moved(
         self, rng: np.random.Generator, function: Model, x: Any, previous: Any, observation: Any, n: int, single: bool
     ) -> tuple[Mapping[str, Any], float]:
-        """Values after the steps, and the rate of accepted steps; `single` for one particle without particle axis."""
+        """Values after the steps, and the acceptance rate; `single` is for one particle without particle axis."""
 
         def score(values: Mapping[str, Any], no_axis: bool = False) -> _Scored:
             handler = ScoreHandler(values, no_axis)
@@ -289,14 +290,14 @@ class ProgramMove(_OfProgram, Rejuvenation):
 def run_program(
     model: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Run a program, or its guide, over n particles; the handler decides the values of the sites.
+    """Run a program, or its guide, over n particles. The handler determines the values of the sites.
 
     Returns
     -------
     particles : mapping of arrays (n, ...), or tuple of n `Trace`
         Values of the sites, and the values that the program returned.
     gain : (n,) float64
-        Added to the log weights.
+        Change of the log weights.
     """
     if not isinstance(model, PerParticle):
         run = _run_once(model, handler, previous, observation, n, False)
@@ -316,7 +317,7 @@ def _run_once(
     n: int,
     single: bool = False,
 ) -> ProgramRun:
-    """One pass of a function, `single` without the particle axis."""
+    """One pass of a function. With `single`, it is without the particle axis."""
     run = ProgramRun(handler, n, single)
     run.function = function
     if isinstance(previous, dict):
@@ -375,7 +376,7 @@ _RAW_ERRORS = {
 
 
 def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
-    """The error of a program with its place and a hint; the same error if it is not one of Python, numpy or scipy."""
+    """The error of a program with its place and a hint. Only errors of Python, numpy or scipy are changed."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
     place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
     if frames:
@@ -430,13 +431,13 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
 
 
 def _equal(a: Any, b: Any) -> bool:
-    """Whether two arrays are equal, NaN to NaN."""
+    """Whether two arrays are equal, where NaN equals NaN."""
     a, b = np.asarray(a), np.asarray(b)
     return a is b or (a.shape == b.shape and bool(np.all((a == b) | ((a != a) & (b != b)))))
 
 
 def _values_of(run: ProgramRun) -> dict[str, Any]:
-    """The particle (or all particles) after a run: values of the sites, and returned values."""
+    """The particle (or all particles) after a run: the values of the sites, and the returned values."""
     values = {name: a[0] for name, a in run.values.items()} if run.single else run.values
     particles = {**values, **run.returned}
     if not particles:

@@ -1,18 +1,18 @@
-"""Checks that a program treats its particles independently, and that it draws by `sample` only.
+"""Checks that a program treats its particles independently and draws only by `sample`.
 
-A program processes all particles in one pass, so it may mix them by mistake (``x.mean()``, ``previous["x"][0]``),
-draw from another generator, or keep values between steps. Such a program runs, and its weights are wrong. `Guard`
-checks some steps, of each kind the first and the second, then the 9th, 66th, 515th, ... (8^k + k, which also finds a
-fault of every third step):
+A program processes all particles in one pass. By mistake it may mix them (``x.mean()``, ``previous["x"][0]``), draw
+from another generator, or keep values between steps. Such a program runs without an error, but its weights are wrong.
+`Guard` checks some steps of each kind: the first and the second, then the 9th, 66th, 515th, ... (8^k + k, which also
+detects a fault of every third step):
 
 1. The first two steps run again with the same random numbers. All values and log weights must equal those of the
    first run.
-2. A few particles run alone with the values that they had: their distributions and returned values must be those of
-   the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-3. Particles of a `per_particle` program run alone, too. In the first two steps, each sees the lists, dictionaries,
-   sets and arrays in the closure and the global variables of the function as before the step.
-4. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
-   the evidence must agree.
+2. A few particles run alone with the same values. Their distributions and returned values must be those of the step.
+   They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
+3. Particles of a `per_particle` program also run alone. In the first two steps, each particle gets copies of the
+   lists, dictionaries, sets and arrays in the closure and the globals of the function, as before the step.
+4. If there is a guide, a step is also drawn from the model. The guide must be able to draw these values, and the two
+   estimates of the evidence must agree.
 
 The results of a filter do not depend on these checks.
 """
@@ -67,7 +67,7 @@ class Guard:
         self.fresh = {id(f): _with_copies(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
-        """Particles and gain of the log weights, as ``step()`` returns them; InputError if a check fails."""
+        """Particles and change of the log weights, as returned by ``step()``. Raises InputError if a check fails."""
         with recorded() as runs:
             particles, gain = step()
         if self.count <= 2:
@@ -89,7 +89,7 @@ class Guard:
         return particles, gain
 
     def _content(self) -> bytes | None:
-        """The objects in the particles of a `per_particle` program, as bytes, which are compared and never read."""
+        """The objects in the particles of a `per_particle` program, as bytes for comparison."""
         if not isinstance(self.model, PerParticle):
             return None
         try:
@@ -117,7 +117,7 @@ class Guard:
 
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
-        """Compare some particles in a run with the same particles in a run of their own."""
+        """Compare some particles in a run with the same particles in a separate run."""
         if any(call.ambiguous for call in whole.calls or ()):
             rows = rows[:1]
         few, rows = self._run_alone(run, whole, rows)
@@ -134,7 +134,7 @@ class Guard:
             _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
 
     def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> tuple[ProgramRun, np.ndarray]:
-        """A run of some particles, and their rows: repeated to n rows if the program needs n particles."""
+        """A run of some particles, and their rows, repeated to n rows if the program needs n particles."""
         with recorded() as runs:
             try:
                 few = self._run_again(run, whole, rows)
@@ -215,7 +215,7 @@ class Guard:
 
 
 class Schedule(Counter[Any]):
-    """Numbers of the steps of a model and its guide, by kind; those with the same functions share it."""
+    """Numbers of the steps of a model and its guide, by kind. Programs with the same functions share them."""
 
     @classmethod
     def of(cls, model: Any, guide: Any) -> Schedule:
@@ -228,7 +228,7 @@ class Schedule(Counter[Any]):
     def guard(
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
     ) -> Guard | None:
-        """A guard if the next step is to be checked."""
+        """A guard if the next step must be checked."""
         shape = observation.shape if type(observation) is np.ndarray else None
         kind = (past is None, observation is None, guide is None, shape)
         self[kind] += 1
@@ -239,7 +239,7 @@ _SCHEDULES: dict[tuple[Any, ...], tuple[Schedule, list[Any]]] = {}
 
 
 def _parts(function: Any) -> list[Any]:
-    """The code of a function, and the values of its closure and defaults but the numbers.
+    """The code of a function, and the values of its closure and defaults except numbers.
 
     The models of many parameter values, as in PMMH, have the same parts.
     """
@@ -282,7 +282,7 @@ def _function_with_copies(function: FunctionType) -> FunctionType:
 
 
 def _copied(value: Any) -> Any:
-    """A copy of an array of at most 16 MiB or a container, and of those in it; other objects are shared."""
+    """A copy of an array of at most 16 MiB or a container, including those in it. Other objects are shared."""
     if type(value) is np.ndarray and value.nbytes <= 1 << 24:
         return value.copy()
     if type(value) is dict:
@@ -291,7 +291,7 @@ def _copied(value: Any) -> Any:
 
 
 def _check_returned(run: ProgramRun) -> None:
-    """Raise if a returned value is NaN, after an invalid operation; NaN that the program writes is a mark."""
+    """Raise if a returned value is NaN after an invalid operation. A NaN that the program writes is allowed."""
     for name, value in run.returned.items():
         if np.asarray(value).dtype.kind == "f" and np.isnan(value).any():
             n = int(np.isnan(value).reshape(run.n, -1).any(axis=1).sum())
@@ -302,7 +302,7 @@ def _check_returned(run: ProgramRun) -> None:
 
 
 def _groups(run: ProgramRun) -> list[np.ndarray]:
-    """Two groups of particles to run alone, of small and of large values, each with some of every branch."""
+    """Two groups of particles to run alone, of small and of large values, with particles of every branch."""
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
     column = np.arange(run.n) if numbers is None else numbers.reshape(run.n, -1)[:, 0]
     order, size = np.argsort(column), max(run.n // 3, 1)
@@ -310,7 +310,7 @@ def _groups(run: ProgramRun) -> list[np.ndarray]:
 
 
 def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
-    """Some rows of a part of the particles; at least two, since one row might be broadcast."""
+    """Some rows of a part of the particles. There are at least two, since one row might be broadcast."""
     rows = list(part[[len(part) // 2, 0, len(part) // 4]])
     for call in run.calls or ():
         if call.rows is not None and len(rows) < 8:
@@ -333,7 +333,7 @@ def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> Any:
-    """Size of the differences between particles, the unit of rounding errors."""
+    """Size of the differences between particles, used as the unit of rounding errors."""
     if values.dtype.kind != "f":
         return 0.0
     finite = values[np.isfinite(values)]
@@ -351,7 +351,7 @@ def _first_difference(particles: Any, again: Any) -> str | None:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether two values are equal up to rounding; objects without a comparison are."""
+    """Whether two values are equal up to rounding. Objects without a comparison count as equal."""
     if isinstance(a, np.ndarray | np.generic | float):
         return np.shape(a) == np.shape(b) and bool(_close(a, b, 1e-9).all())
     if isinstance(a, Mapping) and isinstance(b, Mapping):
@@ -372,8 +372,8 @@ def _first_call_that_differs(one: list[ProgramRun], two: list[ProgramRun]) -> st
 def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
     """Raise if the shape of an event depends on the number of particles.
 
-    A vector with as many entries as there are particles looks like one number for each of them. An array (n, n) made
-    from (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
+    A vector with as many entries as there are particles looks like one number per particle. An array (n, n) made from
+    (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
     """
     calls = alone.calls or []
     for k, found in enumerate(whole.calls or ()):
@@ -389,7 +389,7 @@ def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
 
 
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
-    """Raise unless particles have the same distributions in a call of all and alone."""
+    """Raise unless particles have the same distributions in a call of all particles and alone."""
     position = call.positions(rows)
     here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
     among = call.densities(call.value)
@@ -440,11 +440,11 @@ _KNOWN: set[type] = set()
 
 
 def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
-    """Raise if draws of a user's distribution of numbers do not have its density; once for each class.
+    """Raise if draws of a user's distribution of numbers do not have its density. It is checked once for each class.
 
     The distribution function is the integral of the density between sorted draws. Its distance from the uniform
-    distribution is below .12 for 1000 draws of the true law, with a false alarm of 1e-12 (Dvoretzky, Kiefer,
-    Wolfowitz).
+    distribution is below .12 for 1000 draws of the true distribution, with a false-alarm rate of 1e-12 (Dvoretzky,
+    Kiefer, Wolfowitz).
     """
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:

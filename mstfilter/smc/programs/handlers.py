@@ -1,6 +1,6 @@
-"""Handlers decide the values of the sites of a program.
+"""Handlers, which determine the values of the sites of a program.
 
-A value is a draw, a replayed draw of a guide, the mean of the distribution, or given.
+A value is drawn, replayed from a guide, the mean of the distribution, or given.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ class Site(NamedTuple):
 
 
 class SiteHandler(ABC):
-    """Decides the values of sites.
+    """Determines the values of sites.
 
     Attributes
     ----------
     observes : bool
         Whether the program may observe.
     draws : bool
-        Whether the values are new, and not given.
+        Whether the values are new rather than given.
     strict : bool
-        Whether a log density of NaN or +inf is an error. It is for single particles that are drawn.
+        Whether a log density of NaN or +inf is an error. It is used for single particles that are drawn.
     """
 
     observes = True
@@ -51,14 +51,14 @@ class SiteHandler(ABC):
 
     @abstractmethod
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        """Values (size, ...) of a site and what they add to the log weights (None: nothing)."""
+        """Values (size, ...) of a site, and the change of the log weights (None: no change)."""
 
     def row(self, index: int) -> SiteHandler:
         """The handler of one particle of a `per_particle` program."""
         return self
 
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
-        """End a pass, in which the sites have the given values."""
+        """End a pass in which the sites have the given values."""
 
 
 class SampleHandler(SiteHandler):
@@ -75,7 +75,7 @@ class SampleHandler(SiteHandler):
 
 
 class GuideHandler(SiteHandler):
-    """Draws every site for n particles, and keeps values and log densities for a `ReplayHandler`."""
+    """Draws every site for n particles, and stores values and log densities for a `ReplayHandler`."""
 
     observes = False
 
@@ -194,7 +194,7 @@ class CopyHandler(SiteHandler):
 
 
 class ScoreHandler(SiteHandler):
-    """Takes given values of each site, weights them by their density, and keeps the sites.
+    """Takes given values of each site, weights them by their density, and records the sites.
 
     With `single` they are the values of one particle, without the particle axis. With `strict`, a log density of NaN
     or +inf is an error.

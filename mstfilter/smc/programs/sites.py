@@ -34,19 +34,19 @@ def recorded() -> Iterator[list[ProgramRun]]:
 
 
 def sample(name: str, distribution: Any) -> Any:
-    """A random value of the step, kept in the particle under `name`.
+    """A random value of the step, stored in the particle under `name`.
 
     Parameters
     ----------
     name : str
         Unique within a step, except for sites in different branches of a `switch`.
     distribution : Distribution
-        Of this package, frozen of scipy.stats, or of torch; parameters have one row per particle.
+        A distribution of this package, frozen of scipy.stats, or of torch. Its parameters have one row per particle.
 
     Returns
     -------
-    ndarray ``(n, *event_shape)``
-        One row per particle, read-only; a number or array without that axis in a `per_particle` program.
+    ndarray ``(n, *event_shape)`` One row per particle, read-only. In a `per_particle` program it is a number or array
+    without that axis.
     """
     return _current().sample(name, distribution)
 
@@ -54,9 +54,9 @@ def sample(name: str, distribution: Any) -> Any:
 def observe(name: str, distribution: Any, value: Any) -> None:
     """Weight the particles by the probability of an observed value; None is a missing value and has no effect.
 
-    `distribution` is that of the observation given the particle. The value has its event shape; or it is one for each
-    particle, of shape ``(n, *event_shape)``, such as the reading that the particle assigns to an object. `name` is
-    used in messages.
+    `distribution` is the distribution of the observation given the particle. The value has the event shape of the
+    distribution. Or it is one value for each particle, of shape ``(n, *event_shape)``, such as the reading that the
+    particle assigns to an object. `name` is used in messages.
     """
     _current().observe(name, distribution, value)
 
@@ -71,11 +71,12 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     probs : (k,) or (n, k) array_like
         Probabilities of the k branches.
     branches : sequence of callables
-        Each is called once with the rows of `args` that belong to its particles, and may `sample`, `observe` and
-        `switch`. A site with the same name in several branches is one array; the value is NaN (0 for integers) for
-        particles that did not reach the site. A branch is also called if it has no particles.
+        Each branch is called once with the rows of `args` that belong to its particles. It may call `sample`,
+        `observe` and `switch`. A site with the same name in several branches is one array. The value is NaN (0 for
+        integers) for particles that did not reach the site. A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Split by rows. Values shared by all particles, such as the observation, come by closure.
+        Arguments that are split by rows. Values shared by all particles, such as the observation, are passed by
+        closure.
 
     Returns
     -------
@@ -97,7 +98,7 @@ def _current() -> ProgramRun:
 
 @dataclass(frozen=True)
 class PerParticle(AtStep):
-    """A program that runs once for every particle; made by `per_particle`.
+    """A program that runs once for every particle, made by `per_particle`.
 
     ``function(previous, observation)`` gets the particle's `Trace` as `previous`.
     """
@@ -110,14 +111,14 @@ class PerParticle(AtStep):
 
 
 def per_particle(function: Callable[..., Any]) -> PerParticle:
-    """Mark a program whose set of sites may differ between particles. It runs once for every particle, so slower."""
+    """Mark a program whose set of sites may differ between particles. It runs once for every particle."""
     return PerParticle(function)
 
 
 class Trace(Mapping[str, Any]):
     """An immutable mapping from names to numbers, strings or arrays: a particle of a `per_particle` program.
 
-    Arrays, lists, sets and dictionaries in it cannot be changed either, since copies of the particle share them.
+    Arrays, lists, sets and dictionaries in it are also immutable, since copies of the particle share them.
     """
 
     __slots__ = ("_values",)
@@ -142,7 +143,7 @@ class Trace(Mapping[str, Any]):
 
 
 class FrozenList(list[Any]):
-    """A list in a `Trace`. It cannot be changed; ``items + [new]`` and ``list(items)`` are new lists."""
+    """A list in a `Trace`. It is immutable. ``items + [new]`` and ``list(items)`` are new lists."""
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise TypeError("a list in a particle is read-only: write items + [new], or change list(items)")
@@ -155,7 +156,7 @@ class FrozenList(list[Any]):
 
 
 def _frozen(value: Any) -> Any:
-    """The value, read-only: copies of arrays and of Python's containers; other objects are shared."""
+    """The value, read-only. Arrays and Python's containers are copied, and other objects are shared."""
     if isinstance(value, np.ndarray):
         return frozen_view(np.array(value)) if value.flags.writeable else value
     if type(value) is list:
@@ -182,13 +183,13 @@ class Call(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether an observed value is an event, or one for each particle; a number is an event of shape (1,)."""
+        """Whether an observed value is one event, or one for each particle; a number is an event of shape (1,)."""
         event, value = self.event, self.observed
         return value in (None, event, (1, *event), (self.size, *event)) or (value == () and event == (1,))
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the axis of the particles may be an axis of the event, or the reverse."""
+        """Whether the axis of the particles might be an axis of the event, or the reverse."""
         return self.size > 1 and (self.size in self.event or self.observed == (self.size, *self.event))
 
     def shape_error(self, prefix: str = "") -> InputError:
@@ -213,7 +214,7 @@ class Call(NamedTuple):
         return np.arange(self.size) if self.rows is None else self.rows
 
     def positions(self, rows: np.ndarray) -> np.ndarray:
-        """(k,) positions of some particles among those of the call; -1 for one that does not reach it."""
+        """(k,) positions of some particles among those of the call; -1 for a particle that does not reach it."""
         if self.rows is None:
             return rows
         if not self.size:
@@ -232,9 +233,9 @@ class Call(NamedTuple):
 
 
 class ProgramRun:
-    """One pass of a program over n particles; the handler decides the values.
+    """One pass of a program over n particles. The handler determines the values.
 
-    With `single` the program sees the values of one particle, without the particle axis.
+    With `single` the program gets the values of one particle, without the particle axis.
     """
 
     def __init__(self, handler: SiteHandler, n: int, single: bool = False) -> None:
@@ -265,7 +266,7 @@ class ProgramRun:
         return self.n if self._rows is None else len(self._rows)
 
     def returns(self, name: str, value: np.ndarray) -> None:
-        """Keep the shape of a returned value."""
+        """Store the shape of a returned value."""
         self._last = ("returned", name, "")
         self._note(event=value.shape[1:])
 
@@ -313,7 +314,7 @@ class ProgramRun:
         self.inside = False
 
     def _event_shape(self, distribution: Distribution, found: tuple[int, ...]) -> tuple[int, ...]:
-        """Event shape of a distribution of which a value of shape `found` is observed."""
+        """Event shape of a distribution, given an observed value of shape `found`."""
         if self.single:
             shape = distribution.parameter_shape
             return shape[1:] if shape[:1] == (1,) else shape
@@ -350,7 +351,7 @@ class ProgramRun:
         return merged
 
     def _note(self, **fields: Any) -> None:
-        """Keep the present call if calls are recorded."""
+        """Record the present call if calls are recorded."""
         if self.calls is not None:
             k = sum(call.what == self.what for call in self.calls)
             self.calls.append(Call(self.what, k, self._rows, self._size, **fields))
@@ -437,7 +438,7 @@ def _check_rows(argument: Any, size: int, k: int) -> None:
 
 
 def _blank(value: np.ndarray, n: int) -> np.ndarray:
-    """(n, ...) values of a site that was not reached: NaN for floats, else 0."""
+    """(n, ...) values of a site that was not reached: NaN for floats, and else 0."""
     fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
     return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 

@@ -1,6 +1,6 @@
 """Contracts: properties that every component of a filter has, as test classes for your components and ours.
 
-Inherit the contract of the interface and define `make`; ``pytest`` then tests the component:
+Inherit the contract of the interface and define `make`. ``pytest`` then tests the component:
 
 >>> from mstfilter.smc.testing import WeightResamplerContract
 >>> from mine import MyResampler
@@ -8,7 +8,7 @@ Inherit the contract of the interface and define `make`; ``pytest`` then tests t
 ...     def make(self):
 ...         return MyResampler()
 
-`check_properties` runs the same class without pytest and states in words which property is violated:
+`check_properties` runs the same class without pytest and states which property is violated:
 
 >>> for result in check_properties(MyResampler(), WeightResamplerContract):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")

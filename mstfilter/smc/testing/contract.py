@@ -1,8 +1,8 @@
-"""What all contracts share: the base class, its run without pytest, and helpers that describe failures.
+"""Common parts of all contracts: the base class, its run without pytest, and helpers that describe failures.
 
-A contract is a test class for pytest. It defines the arguments of a call (`inputs`), the call, and what every result
-must fulfil (`check_result`). Each ``test_`` method checks one more property; the first line of its docstring states
-the property, and the message of a failed assertion states how it is violated:
+A contract is a test class for pytest. It defines the arguments of a call (`inputs`), the call (`call`), and the
+requirements of every result (`check_result`). Each ``test_`` method checks one more property. The first line of its
+docstring states the property, and the message of a failed assertion states how it is violated:
 
 >>> class TriggerContract(Contract):
 ...     def call(self, component, rng, inputs):
@@ -53,13 +53,13 @@ _Test = TypeVar("_Test", bound=Callable[..., None])
 
 
 def statistical(test: _Test) -> _Test:
-    """Mark a test that looks at random samples. It fails with probability `FALSE_ALARM` for a correct component."""
+    """Mark a test that uses random samples. It fails with probability `FALSE_ALARM` for a correct component."""
     test.statistical = True  # type: ignore[attr-defined]
     return test
 
 
 def prerequisite(test: _Test) -> _Test:
-    """Mark a test that the tests after it rely on. If it fails, `check_properties` skips them."""
+    """Mark a test on which later tests depend. If it fails, `check_properties` skips the later tests."""
     test.prerequisite = True  # type: ignore[attr-defined]
     return test
 
@@ -74,7 +74,7 @@ def number_example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
 
 
 class Contract:
-    """Base class of all contracts. Inherit one of its subclasses and define `make`; pytest does the rest.
+    """Base class of all contracts. Inherit one of its subclasses and define `make`. pytest does the rest.
 
     A contract for another interface defines `inputs`, `call` and `check_result`, and adds tests.
     """
@@ -84,7 +84,7 @@ class Contract:
         raise NotImplementedError(f"{type(self).__name__} needs a method make(self) that returns the component")
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """A population of `n` particles that the component can handle, and an observation. Default: numbers."""
+        """A population of `n` particles (by default numbers) that the component can handle, and an observation."""
         return number_example(rng, n)
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
@@ -93,14 +93,14 @@ class Contract:
         return {"population": population, "observation": observation}
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        """Use the component once."""
+        """Call the component once."""
         raise NotImplementedError
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        """Assert what the result of every call must fulfil."""
+        """Assert the requirements of every result."""
 
     def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
-        """Use the component once; an exception or a wrong result is reported with a description of the inputs."""
+        """Call the component once. An exception or a wrong result is reported with a description of the inputs."""
         with reports_errors(inputs):
             result = self.call(component, seeded(3) if rng is None else rng, inputs)
         self.check_result(result, inputs)
@@ -113,19 +113,19 @@ class Contract:
         fault: str,
         expected: Callable[[Any], Any] = lambda result: result,
     ) -> None:
-        """Check that changed arguments give the `expected` change of the result, by default the same result."""
+        """Check that changed arguments give the `expected` change of the result (by default none)."""
         component = self.make()
         result = expected(self.checked_call(component, inputs))
         assert close(self.checked_call(component, {**inputs, **changes}), result), fault
 
     def variants(self) -> list[dict[str, Any]]:
-        """Arguments of several calls, for properties that hold for any: six particles; for arrays also one."""
+        """Arguments of calls for which the properties must hold: six particles, and for arrays also one particle."""
         few = self.inputs(6)
         objects = isinstance(getattr(few.get("population"), "particles", None), tuple)
         return [few] if objects else [few, self.inputs(1)]
 
     def fresh(self) -> Any:
-        """A component that has not been used: a copy of what `make` returns, if it can be copied."""
+        """A component that has not been used: a copy of the result of `make`, if it can be copied."""
         return copied(self.make())
 
     def setup_method(self) -> None:
@@ -192,7 +192,7 @@ class Contract:
 
 @dataclass(frozen=True)
 class _Examples(Proposal):
-    """The particles of an example, as the first ones of a filter."""
+    """The particles of an example, used as the first particles of a filter."""
 
     example: Callable[..., Any]
 
@@ -206,7 +206,7 @@ class _Examples(Proposal):
 
 
 class BatchedContract(Contract):
-    """Base class of contracts for components that may work on the particles of several runs together."""
+    """Base class of contracts for components that may process the particles of several runs together."""
 
     slot: ClassVar[str]  #: of a `ParticleFilter` that takes the component
 
@@ -251,7 +251,7 @@ def copied(component: Any) -> Any:
 
 
 def skip_unless_properly_weighted(component: Any) -> Any:
-    """The component; skips a test of the weights if it declares ``properly_weighted = False``."""
+    """The component. Skips a test of the weights if it declares ``properly_weighted = False``."""
     if not component.properly_weighted:
         raise SkipTest("the component declares properly_weighted = False")
     return component
@@ -278,7 +278,7 @@ def check_properties(
 ) -> list[CheckResult]:
     """Test all properties of a component that a contract states.
 
-    ``example(rng, n)`` and ``exact(rng, n)`` take the place of the methods of the contract with these names.
+    ``example(rng, n)`` and ``exact(rng, n)`` replace the methods of the contract with these names.
     """
     unused = copied(component)
     functions = {"make": lambda: component, "fresh": lambda: copied(unused), "example": example, "exact": exact}
@@ -314,7 +314,7 @@ def _test_names(tests: type) -> list[str]:
 
 
 def _outcome(contract: Contract, name: str) -> tuple[str | None, str | None, bool]:
-    """Failure and reason of a skip of a test, and whether the tests after it rely on it."""
+    """Failure and reason of a skip of a test, and whether later tests depend on it."""
     failure = skipped = None
     test = getattr(contract, name)
     contract.setup_method()
@@ -335,7 +335,7 @@ def _outcome(contract: Contract, name: str) -> tuple[str | None, str | None, boo
 
 @contextmanager
 def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
-    """Turn any exception of a component into an AssertionError that describes the call, or its inputs."""
+    """Convert any exception of a component to an AssertionError that describes the call or its inputs."""
     try:
         yield
     except (AssertionError, SkipTest):
@@ -353,7 +353,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def skips_errors() -> Iterator[None]:
-    """Skip a general test if the component raises an exception, which the tests of its interface report."""
+    """Skip a general test if the component raises an exception, since the tests of its interface report it."""
     try:
         yield
     except Exception as error:
@@ -382,7 +382,7 @@ def close(a: Any, b: Any) -> bool:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two values are equal: arrays bit by bit, dataclasses by field. Without equality they count as equal."""
+    """Whether two values are equal: arrays bit by bit, dataclasses by field; True without an equality."""
     if a is b:
         return True
     if type(a) is not type(b):

@@ -1,8 +1,8 @@
-"""What particles carry after a resampling: test cases, their statistics, likely faults, and generators that count.
+"""Weight of particles after a resampling: test cases, their statistics, likely faults, and generators that count.
 
-A `Case` is a list of weights and a number of particles to select. A `Sample` collects over many calls what each
-particle and each group of particles carries, in units of the total weight. `fault_message` compares its mean with the
-weights and names the likely fault.
+A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many calls, the weight
+that each particle and each group of particles carries, in units of the total weight. `fault_message` compares the
+mean with the expected weights and names the likely fault.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mstfilter.smc.testing.contract import FALSE_ALARM
 
 @dataclass(frozen=True)
 class Case:
-    """Weights, number of particles to select, and number of calls at first."""
+    """Weights, number of particles to select, and first number of calls."""
 
     weights: tuple[float, ...]
     n: int
@@ -29,10 +29,10 @@ class Case:
 
 
 def _mixed(m: int, heavy: float) -> tuple[float, ...]:
-    """(m,) weights: a heavy one, zeros, ties and light ones, more mass in the second half.
+    """(m,) weights: one heavy weight, zeros, ties and light weights, with more mass in the second half.
 
-    The first of the second half has the fraction `heavy` of the weight. An eighth of the others is zero, and a
-    quarter has 5e-4 of the heaviest weight or less.
+    The first weight of the second half is the fraction `heavy` of the total. An eighth of the others is zero, and a
+    quarter is at most 5e-4 of the heaviest weight.
     """
     kind = np.arange(m) % 8
     weights = np.select(
@@ -85,13 +85,13 @@ _STAKES = 0.9 * 0.5 ** np.arange(10)
 
 
 class Sample:
-    """What particles and groups of particles of a case carry, over many calls.
+    """The weight that particles and groups of particles of a case carry, over many calls.
 
-    The mean of each is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
-    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to
-    1 / mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality its largest value
+    Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
+    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
+    mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, its largest value
     over any number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no
-    variance, so a scheme that gives very many copies in rare calls passes. Calls may be added where the result is not
+    variance. So a scheme that gives very many copies in rare calls passes. Calls may be added if the result is not
     clear.
     """
 
@@ -103,7 +103,7 @@ class Sample:
         self._rows: list[np.ndarray] = []
 
     def add(self, ancestors: np.ndarray, weights: np.ndarray) -> None:
-        """Add a call: its ancestors, and the output weights in units of the old mean."""
+        """Add a call with its ancestors and its output weights in units of the old mean."""
         n = len(weights)
         total = float(weights.sum()) / n
         self._rows.append(np.bincount(ancestors, weights, minlength=len(self.case.weights)) / n)
@@ -130,8 +130,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expectation of each particle and group.
 
-        It exceeds log(2 / p) with probability at most p. The result is 0 where the mean is less than four standard
-        errors away; 16 copies in all calls together allow for particles that are hardly ever selected.
+        It exceeds log(2 / p) with probability at most p. The result is 0 if the mean is less than four standard
+        errors away. 16 copies are added to all calls, for particles that are rarely selected.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
@@ -155,7 +155,7 @@ def quantile(n_tails: int) -> float:
 
 @lru_cache(maxsize=64)
 def groups_of(case: Case) -> np.ndarray:
-    """(k, m) masks as floats: all particles, the first half, the light ones, the particles of each common weight."""
+    """(k, m) masks as floats: all particles, the first half, the light ones, and those of each common weight."""
     w = np.asarray(case.weights)
     values, counts = np.unique(w, return_counts=True)
     masks = [np.ones(len(w), bool), np.arange(len(w)) < len(w) // 2, (w > 0) & (w < 1e-3 * w.max())]
@@ -163,7 +163,7 @@ def groups_of(case: Case) -> np.ndarray:
 
 
 def fault_message(sample: Sample, column: int) -> str:
-    """How the particle or group that deviates most violates its expectation."""
+    """How the particle or group with the largest deviation violates its expectation."""
     case, expected, mean = sample.case, sample.expected, sample.carried.mean(axis=0)
     m, n = len(case.weights), case.n
     got, want = n * mean, n * expected
@@ -182,7 +182,7 @@ def fault_message(sample: Sample, column: int) -> str:
 
 
 def _hint(got: np.ndarray, want: np.ndarray, n: int, calls: int) -> str:
-    """The likely fault, from the mean copies of each particle and the expected ones."""
+    """The likely fault, from the mean and the expected numbers of copies of each particle."""
     m, excess, heaviest = len(want), got - want, int(np.argmax(want))
     half, top = m // 2, want[heaviest]
     if m == n and np.allclose(got, 1.0):
@@ -219,7 +219,7 @@ def _hint(got: np.ndarray, want: np.ndarray, n: int, calls: int) -> str:
 
 
 def evidence_hint(total: float, W: np.ndarray) -> str:
-    """A hint if the mean weight after selection is that over the positive weights."""
+    """A hint if the mean weight after selection equals that over the positive weights."""
     if (W > 0).all() or abs(total * (W > 0).mean() - 1) > 1e-9:
         return ""
     return ": it is the mean over the positive weights only, divide by the number of all particles"
@@ -232,9 +232,9 @@ def log_of(weights: Any) -> np.ndarray:
 
 
 class CountingGenerator(np.random.Generator):
-    """The generator ``default_rng(seed)``, which counts what it draws and skips the test beyond a budget.
+    """The generator ``default_rng(seed)``, which counts its draws and skips the test above a budget.
 
-    `budget` is in numbers; a call counts as 15 numbers. `slow` is the reason of the skip.
+    `budget` is a number of draws, and a call counts as 15 draws. `slow` is the reason of the skip.
     """
 
     def __init__(self, seed: int, budget: int, slow: str) -> None:

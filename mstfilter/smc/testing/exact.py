@@ -18,7 +18,7 @@ from mstfilter.smc.testing.copies import quantile
 
 
 class PopulationContract(Contract):
-    """What contracts share of components that return a population."""
+    """Common parts of contracts of components that return a population."""
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         assert isinstance(result, Population), f"it returns {type(result).__name__}, expected a Population"
@@ -46,26 +46,27 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 class ExactContract(PopulationContract):
     """Properties of components with exact draws to compare with.
 
-    Define a method ``exact(self, rng, n)`` (or a function ``exact(rng, n)`` beside the component). It returns a
-    population of `n` particles before the call, a population of exact draws, or with exact weights, after it, and the
-    observation. A fourth item ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides: it makes
-    the weights f / q of a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. It returns three
+    items. The first is a population of `n` particles before the call. The second is a population of exact draws, or
+    with exact weights, after the call. The third is the observation. An optional fourth item
+    ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides. It makes the weights f / q of a guided
+    move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
 
-    The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 of them the tests find a
-    standard deviation that is 2 % off, and a shift by 3 % of it. They also find a cut of the tails that holds 0.1 %
-    of the probability and a correlation of 0.02 between particles.
+    The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 rows, the tests detect a
+    standard deviation that is wrong by 2 %, and a shift by 3 % of it. They also detect missing tails with 0.1 % of
+    the probability, and a correlation of 0.02 between particles.
     """
 
     exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None
 
     def exact_case(self, seed: int, n: int) -> tuple[Any, ...]:
-        """Exact draws; skips the test if there are none."""
+        """Exact draws. Skips the test if there are none."""
         if self.exact is None:
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
         return self.exact(seeded(seed), n)
 
     def numbers_of_draws(self, call: Callable[[int], Any]) -> Iterator[int]:
-        """Numbers of draws of a test that does ``call(n)``: 10,000, and 200,000 if that is fast."""
+        """Numbers of draws of a test that calls ``call(n)``: 10,000, and 200,000 if this is fast."""
         yield _DRAWS[0]
         start = process_time()
         call(_DRAWS[0])
@@ -73,12 +74,14 @@ class ExactContract(PopulationContract):
             yield _DRAWS[1]
 
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
-        """Compare the weighted distributions of rows: of each column, and of the sums of pairs of columns.
+        """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.
 
-        Probabilities of intervals, means and spreads are compared. The sums find columns that share a random number.
+        Probabilities of intervals, means and spreads are compared. The sums detect columns that share a random
+        number.
 
-        The difference of two weighted means is normal up to errors that a twentieth of the level allows for. A tail
-        is compared if its probability is that of 50 of the largest weights, so that no rare weight is decisive.
+        The difference of two weighted means is normal, up to errors that a twentieth of the level allows for. A tail
+        is compared if its probability is at least that of 50 of the largest weights, so that no rare weight is
+        decisive.
         """
         samples = []
         for log_weights in (lw, exact_lw):
@@ -126,7 +129,7 @@ class ExactContract(PopulationContract):
     def compare_changed(
         self, found: np.ndarray, change: np.ndarray, log_g: Any, exact: np.ndarray, exact_lw: np.ndarray
     ) -> None:
-        """`compare_weighted` for the log weights ``log_g + change``; says if -`change` would be correct."""
+        """`compare_weighted` for the log weights ``log_g + change``. States whether -`change` would be correct."""
         try:
             self.compare_weighted(found, log_g + change, exact, exact_lw)
         except (AssertionError, SkipTest) as error:
@@ -164,7 +167,7 @@ class ExactContract(PopulationContract):
     moves = False
 
     def columns(self, j: int, n_columns: int) -> str:
-        """What column `j` is."""
+        """Description of column `j`."""
         if not self.moves:
             return f"coordinate {j} of x"
         half = n_columns // 2
@@ -172,14 +175,14 @@ class ExactContract(PopulationContract):
 
 
 def _pairs(d: int) -> list[tuple[int, int]]:
-    """At most 20 pairs of d columns, neighbours first."""
+    """At most 20 pairs of d columns, with neighbours first."""
     return sorted(combinations(range(min(d, 40)), 2), key=lambda pair: pair[1] - pair[0])[:20]
 
 
 def _with_sums(
     found: np.ndarray, exact: np.ndarray, w: np.ndarray, pairs: list[tuple[int, int]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two samples with the sums of pairs of columns as further columns, each over its spread in the exact one."""
+    """Two samples with sums of pairs of columns as additional columns, each divided by its exact spread."""
     scale = [_sd(column, w) or 1.0 for column in exact.T]
     first, second = (
         np.column_stack([x, *(x[:, j] / scale[j] + x[:, k] / scale[k] for j, k in pairs)]) for x in (found, exact)
@@ -199,9 +202,9 @@ def _weighted_fractions(x: np.ndarray, w: np.ndarray, limits: np.ndarray) -> tup
 def _moments_of_scores(
     x: np.ndarray, w: np.ndarray, exact: np.ndarray, F: np.ndarray, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means of z and z^2, and standard errors: z is the normal quantile of the rank of x in sorted draws.
+    """Weighted means of z and z^2, and standard errors; z is the normal quantile of the rank of x in sorted draws.
 
-    `F` (n + 1,) are the cumulative weights of the draws; ranks nearer to 0 or 1 than `least` are moved there.
+    `F` (n + 1,) are the cumulative weights of the draws. Ranks nearer to 0 or 1 than `least` are moved there.
     """
     rank = (F[exact.searchsorted(x)] + F[exact.searchsorted(x, side="right")]) / 2
     z = ndtri(np.clip(rank, least, 1 - least))
@@ -211,9 +214,11 @@ def _moments_of_scores(
 
 
 def without_copies(x: np.ndarray, out: Population) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and log weights of a result, without copies of a parent "previous": the first gets the sum of the weights.
+    """Rows and log weights of a result, without copies of a parent "previous".
 
-    Copies are not independent draws. Particles that are equal and have different parents are.
+    The first copy gets the sum of the weights.
+
+    Copies are not independent draws. Equal particles with different parents are independent draws.
     """
     parent = out.parents.get("previous")
     if parent is None or len(np.unique(parent)) == len(x):

@@ -37,7 +37,7 @@ class TransitionContract(BatchedContract, ExactContract):
     """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
 
     One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
-    them, and the observation. For a guided move it also returns log p(y_t | x_t), a function of x_t. If the
+    these rows, and the observation. For a guided move it also returns log p(y_t | x_t), as a function of x_t. If the
     transition weights by the observation, the population of x_t has these weights.
     """
 
@@ -83,7 +83,7 @@ class TransitionContract(BatchedContract, ExactContract):
         component = skip_unless_properly_weighted(self.make())
 
         def moved(n: int, missing: bool = False, row: int | None = None) -> tuple[Population, Population]:
-            """Particles and their moves; of a single one, for the `row` of the exact draws."""
+            """Particles and their moves. For a single particle, those of the `row` of the exact draws."""
             population, _, observation, *_ = self.exact_case(1, n)
             population = population.take(seeded(4).permutation(n) if row is None else np.array([row]))
             inputs = {"population": population, "observation": None if missing else observation}
@@ -105,7 +105,7 @@ class TransitionContract(BatchedContract, ExactContract):
     def _compare_moves(
         self, before: Population, after: Population, other: Population, fresh: Population, likelihood: list[Any]
     ) -> None:
-        """Compare moves and the change of their weights with exact ones; `likelihood` weights both."""
+        """Compare moves and the change of their weights with exact ones. `likelihood` weights both."""
         change, exact_lw = after.log_weights - before.log_weights, fresh.log_weights - other.log_weights
         log_g = sum(log_likelihood(after.particles) for log_likelihood in likelihood)
         exact_lw = exact_lw + sum(log_likelihood(fresh.particles) for log_likelihood in likelihood)
@@ -161,7 +161,7 @@ class TransitionContract(BatchedContract, ExactContract):
         return np.round(np.array(moves), 9)
 
     def _check_missing(self, component: Any, inputs: dict[str, Any], moves: np.ndarray) -> None:
-        """Check that particles are not still without an observation if they move at random with one."""
+        """Check that particles also move at random without an observation if they do so with one."""
         often = (moves != moves[:1]).mean(axis=(0, 1)) > 0.1
         missing = np.array(
             [
@@ -206,9 +206,9 @@ class DensityTransitionContract(TransitionContract):
     def test_log_prob_is_the_density_of_its_moves(self) -> None:
         """Moves have the distribution of `log_prob`, up to a constant factor of the density.
 
-        Of a move from a or b, each as likely, p = f(x' | a) / (f(x' | a) + f(x' | b)) is the probability that it is
-        from a. With p of the particle that the move is from, (1 - p) log(p / (1 - p)) has mean 0.
-        Pairs are particles that are some positions apart in the order of their first coordinate.
+        Suppose that a move from a and a move from b are equally likely. Then p = f(x' | a) / (f(x' | a) + f(x' | b))
+        is the probability that the move is from a. For p of the true origin, (1 - p) log(p / (1 - p)) has mean 0.
+        Pairs are particles some positions apart in the order of their first coordinate.
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
@@ -241,7 +241,7 @@ class ProposalContract(BatchedContract, ExactContract):
     """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
-    particles, and the observation. For the initial proposal these are draws of p(x_0). A third item
+    particles, and the observation. For the initial proposal these are draws of p(x_0). An optional third item
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
     """
 
@@ -291,10 +291,10 @@ class ProposalContract(BatchedContract, ExactContract):
 class UpdateContract(BatchedContract, ExactContract):
     """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of
-    p(x | y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one,
-    with their constant factor, which is part of the evidence. With exact draws the factor is free, unless a fourth
-    item of `exact` is log p(y), a number.
+    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of p(x |
+    y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one, with
+    their constant factor, which is part of the evidence. For exact draws the factor is arbitrary, unless a fourth
+    item of `exact` is the number log p(y).
     """
 
     slot = "update"
@@ -392,7 +392,8 @@ class RejuvenationContract(ExactContract):
     """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
-    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given them and y_t, and y_t.
+    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and y_t, and
+    y_t.
     """
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
@@ -419,7 +420,7 @@ class RejuvenationContract(ExactContract):
         component = skip_unless_properly_weighted(self.make())
 
         def moved(n: int, row: int | None = None) -> np.ndarray:
-            """x_t, and x_t - x_{t-1}, of exact draws, or of one of them alone, after five moves."""
+            """x_t, and x_t - x_{t-1}, of exact draws or of one of them alone, after five moves."""
             previous, population, observation = self.exact_case(1, n)
             rows = seeded(4).permutation(n) if row is None else np.array([row])
             previous, population = None if previous is None else previous.take(rows), population.take(rows)

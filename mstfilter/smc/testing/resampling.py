@@ -1,15 +1,15 @@
 """Contracts of resamplers.
 
-A resampler must be properly weighted: a particle of normalised weight W_i gets n W_i copies on average, or copies
-that carry W_i together if their weights differ. `mstfilter.smc.testing.copies` lists the weights and numbers of
-particles for which this is tested: n = m, n < m and n > m, ties, zeros, heavy and light weights.
+A resampler must be properly weighted. A particle of normalised weight W_i gets n W_i copies on average, or copies
+that together carry W_i if their weights differ. `mstfilter.smc.testing.copies` lists the weights and numbers of
+particles of the tests: n = m, n < m and n > m, ties, zeros, heavy and light weights.
 
-A scheme that makes new particles instead of copies is a `TransformResampler` and has another law: it keeps the
+A scheme that makes new particles instead of copies is a `TransformResampler` and has another law. It keeps the
 weighted mean of the particles, and its output weights are equal.
 
-A scheme may be correct and slow: the cost of rejection grows with max w / mean w. The generator of the statistical
-tests counts what is drawn, and a case is left out as "too slow at this weight" if it exceeds the budget. The clock is
-not used, so the outcome of a check does not depend on the machine.
+A scheme may be correct and slow. For example, the cost of rejection grows with max w / mean w. The generator of the
+statistical tests counts its draws. A case that exceeds the budget is skipped as "too slow at this weight". The clock
+is not used, so the outcome of a check does not depend on the machine.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 class ResamplerContract(Contract):
     """The contract of every `Resampler`. Its statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    The particles of the example differ. The tests find a deviation of a mean that is about six standard errors in the
-    calls of a `Case`, and at least 0.3 % of the particle's weight.
+    The particles of the example must differ. The tests detect a deviation of a mean of about six standard errors in
+    the calls of a `Case`, and at least 0.3 % of the particle's weight.
     """
 
     #: Fewer calls: schemes that compare particles are slower.
@@ -75,7 +75,7 @@ class ResamplerContract(Contract):
         return {"population": self.population(np.linspace(1, 2 + seed, 40)), "n": 25}
 
     def variants(self) -> list[dict[str, Any]]:
-        """More particles than are selected, as many, fewer, and weights of zero."""
+        """More particles than are selected, as many, and fewer; also weights of zero."""
         weights = (np.linspace(1, 2, 40), (0.2, 0.5, 0.3, 0.9, 0.4, 0.6, 0.1), (0.5, 0.2, 0.7), _ZEROS[0], (0.4, 0.3))
         return [{"population": self.population(w), "n": n} for w, n in zip(weights, (25, 7, 8, 5, 1), strict=True)]
 
@@ -183,7 +183,7 @@ class ResamplerContract(Contract):
         self._check_cases(self.heavy_cases)
 
     def _check_cases(self, cases: tuple[Case, ...]) -> None:
-        """Compare what each particle and each group of particles carries on average with its weight."""
+        """Compare the mean weight that each particle and each group of particles carries with its expectation."""
         component = skip_unless_properly_weighted(self.make())
         slow = []
         for seed, case in enumerate(cases):
@@ -206,7 +206,7 @@ class ResamplerContract(Contract):
             )
 
     def _carried(self, component: Resampler, case: Case, n_cases: int, seed: int) -> Sample:
-        """What each particle and each group carries in many calls.
+        """The weight that each particle and each group carries in many calls.
 
         Calls are added while a mean is suspicious and the evidence is not sufficient.
         """
@@ -230,7 +230,7 @@ class ResamplerContract(Contract):
 
 
 def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
-    """What a generator does, the generator, and a number of particles to select."""
+    """Description of the generator, the generator, and a number of particles to select."""
     for seed in range(60):
         yield f"the generator has seed {seed}", seeded(seed), (1, 4, 5, 11)[seed % 4]
     for value in (0.0, 1 - 2.0**-53):
@@ -270,7 +270,7 @@ class WeightResamplerContract(BatchedContract, ResamplerContract):
         )
 
     def _light_copies(self, component: WeightResampler, n_light: int, calls: int) -> np.ndarray:
-        """Copies of all particles but the first, which has 1000 times their total weight, among 100 000 copies."""
+        """Copies of all particles except the first, which has 1000 times their total weight, among 100 000 copies."""
         n, slow = 100_000, "too slow at this weight: max w / mean w = 1e5"
         weights = np.full(n_light + 1, 1e-3 / n_light)
         weights[0] = 1.0
@@ -285,9 +285,9 @@ class WeightResamplerContract(BatchedContract, ResamplerContract):
 
 
 class TransformResamplerContract(Contract):
-    """The contract of every `TransformResampler`: n new particles of equal weight whose mean is the weighted mean.
+    """The contract of every `TransformResampler`: n new particles of equal weight and with the weighted mean.
 
-    For n other than the number of particles it may raise InputError. The example has particles that are arrays of
+    For n other than the number of particles it may raise InputError. The particles of the example are arrays of
     numbers, or mappings of such arrays. Reich (2013), "A nonparametric ensemble transform method for Bayesian
     inference".
     """
