@@ -1,11 +1,11 @@
-"""Contracts of components of scenes, and the check of any component: what ``mstfilter check`` does.
+"""Contracts of components of scenes, and the check of any component, which ``mstfilter check`` uses.
 
 >>> for result in run_contract(MyRule()):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
-Contracts of components of numbers, and how to use a contract as a test, are in `mstfilter.smc.testing`.
-`scene_example` gives hypotheses and a clip for either. ``mstfilter new resampler mine.py`` writes a component to
-start from, and its test (`write_starter`).
+`mstfilter.smc.testing` has the contracts of components of numbers, and describes how to use a contract as a test.
+`scene_example` returns hypotheses and a clip for either kind. ``mstfilter new resampler mine.py`` writes a starting
+file for a component, and its test (`write_starter`).
 """
 
 from mstfilter.lazy import attach

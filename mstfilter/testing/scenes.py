@@ -1,4 +1,4 @@
-"""An example for components that use images: hypotheses and a clip of a table with three boxes, one of them pushed.
+"""An example for components that use images: hypotheses and a clip of a table with three boxes, one pushed.
 
 >>> population, clip = scene_example(np.random.default_rng(0), 4)
 >>> len(population), clip.before.depth.shape
@@ -53,7 +53,7 @@ def _clip() -> Clip:
 def scene_example(rng: np.random.Generator, n: int) -> tuple[Population, Clip]:
     """`n` hypotheses before the push, unevenly weighted, and the clip of the push.
 
-    Some are correct; in others two boxes are merged, a box is missing, or a box is split.
+    Some hypotheses are correct. In others two boxes are merged, a box is missing, or a box is split.
     """
     hypotheses = []
     for _ in range(n):

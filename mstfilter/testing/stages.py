@@ -1,6 +1,6 @@
-"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, parts of the updates.
+"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
 
-`contract_of` and `run_contract` are for components of every interface, also for those of `mstfilter.smc.testing`.
+`contract_of` and `run_contract` are for components of every interface, including those of `mstfilter.smc.testing`.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class StageContract(Contract):
         return found.realised()
 
     def checked_step(self, component: Any, inputs: dict[str, Any]) -> None:
-        """Use the component in its place; an exception is reported with a description of the inputs."""
+        """Use the component in its place. An exception is reported with a description of the inputs."""
         with reports_errors(inputs):
             result = self.step(component, seeded(3), inputs)
         assert all(isinstance(h, Hypothesis) for h in result.particles), "the result has no hypotheses"
@@ -205,7 +205,7 @@ def _on_surface(filled: list[np.ndarray], seen: list[ObservedBox], axes: tuple[i
 
 
 def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool = False) -> list[ObservedBox]:
-    """What the first frame of a clip shows of the objects of a hypothesis; `cut`: of the half above a diagonal."""
+    """The first frame's evidence about the objects of a hypothesis; with `cut`, about the half above a diagonal."""
     image, _ = render_hypothesis(hypothesis, clip.before.camera)
     masks = [image == k for k in np.unique(image[image > 0])]
     if cut:
@@ -217,7 +217,7 @@ def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool =
 def _estimated(
     completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
 ) -> list[np.ndarray]:
-    """The probabilities of boxes, with the streams from that of box `first` on."""
+    """The probabilities of boxes. Box k uses the stream `first` + k."""
     bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     with _without_warnings():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
@@ -225,14 +225,14 @@ def _estimated(
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Without the warnings of a run, which are properties of their own here."""
+    """Suppress the warnings of a run, which have separate tests here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         yield
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
-    """The first voxels of a box."""
+    """The box reduced to its first voxels."""
     parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name != "height"}
     return ObservedBox(**parts, height=box.height[:c])
 
@@ -274,7 +274,7 @@ def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
 def contract_of(cls: type) -> type[Contract]:
     """The contract of a class of components: `UpdateContract` for an `Update`, and so on for the other interfaces.
 
-    InputError if no interface of the class has a contract.
+    Raises InputError if no interface of the class has a contract.
     """
     for base in cls.__mro__:
         if base.__module__.startswith("mstfilter."):
@@ -292,13 +292,14 @@ def contract_of(cls: type) -> type[Contract]:
 def run_contract(
     component: Any, example: Callable[..., Any] | None = None, exact: Callable[..., Any] | None = None
 ) -> list[CheckResult]:
-    """Test all properties of a component, whose interface has a contract.
+    """Test all properties of a component whose interface has a contract.
 
-    ``example(rng, n)`` returns a population and an observation that the component can handle. Default: the function
-    ``example`` in the module of its class; without one, a scene for components of images and numbers for others.
+    ``example(rng, n)`` returns a population and an observation that the component can process. The default is the
+    function ``example`` in the module of its class. Without one, it is a scene for components of images, and numbers
+    for others.
 
     ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
-    observation; see the contract. Default: the function ``exact`` in the module of its class, if any.
+    observation; see the contract. The default is the function ``exact`` in the module of its class, if there is one.
     """
     cls = type(component)
     contract = contract_of(cls)

@@ -1,4 +1,4 @@
-"""Starting files for components of a user: the examples of the documentation, under another name.
+"""Starting files for components of a user: the examples of the documentation, with other names.
 
 >>> write_starter("resampler", Path("mine.py"))                # mine.py and test_mine.py
 >>> write_starter("transition", Path("mine.py"), "numbers")    # particles are numbers instead of hypotheses
@@ -46,7 +46,7 @@ _BOTH = ("resampler", "trigger", "size")  # use the weights only, so one file is
 
 
 def starter_kinds(target: str = "") -> list[str]:
-    """Kinds of component that have a starting file: for "scenes", for "numbers", or for any of the two."""
+    """Kinds of component that have a starting file: for "scenes", for "numbers", or for either."""
     folders = map(_folder, [target] if target else _TARGETS)
     return sorted({path.stem for folder in folders for path in folder.glob("*.py")} | set(_BOTH))
 
@@ -56,10 +56,10 @@ def _folder(target: str) -> Path:
 
 
 def write_starter(kind: str, path: Path, target: str = "") -> Starter:
-    """Write a commented component of one of `starter_kinds` that works, and its test beside it as ``test_NAME.py``.
+    """Write a commented component of one of `starter_kinds` that works, and its test ``test_NAME.py``.
 
-    `target` says what the particles are: "scenes" (hypotheses) or "numbers". Default: scenes, if the kind has a file
-    for them. Raises InputError if there is no such file, the name cannot be imported, or a file exists already.
+    `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if there is a
+    file for them. Raises InputError if there is no such file, the name cannot be imported, or a file already exists.
     """
     check_choice("the target", target or "scenes", _TARGETS)
     kinds = starter_kinds(target)
