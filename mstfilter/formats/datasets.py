@@ -37,21 +37,21 @@ from mstfilter.scene import (
 
 @dataclass(frozen=True)
 class Bop(RecordingFormat):
-    """BOP: the folder of a scene with scene_camera.json, rgb/, depth/; mask_visib/ as true instances.
+    """BOP: the folder of a scene with scene_camera.json, rgb/, depth/. mask_visib/ becomes the true instances.
 
     ``scene_camera.json`` gives ``cam_K`` and ``depth_scale`` (millimetres per unit) of each image, and sometimes the
     camera pose ``cam_R_w2c``, ``cam_t_w2c`` (mm). The mask of the k-th annotated object has label k + 1 in the
-    instance image. By default every image is a pause, because the scenes are single images rather than videos.
-    Format: Hodan et al. 2018, https://github.com/thodan/bop_toolkit.
+    instance image. By default every image is a pause, because the scenes are single images and not videos. Format:
+    Hodan et al. 2018, https://github.com/thodan/bop_toolkit.
 
     Parameters
     ----------
     images : tuple of int
-        Numbers of the images to use, in order. Default: all.
+        Numbers of the images to use, in order. By default, all images.
     fps : float
-        Images per second; the layout stores no times.
+        Images per second, since the layout stores no times.
     pauses : PauseRule
-        The rule that finds the pauses.
+        Rule that finds the pauses.
     world : KnownWorld
         Pose and workspace, if they are known.
     """

@@ -26,18 +26,19 @@ from mstfilter.scene import Frame, Recording, read_depth, read_labels, read_rgb,
 
 @dataclass(frozen=True)
 class PairedImages(RecordingFormat):
-    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
+    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json. Every frame is a pause.
 
-    ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
-    depth images. There is no pose: the world is found from the support plane. Label images NAME_label.png (8 or 16
-    bits, one number for each object) become the true instances.
+    ``info.json`` has ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, in metres per unit of the 16-bit
+    depth images. The layout has no pose, so the world is computed from the support plane. Label images NAME_label.png
+    (8 or 16 bits, one number for each object) become the true instances.
 
     Parameters
     ----------
     frames : tuple of str
-        Names of the frames in order. Default: all, by name; numbers in names count as numbers.
+        Names of the frames in order. By default all, ordered by name, where numbers in names count as numbers.
     background : tuple of int
-        Labels that are no objects, besides 0. Default: those with most of their readings on the support plane.
+        Labels that are background, in addition to 0. By default, those with most of their readings on the support
+        plane.
     """
 
     frames: tuple[str | int, ...] = ()
@@ -104,7 +105,7 @@ _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "ca
 class Redwood(VideoFormat):
     """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics: Redwood, Open3D, many recorders.
 
-    Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
+    Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix``, column by column. ``camera_info.yaml`` is a message or a calibration file of ROS.
     Images are paired by the first number in their names, or by time if these are time stamps. Depth is PNG or TIFF of
@@ -116,11 +117,11 @@ class Redwood(VideoFormat):
     Parameters
     ----------
     depth_scale : float
-        Metres per unit of integer depth. Default: from the file of intrinsics, else 0.001.
+        Metres per unit of integer depth. By default from the file of intrinsics, or else 0.001.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3. Default: from the file of intrinsics, else none.
+        OpenCV's k1, k2, p1, p2, k3. By default from the file of intrinsics, or else none.
     fps : float
-        Frames per second, if names are no time stamps. Default: from the file of intrinsics, else 30.
+        Frames per second, if names are not time stamps. By default from the file of intrinsics, or else 30.
     tolerance_s : float
         Largest difference of the time stamps of a colour and a depth image of one frame.
     moving : bool
@@ -265,7 +266,7 @@ def _camera_info(text: str) -> dict[str, Any]:
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
-    """A number from 1 of the file of intrinsics."""
+    """A number from 1 from the file of intrinsics."""
     value = stored.get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
@@ -290,7 +291,7 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
 
 
 def _four(K: Any) -> tuple[float, ...]:
-    """fx, fy, cx, cy of these four numbers, or of the nine of a 3 x 3 matrix."""
+    """fx, fy, cx, cy from these four numbers, or from the nine of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:
         return tuple(values.ravel().tolist())
@@ -317,9 +318,9 @@ def _trajectory(path: Path, n: int) -> list[RigidTransform]:
 
 @dataclass(frozen=True)
 class Tum(VideoFormat):
-    """TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt if the camera moves; K must be given.
+    """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. K must be given.
 
-    Lines of rgb.txt and depth.txt are ``timestamp filename``, those of groundtruth.txt
+    Lines of rgb.txt and depth.txt are ``timestamp filename``. Lines of groundtruth.txt are
     ``timestamp tx ty tz qx qy qz qw``. Depth is in units of 1/5000 m. Format: Sturm et al. 2012.
 
     Further parameters: `VideoFormat`.
@@ -393,7 +394,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 
 
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
-    """Camera poses at given times: those of the nearest lines."""
+    """Camera poses at given times, taken from the nearest lines."""
     try:
         rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
         if not np.isfinite(rows).all():
