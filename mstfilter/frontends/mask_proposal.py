@@ -1,13 +1,13 @@
-"""Hypotheses and boundary maps from instance masks that another program made.
+"""Hypotheses and boundary maps from instance masks of another program.
 
 >>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
 
-`mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region,
-drawn by its weight and independently of the other regions, and a cut of the tree of its masks. Combinations are not
-enumerated: the work is that of the alternatives that are drawn, and each distinct mask is completed once.
+`mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region and a
+cut of the tree of its masks. Alternatives are drawn by weight, independently for each region. Combinations are not
+enumerated. Only drawn alternatives cost time, and each distinct mask is completed once.
 
-The same masks can be boundaries of a segmentation tree:
+The same masks can also be boundaries of a segmentation tree:
 
 >>> overrides = "proposal.boundary=mask_folder", "proposal.boundary.folder=masks", "proposal.tree=ucm"
 >>> filter = mstfilter.preset("mst", *overrides)
@@ -50,9 +50,9 @@ class MaskProposal(Proposal, UsesFiles):
     folder : str
         The folder of masks.
     sampler : CutSampler
-        Draws the level of nested masks. At temperature 1 it has the law of `mstfilter.frontends.mask_trees`.
+        Draws the level of nested masks. At temperature 1 it has the distribution of `mstfilter.frontends.mask_trees`.
     objects : ObjectRule
-        Decides which masks are objects. Other masks, such as that of the table, are background; if they contain
+        Decides which masks are objects. Other masks, such as that of the table, are background. If they contain
         masks, their parts are always used.
     completer : Completer
     threshold : float
@@ -113,13 +113,13 @@ class MaskProposal(Proposal, UsesFiles):
 
 
 def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np.ndarray:
-    """Probabilities (N,) to stop, 0 at masks that contain masks and are no object, such as that of the table."""
+    """Probabilities (N,) to stop, which are 0 at masks that contain masks and are not objects, such as the table."""
     inner = np.arange(tree.n_nodes) >= tree.n_leaves
     return np.where(inner & ~is_object, 0.0, stop)
 
 
 def _number(content: bytes) -> int:
-    """A number of 62 bits that names a content in random streams."""
+    """A number of 62 bits that identifies a content in random streams."""
     return int.from_bytes(content_key(content)[:8], "big") >> 2
 
 
@@ -127,9 +127,9 @@ def _number(content: bytes) -> int:
 class MaskBoundary(ClipBoundary, UsesFiles):
     """The probability that a segmentation drawn from a folder of masks has a border at a pixel.
 
-    The law is that of `MaskProposal` with `ExactCuts` at temperature 1. Borders are borders of masks, so they do not
-    have the statistics of image gradients. Combine the model with the tree ``ucm``, not with ``learned``, whose
-    weights were fitted to `ColourDepthBoundary`.
+    The distribution is that of `MaskProposal` with `ExactCuts` at temperature 1. The borders are borders of masks, so
+    they do not have the statistics of image gradients. Combine the model with the tree ``ucm``. The weights of the
+    tree ``learned`` were fitted to `ColourDepthBoundary`.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class MaskBoundary(ClipBoundary, UsesFiles):
     objects : ObjectRule
         Decides which masks are objects, as in `MaskProposal`.
     other : BoundaryModel, optional
-        A second model; the result is the maximum of both.
+        A second model. The result is the maximum of both models.
     """
 
     folder: str = ""
@@ -153,7 +153,7 @@ class MaskBoundary(ClipBoundary, UsesFiles):
         MaskProposal(self.folder).check_files(recording)
 
     def at(self, clip: Clip) -> MaskBoundary:
-        """The model with the masks of the pause that the clip ends at."""
+        """The model with the masks of the pause at the end of the clip."""
         bound = copy.copy(self)
         masks = read_masks(self.folder, clip.index, clip.after.depth.shape, clip.after.rgb)
         other = self.other.at(clip) if isinstance(self.other, ClipBoundary) else self.other
@@ -179,7 +179,7 @@ class MaskBoundary(ClipBoundary, UsesFiles):
 
 
 def border_probability(regions: Iterable[MaskRegion], frame: Frame, objects: ObjectRule) -> np.ndarray:
-    """(H, W) probability of a border between a pixel and one of its four neighbours, the largest of the four."""
+    """(H, W) largest probability of a border between a pixel and one of its four neighbours."""
     shape = frame.depth.shape
     joined = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
     for region in regions:
@@ -201,7 +201,7 @@ def border_probability(regions: Iterable[MaskRegion], frame: Frame, objects: Obj
 
 
 def _split_probability(tree: Tree, stop: np.ndarray) -> np.ndarray:
-    """(N,) probability that a walk goes below the node, if it stops with probabilities `stop` (N,)."""
+    """(N,) probability that a walk continues below the node, if it stops with probabilities `stop` (N,)."""
     below = np.ones(tree.n_nodes)
     for node in range(tree.n_nodes - 1, -1, -1):
         above = 1.0 if node == tree.root else below[tree.parent[node]]
@@ -219,7 +219,7 @@ class MaskGenerator(Protocol):
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
     """Run a mask generator on the last frame of each clip, and write its masks as nested sets.
 
-    `share` is that of `nested_masks`.
+    `share` is the argument of `nested_masks`.
     """
     for clip in clips:
         found = generator.generate(clip.after.rgb.copy())

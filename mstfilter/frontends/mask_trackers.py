@@ -1,14 +1,15 @@
-"""Trackers of masks for the motion rules, through packages of their authors: SAM 2, EdgeTAM and Cutie.
+"""Trackers of masks for the motion rules, by the packages of their authors: SAM 2, EdgeTAM and Cutie.
 
 >>> overrides = "transition.tracker=sam2", "transition.tracker.checkpoint=sam2.1_hiera_tiny.pt"
 >>> filter = mstfilter.preset("mst", *overrides)
 
-A tracker follows the masks of all distinct segments to the last frame of a clip. The motion rules then look for the
-object there, in place of where the optical flow leads (paper, section IV-C).
+A tracker follows the masks of all distinct segments to the last frame of a clip. The motion rules then search for the
+object in these masks instead of the end points of the optical flow (paper, section IV-C).
 
-SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package of
-the same name and interface. Cutie: Cheng et al., CVPR 2024, https://github.com/hkchengrex/Cutie (MIT). The user
-supplies package and checkpoint. The adapters were checked with stand-ins of the packages, not with the packages.
+SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package
+with the same name and interface. Cutie: Cheng et al., CVPR 2024, https://github.com/hkchengrex/Cutie (MIT). The user
+supplies the package and the checkpoint. The adapters were tested with substitutes for the packages, not with the
+packages.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class PackageTracker(MaskTracker, UsesFiles):
     step : int
         Every `step`-th frame is used, and the last one.
     sha256 : str
-        Expected hash of the file; empty: not compared.
+        Expected hash of the file; if empty, it is not compared.
     """
 
     checkpoint: str = ""
@@ -66,7 +67,7 @@ class PackageTracker(MaskTracker, UsesFiles):
 
     @abstractmethod
     def loaded(self) -> Any:
-        """What the package makes of the checkpoint."""
+        """The object that the package loads from the checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Sam2Tracker(PackageTracker):
     """The video predictor of the package ``sam2`` (SAM 2, or EdgeTAM, whose package has the same name).
 
     All masks are tracked together, with one pass of the image encoder for each frame. `config` is the name of the
-    configuration of the checkpoint in the package. Further parameters: `PackageTracker`.
+    checkpoint's configuration in the package. Further parameters: `PackageTracker`.
     """
 
     config: str = "configs/sam2.1/sam2.1_hiera_t.yaml"
@@ -106,7 +107,7 @@ class Sam2Tracker(PackageTracker):
 
 @lru_cache(maxsize=1)
 def _load_sam2(config: str, checkpoint: str, digest: str, device: str) -> Any:
-    """The video predictor; the last one is kept."""
+    """The video predictor. The last one is cached."""
     build = imported("sam2.build_sam", _SAM2).build_sam2_video_predictor
     return build(config, checkpoint, device=device)
 
@@ -120,7 +121,9 @@ def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class CutieTracker(PackageTracker):
-    """The package ``cutie``. Masks that do not overlap are tracked together; every frame is encoded once.
+    """The tracker of the package ``cutie``.
+
+    Masks that do not overlap are tracked together, and every frame is encoded once.
 
     Parameters: `PackageTracker`.
     """
@@ -163,7 +166,7 @@ class CutieTracker(PackageTracker):
 
 @lru_cache(maxsize=1)
 def _load_cutie(checkpoint: str, digest: str, device: str) -> tuple[Any, Any]:
-    """Network and configuration as the package's own default, without its download; the last one is kept."""
+    """Network and configuration with the package's defaults, without its download. The last one is cached."""
     module = imported("cutie.model.cutie", _CUTIE)
     hydra, omegaconf = imported("hydra", _CUTIE), imported("omegaconf", _CUTIE)
     import torch
@@ -180,7 +183,7 @@ def _load_cutie(checkpoint: str, digest: str, device: str) -> tuple[Any, Any]:
 
 
 def disjoint_groups(masks: Sequence[np.ndarray]) -> list[list[int]]:
-    """Numbers of the masks that have pixels, in groups without common pixels; each mask joins the first that fits."""
+    """Numbers of the non-empty masks, in groups without common pixels. Each mask joins the first suitable group."""
     groups: list[list[int]] = []
     unions: list[np.ndarray] = []
     for k, mask in enumerate(masks):
