@@ -5,8 +5,8 @@
 >>> OccupiedComponents()               # connected components of the occupied space
 >>> ImageComponents()                  # connected components of the image above the table
 
-The floors use the pixels above the table and the completer, but no segmentation. A method must score better than
-they do.
+The floors use the pixels above the table and the completer, but no segmentation. A useful method must score better
+than the floors.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from mstfilter.smc import Population, Proposal, child
 
 @dataclass(frozen=True)
 class FirstPause(Proposal):
-    """The samples of another proposal at the first pause; afterwards hypotheses without objects.
+    """The samples of another proposal at the first pause, and later hypotheses without objects.
 
-    The inner proposal has the random stream that it would have without this wrapper.
+    The inner proposal keeps the random stream that it has without this wrapper.
     """
 
     proposal: Proposal = field(default_factory=TreeCutProposal)
@@ -43,7 +43,7 @@ class FirstPause(Proposal):
 
 @dataclass(frozen=True)
 class OneBlob(Proposal):
-    """One object: everything above the table, completed; voxels of probability `threshold` or more are occupied."""
+    """One object of everything above the table, completed. Voxels of probability `threshold` or more are occupied."""
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
@@ -58,7 +58,7 @@ class OneBlob(Proposal):
 
 @dataclass(frozen=True)
 class OccupiedComponents(Proposal):
-    """Connected components of at least `min_voxels` voxels of the occupied space; other fields as in `OneBlob`."""
+    """Connected components of the occupied space with at least `min_voxels` voxels; other fields as in `OneBlob`."""
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
