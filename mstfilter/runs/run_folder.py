@@ -1,4 +1,4 @@
-"""The folder of a run, written pause by pause. Reports read it, and a run that was stopped resumes from it.
+"""The folder of a run, written pause by pause. Reports read this folder, and an interrupted run resumes from it.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
@@ -16,10 +16,10 @@ Layout::
     metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
     compare/without-past     run folders of other filters on the same recording, if asked for
 
-A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one, which contains the step, the
-seed and a hash of run.json. Its arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same
-seed gives the same bytes in all files except seconds.json.
+A pause is written under a temporary name and renamed when it is complete. So an interrupted run has only complete
+pauses. `filter_recording` resumes from state.npz of the last pause, which contains the step, the seed and a hash of
+run.json. Its arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same
+bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class _RecordingEntry(BaseModel):
 
 
 class _RunFile(BaseModel):
-    """What readers use of run.json."""
+    """The parts of run.json that readers use."""
 
     format: Literal[2]
     status: str
@@ -121,7 +121,7 @@ class _RunFile(BaseModel):
 
 
 class _InfoFile(BaseModel):
-    """What readers use of info.json."""
+    """The parts of info.json that readers use."""
 
     t: int
     n: int
@@ -191,7 +191,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
-        """A new run folder that holds only its description."""
+        """A new run folder that contains only its description."""
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
@@ -204,7 +204,7 @@ class RunFolder:
         return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
 
     def check(self) -> RunFolder:
-        """Read every file of the run and of those that it is compared with, before work with them starts.
+        """Read every file of the run and of its comparison runs, before work with them starts.
 
         Raises InputError if a file is missing or damaged, or files of a pause do not belong together.
         """
@@ -245,7 +245,7 @@ class RunFolder:
 
     @property
     def key(self) -> str:
-        """A hash of run.json without the status; the states of the run contain it."""
+        """A hash of run.json without the status. The states of the run contain it."""
         kept = {name: value for name, value in self.description.items() if name != "status"}
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -271,7 +271,7 @@ class RunFolder:
         questions: Questions | None = None,
         instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, and of the pause, if known: true labels, questions, true label image.
+        """Write the results of a step, and of the pause if known: true labels, questions, true label image.
 
         An interrupted call writes nothing.
         """
@@ -299,7 +299,7 @@ class RunFolder:
             write_json(folder / "seconds.json", info.seconds)
 
     def check_replaceable(self) -> None:
-        """Raise InputError if the folder contains files that no run writes."""
+        """Raise InputError if the folder contains files that are not part of a run."""
         if others := other_files(self.path, RUN_FILES):
             raise InputError(
                 f"run folder {self.path} cannot be replaced: it holds {others[0]}, which is not of a run",
@@ -307,14 +307,14 @@ class RunFolder:
             )
 
     def damage(self) -> list[str]:
-        """What is wrong with files of the run: those that differ from their hashes, and states of another run."""
+        """Faults of the files of the run: files that differ from their hashes, and states of another run."""
         found = damaged_files(self.path) if self.description["status"] == "done" else []
         for t in range(self.n_pauses):
             found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t)) or self._foreign(t)]
         return found
 
     def _foreign(self, t: int) -> list[str]:
-        """In what the state of a pause differs from one of this run."""
+        """The difference between the state of a pause and a state of this run."""
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"), np.load(path, allow_pickle=False) as data:
             head = json.loads(str(data["head"]))
@@ -327,9 +327,9 @@ class RunFolder:
         ]
 
     def repair(self) -> None:
-        """Prepare the folder for resuming: remove what a killed process left, and damaged pauses with a warning.
+        """Prepare the folder for resuming. Remove remains of a killed process, and damaged pauses with a warning.
 
-        All pauses after a damaged one are removed. Raises InputError if a pause belongs to another run.
+        All pauses after a damaged pause are also removed. Raises InputError if a pause belongs to another run.
         """
         sweep(self.path)
         sweep(self.path / "pauses")
@@ -358,7 +358,7 @@ class RunFolder:
         return self._read(self.pause(t) / "seconds.json", _SecondsFile)
 
     def instance(self, t: int) -> np.ndarray | None:
-        """True label image (H, W) at a pause, 255 for the robot; None if it is not known."""
+        """True label image (H, W) at a pause, with 255 for the robot; None if unknown."""
         path = self.pause(t) / "instance.png"
         return read_labels(path) if path.is_file() else None
 
@@ -402,7 +402,7 @@ class RunFolder:
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed.
 
-        It is kept in `scene_cache`: a report asks for it many times.
+        It is kept in `scene_cache`, since a report uses it many times.
         """
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"):
