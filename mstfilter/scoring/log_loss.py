@@ -1,27 +1,27 @@
-"""What a weighted set of hypotheses knows: scores of its answers to `questions`.
+"""Scores of the probabilities of a weighted set of hypotheses: scores of its answers to `questions`.
 
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t), object_status(recording, t))
 >>> belief.row["brier"], belief.row["energy"]                  # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses of labels alone have no
-uncertainty of shape, so noise at their borders makes forecasts less sure where they are often wrong. Recalibration
-removes this. Forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log
-loss in nats; lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster
-that adds such noise itself gains nothing (`experiments/information` shows it for all methods), and forecasters are
-compared by what they distinguish. Noise of another kind, or more of it than the largest rate, can still help a
-little.
+**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses that consist only of labels
+have no uncertainty of shape. Noise at their borders makes forecasts less certain where they are often wrong.
+Recalibration removes this effect. Forecasts are recalibrated by isotonic regression, fitted to other scenes. The
+score is the mean log loss in nats; lower is better. Noise at the border is added if it lowers the loss on the other
+scenes. So a forecaster that adds such noise itself gains nothing (`experiments/information` shows this for all
+methods). Forecasters are compared by what they distinguish. Noise of another kind, or at a higher rate than the
+largest one, can still give a small gain.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 
     ES = sum_i w_i d(h_i, y) - 1/2 sum_ij w_i w_j d(h_i, h_j)
 
-It is proper, and it is never shown without its floor. The floor is the score of the same hypotheses with one draw of
-noise at the border of each, at the rate that is best on other scenes.
+This score is proper. It is never shown without its floor. The floor is the score of the same hypotheses with one draw
+of noise at the border of each, at the rate that is best on other scenes.
 
-Counts of forecasts and outcomes are kept by category of the question, so that losses can be split. A split is a
-description: taken alone it is no proper score, because the truth decides which questions belong to it.
+Counts of forecasts and outcomes are stored by category of the question, so that losses can be split. A split loss is
+only a description. It is not a proper score, because its questions depend on the truth.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class BeliefScore(NamedTuple):
 
     @property
     def base_rate_loss(self) -> float:
-        """Log loss, in nats, of the forecast that gives all questions the share of those that are true."""
+        """Log loss, in nats, of a constant forecast that equals the share of true questions."""
         table = forecast_table(self.counts[0].astype(np.int64))
         if not table.n:
             return float("nan")
@@ -98,7 +98,7 @@ def score_belief(
         Sum 1.
     truth : (X, Y, Z) int
     status : mapping, optional
-        True label -> visible, hidden or unseen. Default: all count as visible.
+        True label -> visible, hidden or unseen. By default, all objects count as visible.
     """
     weights = np.asarray(weights, dtype=np.float64)
     if len(hypotheses) != len(weights) or not len(hypotheses):
@@ -156,7 +156,7 @@ def _categories(questions: Questions, truth: np.ndarray, status: Mapping[int, St
 
 
 def forecast_table(counts: np.ndarray, categories: Sequence[str] = CATEGORIES) -> ForecastTable:
-    """The forecasts and outcomes of counts (1001, 7), of all or of some categories."""
+    """The forecasts and outcomes of counts (1001, 7), for all or some categories."""
     chosen = np.isin(CATEGORIES, categories)
     no, yes = counts[:, chosen & ~_SAME].sum(axis=1), counts[:, chosen & _SAME].sum(axis=1)
     kept = no + yes > 0
@@ -165,7 +165,7 @@ def forecast_table(counts: np.ndarray, categories: Sequence[str] = CATEGORIES) -
 
 @dataclass(frozen=True, eq=False)
 class FittedForecasts:
-    """How to read the forecasts of a method: with noise at the border, and recalibrated.
+    """A fitted transformation of the forecasts of a method: noise at the border, and recalibration.
 
     Parameters
     ----------
@@ -179,14 +179,14 @@ class FittedForecasts:
 
     @classmethod
     def fit(cls, counts: np.ndarray) -> FittedForecasts:
-        """Fit to counts (r, 1001, 7): the rate of least log loss after recalibration."""
+        """Fit to counts (r, 1001, 7), with the rate of least log loss after recalibration."""
         tables = [forecast_table(one) for one in counts]
         fits = [Recalibration.fit(table) for table in tables]
         best = int(np.argmin([fit.log_loss(table) for fit, table in zip(fits, tables, strict=True)]))
         return cls(NOISE_RATES[best], fits[best])
 
     def log_loss(self, counts: np.ndarray, categories: Sequence[str] = CATEGORIES) -> float:
-        """Mean log loss in nats of counts (r, 1001, 7); NaN if there are no such questions."""
+        """Mean log loss in nats of counts (r, 1001, 7); NaN without questions."""
         return self.recalibration.log_loss(forecast_table(counts[NOISE_RATES.index(self.rate)], categories))
 
     def row(self, counts: np.ndarray) -> dict[str, float]:
@@ -196,9 +196,9 @@ class FittedForecasts:
 
 
 def leave_one_out(counts: Mapping[Any, np.ndarray]) -> dict[Any, FittedForecasts]:
-    """For each scene, what is fitted to all others; `counts` maps a scene to counts (r, 1001, 7).
+    """For each scene, the fit to all other scenes. `counts` maps a scene to counts (r, 1001, 7).
 
-    Scenes without questions in the others are left out.
+    Scenes are omitted if the other scenes have no questions.
     """
     total = sum((one.astype(np.int64) for one in counts.values()), np.zeros(1, np.int64))
     return {scene: FittedForecasts.fit(rest) for scene, one in counts.items() if (rest := total - one).any()}
