@@ -6,12 +6,12 @@
 
 Layout of an exported run::
 
-    objects.csv                          pause, hypothesis, weight, label, id, birth, voxels, colour
-    pause_000/hypothesis_000.ply         meshes of all objects; world metres
-    pause_000/hypothesis_000.png         label of the object at each pixel, 0 for none
+    objects.csv pause, hypothesis, weight, label, id, birth, voxels, colour pause_000/hypothesis_000.ply meshes of all
+    objects; world metres pause_000/hypothesis_000.png label of the object at each pixel, 0 for none
 
-Vertices have the colour of their object in the report. Objects share no vertices. A hypothesis without objects has
-no mesh file. In PLY and OBJ the z axis points up as in the recording; in GLB the y axis does, as glTF requires.
+Vertices have the colour of their object in the report. Objects do not share vertices. A hypothesis without objects
+has no mesh file. In PLY and OBJ the z axis points up as in the recording. In GLB the y axis points up, as glTF
+requires.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _CORNERS = {
 
 
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, not empty, and all other voxels.
+    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, which is not empty, and all other voxels.
 
     Returns corners (v, 3) int in voxels from the lower corner of the grid, and triangles (f, 3) int,
     counter-clockwise seen from outside.
@@ -65,8 +65,8 @@ def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def hypothesis_mesh(hypothesis: Hypothesis, colours: Mapping[int, Colour] | None = None) -> Any:
     """Meshes of all objects of a hypothesis as one ``open3d.geometry.TriangleMesh``, in world metres.
 
-    The triangles are the faces of the voxels; the mesh of an object encloses exactly the volume of its voxels.
-    `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. Raises MissingLibraryError if
+    The triangles are the faces of the voxels. The mesh of an object encloses exactly the volume of its voxels.
+    `colours` is ``{label: (r, g, b)}``. The default is the palette in order of labels. Raises MissingLibraryError if
     open3d cannot be imported.
     """
     o3d = import_open3d()
@@ -87,9 +87,9 @@ def _voxel_mesh(o3d: Any, mask: np.ndarray, grid: VoxelGrid) -> Any:
 
 
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write the mesh of a hypothesis that has objects; the ending of `path` (ply, obj, glb) chooses the format.
+    """Write the mesh of a hypothesis that has objects. The ending of `path` (ply, obj, glb) selects the format.
 
-    `colours` are those of `hypothesis_mesh`.
+    `colours` are as in `hypothesis_mesh`.
     """
     path, o3d = Path(path), import_open3d()
     mesh = hypothesis_mesh(hypothesis, colours)
@@ -108,7 +108,7 @@ def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, 
 
 
 def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply") -> list[Path]:
-    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, as laid out above.
+    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, in the layout above.
 
     Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
     imported. `mesh_format` is "ply", "obj" or "glb".

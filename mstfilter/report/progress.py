@@ -36,7 +36,7 @@ def _bars() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
-    """A progress bar; yields ``advance(done, total)``, where `total` is None if it is not known."""
+    """A progress bar. Yields ``advance(done, total)``, where `total` is None if it is unknown."""
     with _bars() as bars:
         task = bars.add_task(what, total=None)
 
@@ -49,7 +49,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Bars of the parts of a study; yields the function for its events. Failures are printed above the bars."""
+    """Bars of the parts of a study. Yields the function for its events. Failures are printed above the bars."""
     tasks: dict[str, Any] = {}
     with _bars() as bars:
 

@@ -1,9 +1,9 @@
-"""The numbers of a run and what they say, in sentences: for its report and the command line.
+"""The numbers of a run, and sentences about them, for the report and the command line.
 
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
 >>> numbers.summary, numbers.tiles, numbers.steps[-1].mean
 
-They are read from the run folder alone, of a finished or an interrupted run.
+They are read from the run folder alone. The run may be finished or interrupted.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class PauseNumbers:
 
     @property
     def distinct_text(self) -> str:
-        """How many hypotheses are distinct, in words."""
+        """Number of distinct hypotheses, in words."""
         if self.n_distinct == len(self.weights):
             return "all distinct"
         return "all the same" if self.n_distinct == 1 else f"{self.n_distinct} distinct"
@@ -111,7 +111,7 @@ class PauseNumbers:
         return self.info["parents"].get(kind)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
-        """Notes of a component, without those that it only passed on from an earlier one."""
+        """Notes of a component, without those that it only passed on from an earlier component."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
         earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
         return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
@@ -153,22 +153,22 @@ class RunNumbers:
 
     @property
     def with_truth(self) -> list[int]:
-        """Pauses whose quality is known."""
+        """Pauses with known quality."""
         return [t for t, step in enumerate(self.steps) if step.quality is not None]
 
     @property
     def with_images(self) -> list[int]:
-        """Pauses whose quality is known in the image only."""
+        """Pauses with known quality in the image only."""
         return [t for t, step in enumerate(self.steps) if step.image_score is not None]
 
     @property
     def compared(self) -> list[str]:
-        """Names of the compared runs whose quality is known."""
+        """Names of the compared runs with known quality."""
         return list(dict.fromkeys(name for step in self.steps for name in step.compared))
 
     @property
     def value_of_the_past(self) -> list[str]:
-        """What the filter gains over the latest image alone, in a sentence; empty without such a run or truth."""
+        """The gain of the filter over the latest image alone, in a sentence; empty without such a run or truth."""
         name = "single frame"
         known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
         if not known:
@@ -231,7 +231,7 @@ class RunNumbers:
 
     @property
     def reasons(self) -> list[str]:
-        """Why the quality of the last pause with ground truth is what it is, in sentences."""
+        """Reasons for the quality of the last pause with ground truth, in sentences."""
         if not self.with_truth:
             return []
         step = self.steps[self.with_truth[-1]]
@@ -259,7 +259,7 @@ class RunNumbers:
 
     @property
     def tiles(self) -> list[tuple[str, str, str]]:
-        """Key numbers of the last pause: name, value, remark."""
+        """Main numbers of the last pause: name, value, remark."""
         if not self.steps:
             return []
         last = self.steps[-1]
@@ -297,7 +297,7 @@ def _count(n: int, one: str, several: str = "") -> str:
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
-    """Numbers of a run folder; without `beliefs`, the log losses are left out, which take the most time."""
+    """Numbers of a run folder. Without `beliefs`, the log losses are omitted, since they take the most time."""
     description = run.description
     times = description["recording"]["times"]
     steps = []

@@ -1,4 +1,4 @@
-"""Scenes in three dimensions: pages that any browser opens, and files of the viewer rerun.
+"""Scenes in three dimensions: pages that any browser opens, and files for the viewer rerun.
 
 >>> run_page("runs/demo").save("run.html")             # one file: time line, image, voxels, weights, genealogy, truth
 >>> recording_page(recording).save("recording.html")   # images and truth, or the surface that the camera sees
@@ -34,7 +34,7 @@ from mstfilter.scene import Camera, Hypothesis, Recording, occupied_box, project
 
 @dataclass(frozen=True)
 class ScenePage:
-    """A page with scenes that can be rotated; a notebook shows it in place."""
+    """A page with scenes that can be rotated. A notebook shows it in place."""
 
     text: str  #: HTML, self-contained
     title: str
@@ -46,7 +46,7 @@ class ScenePage:
         return self.frame(460)
 
     def frame(self, height: int) -> str:
-        """The page as a frame of another page, `height` pixels high. Its script cannot reach that page."""
+        """The page as a frame of another page, `height` pixels high, whose script cannot access the other page."""
         style = f'width="100%" height="{height}" style="border:0" sandbox="allow-scripts"'
         return f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.text)}" {style}></iframe>'
 
@@ -66,7 +66,7 @@ def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
 
 
 def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
-    """All pauses of a run as a page; without `photos` voxels only, without `head` no title."""
+    """All pauses of a run as a page; without `photos` only voxels, without `head` no title."""
     run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     description = run.description
     title = str(description["recording"]["name"])
@@ -106,7 +106,7 @@ def _page(
 
 
 def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
-    """A pause for the script of the page. Labels are runs (label, length) of the occupied box, 16 bits each."""
+    """A pause for the script of the page. Labels are runs (label, length) of the occupied box, with 16 bits each."""
     views = []
     for view in scene.views:
         hypothesis = view.hypothesis
@@ -141,7 +141,7 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
 
 
 def encode_runs(labels: np.ndarray) -> np.ndarray:
-    """Runs of equal labels in C order as rows (label, length), 16 bits each; long runs are split."""
+    """Runs of equal labels in C order as rows (label, length), with 16 bits each. Long runs are split."""
     flat = labels.ravel()
     if not len(flat):
         return np.zeros((0, 2), "<u2")
@@ -155,9 +155,9 @@ def encode_runs(labels: np.ndarray) -> np.ndarray:
 
 
 def save_rerun(source: RunFolder | Recording, path: str | Path) -> Path:
-    """Write a run or a recording as a file of rerun (.rrd), with the arrangement of its views.
+    """Write a run or a recording as a rerun file (.rrd), with the arrangement of its views.
 
-    Raises MissingLibraryError without the library rerun-sdk, InputError if the file cannot be written.
+    Raises MissingLibraryError without the library rerun-sdk, and InputError if the file cannot be written.
     """
     rr = import_rerun()
     check_output(Path(path))
@@ -177,8 +177,8 @@ def save_rerun(source: RunFolder | Recording, path: str | Path) -> Path:
 def show_rerun(path: str | Path) -> None:
     """Open a file in the viewer of rerun, and wait until its window is closed.
 
-    The viewer listens on 127.0.0.1 only, on a free port. Its analytics are off: rerun sends none where the variable
-    ``CI`` is set, which is set for the viewer alone.
+    The viewer listens only on 127.0.0.1, on a free port. Its analytics are off. rerun sends none if the variable
+    ``CI`` is set, which is set only for the viewer.
     """
     import_rerun()
     environment = {k: v for k, v in os.environ.items() if k != "FORCE_RERUN_ANALYTICS"} | {"CI": "1"}
@@ -209,7 +209,7 @@ def _entities(scene: ShownPause) -> dict[str, ShownHypothesis]:
 
 
 def _log_scenes(stream: Any, scenes: Sequence[ShownPause]) -> None:
-    """Images, labels in the image, voxels, weights and quality at the pauses; the genealogy."""
+    """Images, labels in the image, voxels, weights and quality at the pauses, and the genealogy."""
     rr = import_rerun()
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     identities = {i for scene in scenes for view in scene.views for i in view.identity.values()}
@@ -293,7 +293,7 @@ def _enclosed(labels: np.ndarray) -> np.ndarray:
 
 
 def _blueprint(scenes: Sequence[ShownPause]) -> Any:
-    """The image with the heaviest hypothesis, a view of each hypothesis, weights, genealogy."""
+    """The image with the heaviest hypothesis, a view of each hypothesis, weights, and genealogy."""
     rrb = import_rerun().blueprint
     names = list(dict.fromkeys(name for scene in scenes for name in _entities(scene)))
     first, image = names[0], "world/camera/image"
