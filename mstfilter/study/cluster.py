@@ -2,12 +2,13 @@
 
 >>> Cluster("tcp://head:8786").run(jobs, tell)
 
-The scheduler and its workers are neither started nor stopped here. All machines must see the study folder and the
+This module neither starts nor stops the scheduler and its workers. All machines must see the study folder and the
 cache under the same paths and have the same version of mstfilter. If a worker dies, the scheduler gives its job to
-another worker; after its ``allowed-failures`` (3) the job has failed. If a job exceeds its time limit, the process of
-its worker is restarted by the worker's nanny. If no worker is left for a while, an error ends the wait.
+another worker. After ``allowed-failures`` (3) deaths, the job has failed. If a job exceeds its time limit, the
+worker's nanny restarts the process of the worker. If no worker is left for a while, an error ends the wait.
 
-A worker sends the outcome of a job as an event, not as the value of the task: it remains if the worker dies later.
+A worker sends the outcome of a job as an event, not as the value of the task. So the outcome remains if the worker
+dies later.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ class Cluster(Executor):
     Parameters
     ----------
     address : str
-        For example ``tcp://head:8786``.
+        Address, for example ``tcp://head:8786``.
     connect_s : float
         Time limit in seconds for the first answer of the scheduler, and for its first worker.
     without_workers_s : float
-        `run` raises InputError if later the scheduler has no workers for this time in seconds.
+        `run` raises InputError if the scheduler later has no workers for this time in seconds.
     """
 
     address: str
@@ -57,7 +58,7 @@ class Cluster(Executor):
             return _ClusterRun(client, jobs, tell, self.without_workers_s).run()
 
     def _warn_without_tls(self) -> None:
-        """Warn if the scheduler is on another host and the connection has no TLS: who reaches it can run code."""
+        """Warn if the scheduler is on another host without TLS, since any program that reaches it can run code."""
         protocol, _, rest = self.address.rpartition("://")
         host = rest.rpartition(":")[0].strip("[]")
         if protocol not in ("tls", "wss", "inproc") and host not in ("localhost", "::1") and host[:4] != "127.":
@@ -143,7 +144,7 @@ class _ClusterRun:
             self._running[k] = (message["started"], time.monotonic())
 
     def _end_without_outcome(self, k: int, future: Any) -> None:
-        """End or repeat a job whose task is done and which has sent no outcome."""
+        """End or repeat a job whose task is done without an outcome."""
         from distributed import KilledWorker
 
         if future.status in ("cancelled", "lost"):
@@ -169,7 +170,7 @@ class _ClusterRun:
         self._tell(Event("ended", k, outcome=outcome))
 
     def _check_workers_left(self) -> None:
-        """Forget what ran on workers that are gone; raise InputError if there have been no workers for too long."""
+        """Drop jobs of workers that are gone. Raise InputError if there have been no workers for too long."""
         try:
             workers = self._client.nthreads()
         except OSError:  # the connection is lost, and distributed cancels all futures
@@ -207,7 +208,7 @@ class _ClusterRun:
 
 
 def _check_workers(client: Any, timeout_s: float) -> None:
-    """Wait for a worker. Raise InputError if none comes, or if one has several threads or another version."""
+    """Wait for a worker. Raise InputError if none comes, or if a worker has several threads or another version."""
     from mstfilter import __version__
 
     try:  # workers may be starting, or starting again after an earlier job

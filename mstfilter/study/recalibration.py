@@ -1,10 +1,10 @@
-"""The recalibrated log loss of the runs of a study: the forecasts of a scene are recalibrated on other scenes.
+"""The recalibrated log loss of the runs of a study. The forecasts of a scene are recalibrated on other scenes.
 
 >>> add_log_loss(rows, counts)            # adds recalibrated_log_loss, recalibrated_log_loss_same, ..., energy_floor
 >>> fitted = fit_recalibration(rows, counts, [("s1", "mst")])  # to score the scenes of another study
 
-Recalibration and the floor of the energy score need other scenes of the same family and arm. They are those of the
-study without the scene itself, or those that a recalibration was fitted to. Filter seeds of one scene are never on
+Recalibration and the floor of the energy score need other scenes of the same family and arm. These are the other
+scenes of the study, or the scenes to which a given recalibration was fitted. Filter seeds of one scene are never on
 both sides.
 """
 
@@ -26,7 +26,7 @@ Counts = Callable[[str, str], Mapping[tuple[str, Any], np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """What other scenes say: how to read forecasts, and the best rate of noise for the energy score."""
+    """The fit to other scenes: a transformation of forecasts, and the best rate of noise for the energy score."""
 
     forecasts: FittedForecasts
     energy_rate: float
@@ -57,8 +57,8 @@ def add_log_loss(
         One row per pause with family, scene, arm, seed, pause and ``energy_noise``.
     counts : callable
     fitted : mapping, optional
-        As `fit_recalibration` returns it. Default: each scene is scored by the other scenes of its family, which
-        needs at least two scenes.
+        A recalibration from `fit_recalibration`. By default, the other scenes of its family are used for each scene,
+        so at least two scenes are needed.
     """
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -81,7 +81,7 @@ def add_log_loss(
 def fit_recalibration(
     rows: Sequence[Mapping[str, Any]], counts: Counts, arms: Sequence[tuple[str, str]]
 ) -> dict[str, dict[str, Any]]:
-    """Fit each family and arm to all its scenes: family -> arm -> plain values, with the names of the scenes."""
+    """The fit of each family and arm to all its scenes: family -> arm -> plain values, with scene names."""
     found: dict[str, dict[str, Any]] = defaultdict(dict)
     for family, arm in arms:
         own = [row for row in rows if (row["family"], row["arm"]) == (family, arm)]
