@@ -15,13 +15,13 @@ The studies use the families `s1`, `s2` and `s3`. A scene can also be simulated 
 
 A filter that decides what is pushed next runs with a `PushLoop`.
 
-The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (what defines a scene), `world`
+The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (definition of scenes), `world`
 (MuJoCo physics, pushes), `printing` and `textures` (appearance). Above them are `arrangement` (placement), `layers`
 and `renderer` (images by ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
 
 The simulation lacks camera motion, glossy and transparent surfaces, light reflected between objects, articulated and
-soft objects, and a hand. Depth noise, the shadow of the projector and losses at edges are calibrated to real frames;
-within surfaces, noise is not correlated between pixels.
+soft objects, and a hand. Depth noise, the shadow of the projector and losses at edges are calibrated to real frames.
+Within surfaces, noise is not correlated between pixels.
 """
 
 from mstfilter.lazy import attach

@@ -1,9 +1,9 @@
-"""Rays of the renderer and the light that they meet, updated only where something moved.
+"""Rays of the renderer and the light at their end points, updated only where something moved.
 
-`Stage` holds the poses that are rendered. `PixelRays` casts one ray through each pixel and keeps what it meets.
-`LightMap` holds light on the table. A ray's result holds until a body moves that the ray meets before or after. The
-light at a point holds, for each light source, until a body moves between them. Both are decided by conservative
-bounds (`solids.may_meet`), so the images equal those of casting every ray in every frame.
+`Stage` holds the poses that are rendered. `PixelRays` casts one ray through each pixel and stores what it hits.
+`LightMap` stores light on the table. The result of a ray is valid until a body moves that the ray hits before or
+after the motion. The light at a point from a light source is valid until a body moves between them. Both are decided
+by conservative bounds (`solids.may_meet`). So the images equal those of casting every ray in every frame.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ UNKNOWN = -2  #: Geom of a ray that has not been cast
 
 
 class Stage:
-    """The poses that are rendered: those of the physics without tremor.
+    """The poses that are rendered, which are those of the physics without tremor.
 
-    Soft contacts make bodies at rest move by micrometres between frames. A rendered pose is kept until a point of
-    the body is farther than `tolerance` metres from it. Images, poses and volumes all use the rendered poses, so they
-    agree exactly, and a body that has not moved need not be rendered again. The world is not changed.
+    Soft contacts make bodies at rest move by micrometres between frames. A rendered pose is kept until a point of the
+    body is farther than `tolerance` metres from it. Images, poses and volumes all use the rendered poses, so they
+    agree exactly. A body that has not moved is not rendered again. The world is not changed.
     """
 
     def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
@@ -81,7 +81,7 @@ class Stage:
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (k, 12) of all bodies that cast shadows, and capsules (k, 7) that contain them.
 
-        Equal rows of the first array are equal poses; see `solids.may_meet` for the second.
+        Equal rows of the first array are equal poses. `solids.may_meet` describes the second array.
         """
         model, data, n = self.world.model, self._data, len(self.poses)
         limbs = np.flatnonzero(self.world.geom_object == FINGER_ID)
@@ -114,10 +114,10 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 
 
 class LightMap:
-    """Mean of cosine times visibility of light sources (k, 3) on the table, on a raster with some spacing in metres.
+    """Mean of cosine times visibility of light sources (k, 3) on the table, on a raster with a spacing in metres.
 
-    A shadow on the table thus costs rays at the resolution of the raster, not of the image. `pixels` (n, 2) are the
-    points of the table that the camera shows.
+    So a shadow on the table costs rays at the resolution of the raster, not of the image. `pixels` (n, 2) are the
+    points of the table in the image.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray, pixels: np.ndarray) -> None:
@@ -133,7 +133,7 @@ class LightMap:
         self._pixels = self._locate(pixels)
 
     def update(self, stage: Stage, moved: np.ndarray) -> None:
-        """Cast shadow rays again where one of the capsules (k, 7) may be in the way."""
+        """Cast shadow rays again where one of the capsules (k, 7) may intersect them."""
         self._values[:] = 0
         for light, rays, cosine, dark in zip(self._lights, self._rays, self._cosine, self._dark, strict=True):
             which = np.flatnonzero(may_meet(moved, light, rays))
@@ -147,7 +147,7 @@ class LightMap:
         return self._interpolate(*self._pixels)
 
     def sample(self, xy: np.ndarray) -> np.ndarray:
-        """Bilinear values (n,) at points (n, 2) of the table; beyond the map the value at its border."""
+        """Bilinear values (n,) at points (n, 2) of the table. Beyond the map, the value at its border is used."""
         return self._interpolate(*self._locate(xy))
 
     def _locate(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +163,7 @@ class LightMap:
 
 
 class PixelRays:
-    """Rays from the camera at `eye` (3,), one per pixel, with what they meet among the geoms of some groups.
+    """Rays from the camera at `eye` (3,), one per pixel, with their hits among the geoms of some groups.
 
     `directions` (n, 3) have length 1 along the optical axis.
     """
@@ -186,10 +186,10 @@ class PixelRays:
         self._cosine = np.empty((len(self._lights), n), np.float32)
 
     def update(self, pixels: np.ndarray, moved: np.ndarray, limit: np.ndarray | None = None) -> None:
-        """Bring some pixels (m,) up to date and forget all others.
+        """Update some pixels (m,) and drop all others.
 
-        `moved` (k, 7) are capsules of bodies that moved since the last update, at their old and new poses, in metres.
-        Hits beyond the depth `limit` (n,) are ignored.
+        `moved` (k, 7) are capsules, in metres, of bodies that moved since the last update, at their old and new
+        poses. Hits beyond the depth `limit` (n,) are ignored.
         """
         other = np.ones(len(self.geom), bool)
         other[pixels] = False
@@ -207,7 +207,7 @@ class PixelRays:
         self._light(kept[self.is_body(kept)], moved)
 
     def instance(self, pixels: np.ndarray) -> np.ndarray:
-        """Instance id (k,) of what the rays meet, 0 for the room or nothing."""
+        """Instance id (k,) of the hits of the rays; 0 for the room or nothing."""
         geom = self.geom[pixels]
         return np.where(geom >= 0, self.stage.world.geom_object[np.maximum(geom, 0)], 0)
 
@@ -219,7 +219,7 @@ class PixelRays:
         return self.eye + self.directions[pixels] * self.depth[pixels, None]
 
     def _shade(self, pixels: np.ndarray) -> None:
-        """Albedo, smooth normal, highlight and bounced light of pixels on bodies; casts no rays."""
+        """Albedo, smooth normal, highlight and bounced light of pixels on bodies, without casting rays."""
         instance, geom = self.instance(pixels), self.geom[pixels]
         points, normal = self.points(pixels), self.normal[pixels]
         world, poses = self.stage.world, self.stage.poses
@@ -292,7 +292,7 @@ def _rotate(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Normals of a turned solid made of flat wedges, with the azimuth of the point instead of the facet's."""
+    """Normals of a turned solid made of flat wedges, with the azimuth of the point instead of the facet's azimuth."""
     if shape.print_as != "lathe" or len(shape.pieces) == 1:
         return normal
     radius = np.hypot(points[:, 0], points[:, 1])

@@ -1,4 +1,4 @@
-"""A simulated scene that is changed by chosen pushes: for filters that decide what the robot does next.
+"""A simulated scene that chosen pushes change, for filters that decide the next action of the robot.
 
 >>> from mstfilter import Belief, preset
 >>> from mstfilter.simulation import PushLoop, scene_family
@@ -9,8 +9,8 @@
 ...     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=50))
 ...     state, _ = mst.step(state, loop.play(push or pushes[0]))
 
-A policy chooses one of the candidates. It sees clips and beliefs; only scores use the truth. The scene and its
-candidates depend on the family, the seed and the pushes so far.
+A policy chooses one of the candidates. The policy gets clips and beliefs. Only scores use the truth. The scene and
+its candidates depend on the family, the seed and the pushes so far.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ class PushLoop:
     Parameters
     ----------
     family : SceneFamily
-        `n_actions` is ignored: any number of pushes can be played.
+        `n_actions` is ignored, since any number of pushes can be played.
     seed : int
 
     Attributes
     ----------
     clip : Clip
-        From the last pause to the present one; the observation of a step of a filter.
+        The clip from the last pause to the present pause, which is the observation of a filter step.
     effects : list of PushEffect
         The effect of every push.
     """
@@ -89,9 +89,9 @@ class PushLoop:
         return len(self.effects)
 
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
-        """n pushes towards objects, with a free place for the finger to come down; the scene is left unchanged.
+        """n pushes towards objects, with a free place for the finger to come down. The scene does not change.
 
-        They are drawn towards true objects, so most of them move something; some move nothing or drop an object.
+        They are drawn towards true objects, so most of them move something. Some move nothing or drop an object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)
@@ -107,7 +107,7 @@ class PushLoop:
         )
 
     def play(self, push: FingerPush) -> Clip:
-        """Play a push and record it; returns the clip from the last pause to the new one."""
+        """Simulate a push and record it. Returns the clip from the last pause to the new pause."""
         check_component("push", push, FingerPush)
         first = len(self._frames) - 1
         self.effects.append(self._scene.play(push, self._add_frame))
@@ -117,7 +117,7 @@ class PushLoop:
         return self.clip
 
     def effect(self, push: FingerPush) -> PushEffect:
-        """What a push would do; the scene is left unchanged. For oracles: a policy cannot know it."""
+        """The effect of a push, for oracles, since a policy cannot know it. The scene does not change."""
         saved = self._scene.world.save()
         try:
             return play_push(self._scene.world, push, self.family)
@@ -125,12 +125,12 @@ class PushLoop:
             self._scene.world.restore(saved)
 
     def save(self) -> LoopState:
-        """The present state, for `restore`: to try several pushes from it."""
+        """The present state for `restore`, for example to try several pushes from it."""
         kept = tuple(tuple(getattr(self, name)) for name in _LISTS)
         return LoopState(self._scene.world.save(), self._scene.stage.save(), kept, self.clip)
 
     def restore(self, state: LoopState) -> None:
-        """Return to a saved state of this loop; the same pushes then give the same images."""
+        """Return to a saved state of this loop. The same pushes then give the same images."""
         self._scene.world.restore(state.world)
         self._scene.stage.restore(state.stage)
         for name, values in zip(_LISTS, state.lists, strict=True):

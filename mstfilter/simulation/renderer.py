@@ -1,7 +1,7 @@
-"""Colour, depth and instance images by ray casting; needs no display, GPU or OpenGL.
+"""Colour, depth and instance images by ray casting, which needs no display, GPU or OpenGL.
 
-One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
-the textures. Between frames, rays are cast only where something moved (`layers`); the images equal those of casting
+One ray per pixel gives depth and instance. Colours come from the textures, and from a few shadow rays to a lamp and
+to the ceiling. Between frames, rays are cast only where something moved (`layers`). The images equal those of casting
 every ray.
 """
 
@@ -39,8 +39,8 @@ def visible_texel(camera: Camera) -> float:
 class Renderer:
     """Renders the current state of a world.
 
-    There is one skin for each object. `supersample` casts additional rays for pixels on edges. The rendered poses may
-    differ from the physics by `tolerance` metres; see `Stage`.
+    There is one skin (texture) for each object. `supersample` casts additional rays for pixels on edges. The rendered
+    poses may differ from the physics by `tolerance` metres; see `Stage`.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Renderer:
         self.forget()
 
     def forget(self) -> None:
-        """Cast all rays again at the next call of `render`, for the same images."""
+        """Cast all rays again at the next call of `render`, which gives the same images."""
         # Bodies at their first poses count as moved, so a ray that cannot meet any of them meets no body.
         self._poses = np.full_like(self._poses, np.nan)
         self._main.geom[:] = -1
@@ -117,7 +117,7 @@ class Renderer:
         return colour
 
     def _unshadowed_light(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Light (n, 3) on floor, wall and the rim of the table: no shadows, less with distance."""
+        """Light (n, 3) on floor, wall and the rim of the table, without shadows and decreasing with distance."""
         lamp = self.room.lamp.mean(axis=0)
         reach = np.linalg.norm(points - lamp, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -139,7 +139,7 @@ class Renderer:
         return both
 
     def render(self) -> View:
-        """Images of the world as it is now."""
+        """Images of the world in its present state."""
         h, w = self.camera.height, self.camera.width
         self.stage.follow()
         moved = self._moved_capsules()

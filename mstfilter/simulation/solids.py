@@ -1,7 +1,7 @@
-"""Convex pieces of objects, and a test which rays can meet the capsules around them.
+"""Convex pieces of objects, and a test whether rays can meet the capsules around them.
 
-A rigid object is a union of convex pieces. MuJoCo collides and ray-casts these pieces, and `Piece.inside` answers
-for the same solids, so images and true volumes agree.
+A rigid object is a union of convex pieces. MuJoCo uses these pieces for collisions and ray casting, and
+`Piece.inside` is for the same solids. So images and true volumes agree.
 
 >>> from mstfilter.simulation.solids import box
 >>> box((0.02, 0.03, 0.04)).inside([[0.0, 0.0, 0.039], [0.0, 0.0, 0.041]]).tolist()
@@ -134,7 +134,7 @@ def hull(vertices: ArrayLike) -> Piece:
 
 
 def _circle(sides: int) -> np.ndarray:
-    """Points (sides + 1, 2) of the unit circle; the last one repeats the first."""
+    """Points (sides + 1, 2) of the unit circle, where the last one repeats the first."""
     angle = np.arange(sides + 1) * (2.0 * np.pi / sides)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -149,7 +149,7 @@ def frustum(lower: tuple[float, float], upper: tuple[float, float], sides: int =
 def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Piece]:
     """The wall of a turned solid as convex wedges, `sides` in each layer.
 
-    The profile has (inner radius, outer radius, z) from bottom to top; neighbouring entries bound one layer.
+    The profile has (inner radius, outer radius, z) from bottom to top. Neighbouring entries bound one layer.
     """
     circle = _circle(sides)
     wedges = []
@@ -163,9 +163,9 @@ def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Pie
 def may_meet(capsules: np.ndarray, point: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Whether rays (n, 3) of any length from a point may meet one of some capsules: (n,) bool.
 
-    Capsules (k, 7) are both ends of the axis and the radius, in metres; equal ends make a ball. Seen from the point,
-    a capsule lies in a cone and, if it is long, between two planes through the point. The test is conservative: a ray
-    that fails it does not meet the capsule.
+    Capsules (k, 7) consist of both ends of the axis and the radius, in metres. Equal ends make a ball. From the
+    point, a capsule lies in a cone and, if it is long, between two planes through the point. The test is
+    conservative: a ray that fails it does not meet the capsule.
     """
     a, b, radius = capsules[:, :3] - point, capsules[:, 3:6] - point, capsules[:, 6]
     along = b - a
