@@ -6,7 +6,7 @@ They state what is wrong, where, and the value found, and then what to do.
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
 ('record the frame again',)
 
-`check_number`, `check_integer`, `check_choice` and `check_component` check the fields of components and use the same
+`check_number`, `check_integer`, `check_choice` and `check_component` check fields of components with the same
 wording.
 """
 

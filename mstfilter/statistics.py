@@ -232,7 +232,8 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
 
     Returns
     -------
-    dict Mapping from arms to `Difference`, without the reference.
+    dict
+        Mapping from arms to `Difference`, without the reference.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")

@@ -306,8 +306,7 @@ class Belief:
     ) -> Action | None:
         """The action of largest expected information in nats; the first one if several are equal.
 
-        None if no action has `at_least` nats. Then the hypotheses agree on all outcomes, and no action is better than
-        another.
+        None if no action has `at_least` nats. Then the hypotheses agree on all outcomes.
         """
         values = [information(action) for action in actions]
         if np.isnan(values).any():

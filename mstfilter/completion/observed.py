@@ -215,8 +215,7 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
 def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which centres (n, 3) lie in the box of a view (n,) bool, and what the view shows of the object there.
 
-    The evidence consists of flags of `Seen` (k,) and signed distances (k,) in voxels, with NaN where nothing is
-    shown.
+    The evidence consists of flags of `Seen` (k,) and signed distances (k,) in voxels, NaN where nothing is shown.
     """
     index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
     inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)

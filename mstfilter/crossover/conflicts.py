@@ -135,8 +135,7 @@ class OccupiedVoxels:
         return present, sizes[present], first[present]
 
     def overlaps(self) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """Proposed and predicted labels (m,) of overlapping pairs, ascending, and their numbers of common voxels
-        (m,)."""
+        """Proposed and predicted labels (m,) of overlapping pairs, ascending, and numbers of common voxels (m,)."""
         proposed, predicted = self.labels
         both = (proposed != 0) & (predicted != 0)
         pair = proposed[both].astype(np.int64) * (MAX_LABEL + 1) + predicted[both]
@@ -204,7 +203,7 @@ class Structure(Checked, ABC):
         Parameters
         ----------
         graph : networkx.Graph
-            The conflict graph (`ConflictGraph.networkx`). The neighbours of a vertex, ``graph[v]``, are in ascending
+            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` of a vertex are in ascending
             order.
         component : sequence of int
             Vertices of one connected component, ascending.

@@ -2,8 +2,7 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. The projection onto free space clears voxels of every predicted hypothesis j. The hypothesis keeps a share Q_j of
-   its voxels.
+1. The projection onto free space clears voxels of every predicted hypothesis j. It keeps a share Q_j of its voxels.
 2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
 
        log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
@@ -260,7 +259,7 @@ class _Child:
         return (size == kept) & (size == self.graph.size[heads])
 
     def _occupancy(self, labels: np.ndarray, parents: tuple[Hypothesis, Hypothesis]) -> Occupancy:
-        """The larger probability of the parents, limited to at least one half in labelled voxels and at most one half
+        """The larger probability of the parents, limited to at least .5 in labelled voxels and at most .5
         elsewhere."""
         owner, p = labels.copy(), np.where(labels > 0, np.float16(0.5), np.float16(0))
         heir = np.searchsorted(self.groups, self.group) + 1

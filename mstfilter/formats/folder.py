@@ -13,8 +13,9 @@ The layout::
     rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
     instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
 
-    voxels.npz optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size poses.json optional ground
-    truth: per frame, per object a 4x4 T_world_object SHA256SUMS hashes of these files
+    voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
+    poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+    SHA256SUMS           hashes of these files
 
 Frames with role ``static`` are the pauses. If camera.json has no pose, the world is computed from the support plane
 of the first pause. If it has no workspace, a grid is placed around the objects on the table. A recording is written

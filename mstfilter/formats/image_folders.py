@@ -37,8 +37,7 @@ class PairedImages(RecordingFormat):
     frames : tuple of str
         Names of the frames in order. By default all, ordered by name, where numbers in names count as numbers.
     background : tuple of int
-        Labels that are background, in addition to 0. By default, those with most of their readings on the support
-        plane.
+        Labels that are background, in addition to 0. By default, those with most readings on the support plane.
     """
 
     frames: tuple[str | int, ...] = ()

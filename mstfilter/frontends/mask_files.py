@@ -10,8 +10,8 @@ In the layout, numbers are those of the pauses (`Clip.index`), from 0::
     masks/000000.png              one segmentation of the image at pause 0
     masks/000001/a.png, b.npz     several alternatives of the whole image
 
-    masks/000002/left/a.json, b.json alternatives of a region; the regions of a pause are independent
-    masks/000002/sure/0.json a region with one alternative is certain
+    masks/000002/left/a.json, b.json     alternatives of a region; the regions of a pause are independent
+    masks/000002/sure/0.json      a region with one alternative is certain
 
     .../weights.json              optional, beside the alternatives: {"a.png": 2, "b.npz": 1}
 

@@ -8,8 +8,7 @@ object in these masks instead of the end points of the optical flow (paper, sect
 
 SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package
 with the same name and interface. Cutie: Cheng et al., CVPR 2024, https://github.com/hkchengrex/Cutie (MIT). The user
-supplies the package and the checkpoint. The adapters were tested with substitutes for the packages, not with the
-packages.
+supplies the package and the checkpoint. The adapters were tested only with substitutes for the packages.
 """
 
 from __future__ import annotations

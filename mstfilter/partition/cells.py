@@ -74,8 +74,7 @@ class Readings:
         return mask
 
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
-        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 if there is
-        none."""
+        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 if none."""
         occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
         _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
         found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour

@@ -113,8 +113,7 @@ class PartitionUpdate(Update):
     quality_exponent : float
         lambda. With 0, every prediction holds, and every occluded object is kept.
     n_candidates : int
-        Number of candidates after the first pause. With 0, it is one for each predicted hypothesis, or four if there
-        is evidence.
+        Number of candidates after the first pause. 0 means one for each predicted hypothesis, or four with evidence.
     reach : float
         Largest distance in voxels between a reading and the predicted object that explains it.
     n_views : int

@@ -6,12 +6,12 @@
 
 Layout of an exported run::
 
-    objects.csv pause, hypothesis, weight, label, id, birth, voxels, colour pause_000/hypothesis_000.ply meshes of all
-    objects; world metres pause_000/hypothesis_000.png label of the object at each pixel, 0 for none
+    objects.csv                          pause, hypothesis, weight, label, id, birth, voxels, colour
+    pause_000/hypothesis_000.ply         meshes of all objects; world metres
+    pause_000/hypothesis_000.png         label of the object at each pixel, 0 for none
 
 Vertices have the colour of their object in the report. Objects do not share vertices. A hypothesis without objects
-has no mesh file. In PLY and OBJ the z axis points up as in the recording. In GLB the y axis points up, as glTF
-requires.
+has no mesh file. In PLY and OBJ the z axis points up as in the recording, and in GLB the y axis.
 """
 
 from __future__ import annotations

@@ -177,8 +177,7 @@ def genealogy_figure(
     """Genealogy of the particles, with those of a pause in a column and disc area by weight.
 
     For each pause, `weights` has one value per particle. `previous` and `proposed` have the previous particle and the
-    proposed sample of each particle, with -1 for none. The lineage of the heaviest particle of the last pause is
-    coloured.
+    proposed sample of each particle, with -1 for none. The lineage of the heaviest last particle is coloured.
     """
     n = max(len(w) for w in weights)
     named = n <= _MOST_NAMED

@@ -118,8 +118,7 @@ class Cache:
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
         """Also store values with `stored_as` in a folder that several processes share (see `DiskCache`).
 
-        `limit_bytes` is the largest size of the folder. Values that were stored by another `version` of the code are
-        not found.
+        `limit_bytes` is the largest size of the folder. Values from another `version` of the code are not found.
         """
         from mstfilter.scene.disk_cache import DiskCache
 

@@ -4,8 +4,7 @@
 ...     run()                                    # values with `stored_as` are stored, and found again
 
 The argument `stored_as` of `mstfilter.scene.memo` selects these values. diskcache stores the entries and removes the
-least recently used ones beyond the limit. An entry contains the bytes of an .npz file. Nothing is pickled or
-unpickled.
+least recently used ones beyond the limit. An entry is the bytes of an .npz file. Nothing is unpickled.
 """
 
 from __future__ import annotations

@@ -181,7 +181,8 @@ class Recording:
 
         Raises
         ------
-        InputError If the arrays cannot be used, or `examine` finds that hypotheses cannot be correct.
+        InputError
+            If the arrays cannot be used, or `examine` finds that hypotheses cannot be correct.
         """
         if depth is None:
             raise InputError(
@@ -277,7 +278,7 @@ class Recording:
         """This recording with the workspace and the first camera pose of another recording, without true volumes.
 
         Use it for parts of one session whose camera has the same pose at both first pauses: ``open_recording(path,
-        options=["start_s=30"]).in_world_of(first)``. The clips of the second part can then update hypotheses of the
+        options=["start_s=30"]).in_world_of(first)``. Clips of the second part can then update hypotheses of the
         first.
         """
         own = self.frames[self.pauses[0]].camera.pose

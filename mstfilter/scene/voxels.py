@@ -320,8 +320,7 @@ class Hypothesis:
     grid : VoxelGrid
         Positions of the voxels.
     objects : tuple of ObjectRecord
-        One record for each label that occurs, in ascending order of labels. `Hypothesis.from_labels` makes the
-        records.
+        One record for each label, in ascending order of labels. `Hypothesis.from_labels` makes the records.
     occupancy : Occupancy, optional
         Probabilities of the voxels. By default, all voxels are certain.
     """

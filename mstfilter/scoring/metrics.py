@@ -120,8 +120,7 @@ def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
-    """Mean over some true objects, by size, of the largest intersection over union with an object; NaN without
-    any."""
+    """Mean over some true objects, by size, of the largest intersection over union with an object, or NaN."""
     _, _, sizes, jaccard = _objects(table)
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():

@@ -7,14 +7,16 @@ index J). It averages J by size:
 
 There are three forms, by name:
 
-``objects`` (default) Objects only (label 0 is not a region). ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where
-V is the volume of all objects of that segmentation. The form is symmetric. Missing, invented, split and merged
-objects all reduce it. ``paper``
+``objects`` (default)
+    Objects only (label 0 is not a region). ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V is the volume
+    of all objects of that segmentation. The form is symmetric. Missing, invented, split and merged objects all
+    reduce it.
+``paper``
     The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
-    Both sides are divided by the size of the grid. The result is nearly 1 for any input, because free space
-    dominates.
-``authors`` The authors' program. Objects only, but both sides are divided by the volume of the FIRST argument. It is
-not symmetric, and too high if the first argument is too small.
+    Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.
+``authors``
+    The authors' program. Objects only, but both sides are divided by the volume of the FIRST argument. It is
+    not symmetric, and too high if the first argument is too small.
 
 >>> import numpy as np
 >>> a = np.array([1, 1, 2, 2, 0]); b = np.array([1, 1, 1, 1, 0])
@@ -172,7 +174,8 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
 
     Raises
     ------
-    InputError If the recording has no true voxels at pause `t`, or no instance image at this or an earlier pause.
+    InputError
+        If the recording has no true voxels at pause `t`, or no instance image at this or an earlier pause.
     """
     if not 0 <= t < len(recording.pauses):
         raise InputError(f"recording {recording.name} has no pause {t}, it has {len(recording.pauses)}")

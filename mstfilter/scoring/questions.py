@@ -190,7 +190,8 @@ def ask(recording: Recording, t: int, n: int = N_QUESTIONS) -> Questions:
 
     Returns
     -------
-    Questions Empty if there are fewer than two such voxels.
+    Questions
+        Empty if there are fewer than two such voxels.
     """
     check_integer("number of questions", n)
     if not 0 <= t < len(recording.pauses):

@@ -34,7 +34,7 @@ _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE L
 def above_table(frame: Frame) -> np.ndarray:
     """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without a reading.
 
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, and else the plane with the most
+    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane with most
     readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)

@@ -54,8 +54,7 @@ class SceneCutObjectness(CutValue):
 
     ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)`` and ``w = ln(s) area^0.95``. A region smaller than
     1000 or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of
-    planes with the size of furniture, is omitted. On a tabletop the support plane is found directly and removed as
-    background.
+    planes with the size of furniture, is omitted. Here the support plane is removed directly as background.
 
     Parameters
     ----------

@@ -239,8 +239,7 @@ LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsM
 class CutChain:
     """A Metropolis-Hastings chain over cuts from an initial cut, one step at a time.
 
-    The target is the distribution with ``log_p(value)``, the log probability of a cut with this value, up to a
-    constant.
+    The target distribution has the log probability ``log_p(value)`` for a cut with this value, up to a constant.
     """
 
     def __init__(self, tree: Tree, w: np.ndarray, log_p: Callable[[float], float], cut: np.ndarray) -> None:
@@ -295,8 +294,7 @@ class MetropolisHastingsCuts(CutSampler):
         Rule of the local moves: the exact rule of the paper, or the rule of the authors' program, which has a wrong
         forward probability.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of making a local move. It is used only with a
-        temperature.
+        Fraction of steps that redraw a random subtree instead of a local move. It is used only with a temperature.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -380,7 +378,7 @@ def _uniforms(rng: np.random.Generator) -> Iterator[float]:
 def _autocorrelation(trace: np.ndarray) -> float | None:
     """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
 
-    A chain shorter than about 50 autocorrelation times underestimates them, so a low value does not prove
+    A chain shorter than about 50 autocorrelation times underestimates them, so a low value is no proof of
     convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:

@@ -163,8 +163,7 @@ class TreeCutProposal(Proposal):
         return replace(self, boundary=self.boundary.at(clip)) if isinstance(self.boundary, ClipBoundary) else self
 
     def label_image(self, frame: Frame, cut: np.ndarray | None = None) -> np.ndarray:
-        """(H, W) int32 segments of a cut: 0 is background, and k + 1 its k-th node. The default is the optimal
-        cut."""
+        """(H, W) int32 segments of a cut, by default the optimal one: 0 is background, and k + 1 its k-th node."""
         tree, w = self.tree_of(frame)
         return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame)
 

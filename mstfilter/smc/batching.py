@@ -451,8 +451,7 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 
 def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
-    """The first difference of two arrays or mappings of arrays, and whether it is rounding; None if they are
-    equal."""
+    """The first difference of arrays or mappings of arrays, and whether it is rounding; None if they are equal."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

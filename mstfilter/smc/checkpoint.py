@@ -68,8 +68,7 @@ def save_state(
 def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> tuple[State, dict[str, Any]]:
     """The state in a file, and the description stored with it.
 
-    Raises InputError if the file is missing or damaged, is not a checkpoint, or its arrays need more than `limit`
-    bytes.
+    Raises InputError if the file is missing, damaged, not a checkpoint, or its arrays need more than `limit` bytes.
     """
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")

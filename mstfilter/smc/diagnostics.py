@@ -115,8 +115,7 @@ class Coalescence:
 
     @property
     def time(self) -> int | None:
-        """Number of steps from the last time back to the latest common ancestor of all particles; None if none
-        exists."""
+        """Number of steps from the last time back to the latest common ancestor of all particles, or None."""
         common = np.flatnonzero(self.ancestors == 1)
         return len(self.ancestors) - 1 - int(common[-1]) if len(common) else None
 
@@ -191,8 +190,8 @@ def run_variance(
 
     All estimates are of first order in 1 / n, and too low for small n. With 300 particles they are within 15 % of the
     variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of means are
-    90 % too low (`experiments/run_variance/sizes.csv`). Take more particles if the variance of the log evidence is
-    above .3.
+    90 % too low (`experiments/run_variance/sizes.csv`). Take more particles if the log evidence's variance is above
+    .3.
 
     Parameters
     ----------

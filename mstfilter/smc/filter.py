@@ -179,8 +179,7 @@ class ParticleFilter(AtStep):
         checkpoint : path, optional
             A file to which the state is written after every step. If the file exists, the run continues from its
             state. Observations that were already used are skipped, and the result equals that of an uninterrupted
-            run. InputError if the file belongs to another seed, filter or model, or if those observations were
-            different.
+            run. InputError if the file belongs to another seed, filter, model or other observations.
         codec : Codec, optional
             Stores particles that are not arrays, mappings of arrays or dataclasses of arrays.
         """
@@ -463,7 +462,7 @@ def keep_freed_memory() -> None:
 
     After this, glibc keeps freed arrays of up to 32 MB (its largest value) instead of returning them to the system
     after every step. Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of
-    the time of resampling a million weights. The memory of the block itself is never used. Other C libraries are not
+    the time of resampling a million weights. The memory of the block is never used. Other C libraries are not
     affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

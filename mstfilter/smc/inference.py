@@ -85,9 +85,9 @@ class Chains(Table):
 
         Returns
         -------
-        xarray.DataTree Groups ``posterior`` and ``sample_stats``. The latter has ``log_evidence``, and ``lp`` for the
-        log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted. Paths are not
-        included.
+        xarray.DataTree
+            Groups ``posterior`` and ``sample_stats``. The latter has ``log_evidence``, and ``lp`` for the
+            log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted, without paths.
         """
         theta = self.theta[discard:].swapaxes(0, 1)
         if names and len(names) != theta.shape[2]:

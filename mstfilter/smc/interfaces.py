@@ -21,8 +21,7 @@ to the log weights. `mstfilter.smc.Dynamics` does so for any model with densitie
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
 `Transition` and an `Update`. Optional components are `Size` (number of particles), `Lookahead` (auxiliary filter),
 `Rejuvenation` (resample-move) and `Codec` (checkpoints of other particle types). Two interfaces extend another one
-with an additional ability: `DensityTransition` and `WeightResampler`. Models and programs consist of `Distribution`
-objects.
+with an additional ability: `DensityTransition` and `WeightResampler`. Models and programs use `Distribution` objects.
 """
 
 from __future__ import annotations

@@ -78,13 +78,14 @@ def run_many(
         if a stored run was made with another filter, other observations or other collectors, or if its file is
         damaged.
     progress : bool or callable
-        True shows a progress bar. A function is called as ``progress(done, total)`` when runs finish. **collectors As
-        for `collect`; default `log_evidence`.
+        True shows a progress bar. A function is called as ``progress(done, total)`` when runs finish.
+    **collectors
+        As for `collect`; default `log_evidence`.
 
     Returns
     -------
-    History Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle
-    explains
+    History
+        Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
         an observation (`LostRunError`). From that step on, its log evidence is -inf and the other results are NaN.
         `History.lost` has the reasons. `History.single` states why the runs of an arm were made one by one.
 

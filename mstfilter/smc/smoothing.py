@@ -284,8 +284,9 @@ def paris(
     transition : DensityTransition
         The transition of the model, ``Dynamics(model)``.
     n_draws : int
-        At least 2, since with one the variance grows as that of the genealogy. method, steps, log_bound As in
-        `backward_paths`.
+        At least 2, since with one the variance grows as that of the genealogy.
+    method, steps, log_bound
+        As in `backward_paths`.
 
     Yields
     ------
@@ -317,8 +318,8 @@ def paris(
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight, in random order (`independent_draws` returns nearly sorted
-    ones)."""
+    """(n,) indices drawn independently by weight, in random order (those of `independent_draws` are nearly
+    sorted)."""
     index = independent_draws(rng, population.weights, n)
     rng.shuffle(index)
     return index

@@ -250,8 +250,7 @@ class RandomWalkMove(Rejuvenation):
     Parameters
     ----------
     model : StateSpaceModel
-        The model with its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of such
-        arrays.
+        The model with its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of them.
     scale : float or array_like
         Standard deviation of a step, in the units of the state. It is fixed, so that the evidence is unbiased.
     steps : int
@@ -324,7 +323,8 @@ def metropolis(
 
     Yields
     ------
-    state, accepted After each step, the state and (n,) bool whether its proposal was accepted.
+    state, accepted
+        After each step, the state and (n,) bool whether its proposal was accepted.
     """
     for _ in range(steps):
         new, log_ratio = propose(rng, state)
@@ -381,8 +381,9 @@ def guided(
     proposal : callable
         ``(particles, y) -> distribution`` of x_t.
     initial : callable, optional
-        ``(y) -> distribution`` of x_0; the default is the prior of the model. **components Other fields of
-        `ParticleFilter`, such as ``resampler`` or ``trigger``.
+        ``(y) -> distribution`` of x_0; the default is the prior of the model.
+    **components
+        Other fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
     """
     return replace(
         bootstrap(model, n),

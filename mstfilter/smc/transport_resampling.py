@@ -206,8 +206,7 @@ class Tempered(ResamplerWrapper):
 class KeepWeights(ResamplerWrapper):
     """Selected particles keep their weights, as in the program of the MST authors.
 
-    Selecting by weight and keeping the weight counts the same evidence twice, so this scheme is not properly
-    weighted.
+    Selecting by weight and keeping the weight counts evidence twice, so this scheme is not properly weighted.
     """
 
     scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)

@@ -5,7 +5,7 @@
 
 Layout::
 
-    study.json description, arms with their configuration, scenes, seeds, the folder of every run
+    study.json       description, arms with their configuration, scenes, seeds, the folder of every run
 
     runs/NAME/       one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz: counts of
                      its forecasts

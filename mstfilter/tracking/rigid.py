@@ -1,8 +1,7 @@
 """Rigid motions from corresponding points: least squares, robust fits, and J-Linkage for several motions.
 
 Motions are (..., 4, 4) float64 matrices T: a point p moves to ``q = R p + t`` with R = T[:3, :3] and t = T[:3, 3].
-Components exchange single motions as scipy `RigidTransform`. `rigid_transform` converts a matrix without changing a
-bit.
+Components exchange single motions as scipy `RigidTransform`. `rigid_transform` converts a matrix bit for bit.
 
 >>> import numpy as np
 >>> rng = np.random.default_rng(1)

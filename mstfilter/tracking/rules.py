@@ -240,8 +240,7 @@ class MstRule(MotionRule):
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame. The refined motions are additional
-        candidates.
+        Number of best candidates that are refined against the whole last frame. These are additional candidates.
     search_above : float
         If every score is larger than this value, the object is searched for around its last position. A negative
         value disables the search.

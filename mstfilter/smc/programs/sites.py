@@ -45,8 +45,9 @@ def sample(name: str, distribution: Any) -> Any:
 
     Returns
     -------
-    ndarray ``(n, *event_shape)`` One row per particle, read-only. In a `per_particle` program it is a number or array
-    without that axis.
+    ndarray ``(n, *event_shape)``
+        One row per particle, read-only. In a `per_particle` program it is a number or array
+        without that axis.
     """
     return _current().sample(name, distribution)
 
@@ -75,8 +76,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
         `observe` and `switch`. A site with the same name in several branches is one array. The value is NaN (0 for
         integers) for particles that did not reach the site. A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Arguments that are split by rows. Values shared by all particles, such as the observation, are passed by
-        closure.
+        Arguments that are split by rows. Values shared by all particles are passed by closure.
 
     Returns
     -------

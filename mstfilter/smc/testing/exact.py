@@ -76,8 +76,7 @@ class ExactContract(PopulationContract):
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
         """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.
 
-        Probabilities of intervals, means and spreads are compared. The sums detect columns that share a random
-        number.
+        Probabilities of intervals, means and spreads are compared. Sums detect columns that share a random number.
 
         The difference of two weighted means is normal, up to errors that a twentieth of the level allows for. A tail
         is compared if its probability is at least that of 50 of the largest weights, so that no rare weight is
