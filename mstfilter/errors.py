@@ -1,6 +1,6 @@
 """Errors and warnings that a user can correct.
 
-They state what is wrong, where, and the value found, and then what to do.
+The messages state what is wrong, where, and the value found, and then what to do.
 
 >>> from mstfilter.errors import InputError
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
@@ -176,8 +176,8 @@ _PACKAGES = {
 def place_in_user_file(error: BaseException) -> str | None:
     """``FILE, line N: TEXT`` for the line of a user's file in which an exception was raised; None if there is none.
 
-    It is the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this package
-    nor to an installed library. For a syntax error, it is the file that the error names.
+    The line is in the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this
+    package nor to an installed library. For a syntax error, it is the file that the error names.
     """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{short_path(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"

@@ -1,7 +1,7 @@
 """Scores of forecasts: Brier score, log loss, calibration, recalibration, energy score.
 
-A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. It has
-how often each value of p was given, and how often the event then occurred. Such tables can be pooled.
+A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. The
+table has how often each value of p was given, and how often the event then occurred. Tables can be pooled.
 
 >>> import numpy as np
 >>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])

@@ -5,7 +5,7 @@ A package's ``__init__.py`` has its documentation and two lines::
     from mstfilter.lazy import attach
     __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-Its ``__init__.pyi`` lists the names, with one ``from module import name as name`` statement per module. Type checkers
+The ``__init__.pyi`` lists the names, with one ``from module import name as name`` statement per module. Type checkers
 read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera`` imports only the
 module of `Camera` (the scheme of Scientific Python's SPEC 1).
 """
@@ -68,7 +68,7 @@ def _equal(a: Any, b: Any) -> bool:
 def late(location: str, summary: str) -> Callable[..., Any]:
     """A method that calls ``module:function``, which is imported at the first call.
 
-    It is used for methods that draw, and for the rules of pauses. So `mstfilter.scene` and `mstfilter.smc` do not
+    `late` is used for methods that draw, and for the rules of pauses. So `mstfilter.scene` and `mstfilter.smc` do not
     depend on `mstfilter.report` and `mstfilter.formats`.
     """
     module, _, name = location.partition(":")

@@ -5,7 +5,7 @@
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
 ``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
-TOML file with the fields of `ParticleFilter`, one table for each component. It may extend another preset, or
+TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset, or
 ``models/base.toml``, which has the common parts of `mst` and its baselines:
 
     base = "base"                           # fields that are not named here are those of the base
@@ -15,7 +15,7 @@ TOML file with the fields of `ParticleFilter`, one table for each component. It 
 
     wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
 
-``base`` itself has no update. It can be extended but is not a preset.
+``base`` itself has no update. `base` can be extended but is not a preset.
 """
 
 from __future__ import annotations

@@ -214,7 +214,7 @@ class Registry:
             raise InputError(f"{prefix}{cls.__name__} cannot be made: {error}") from error
 
     def _abstract_error(self, prefix: str, cls: type) -> InputError:
-        """The error for a class without all methods of its interface. It names them, and a suitable base class."""
+        """The error for a class that lacks methods of its interface, with their names and a suitable base class."""
         missing = sorted(getattr(cls, "__abstractmethods__", ()))
         written = {name for name, value in vars(cls).items() if inspect.isfunction(value) and name[0] != "_"}
         origin = next(base.__name__ for base in reversed(cls.__mro__) if missing[0] in vars(base))
@@ -392,7 +392,7 @@ def load_file(path: str | Path) -> ModuleType:
 
 
 def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> ModuleType:
-    """A new module from the source of a file. Its name is different for every path and content."""
+    """A new module from the source of a file. The name of the module is different for every path and content."""
     unique = hashlib.sha256(f"{resolved}\0{digest}".encode()).hexdigest()[:12]
     name = f"mstfilter_user_{resolved.stem}_{unique}"
     spec = importlib.util.spec_from_file_location(name, resolved)

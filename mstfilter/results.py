@@ -1,7 +1,7 @@
 """Checks of the results of components' methods.
 
 An interface states the check of a result beside the method. The check applies to every class that defines the method.
-Its error names the class, the file and the line of the method:
+The error names the class, the file and the line of the method:
 
 >>> class Score(Checked):
 ...     @returns(lambda self, found, particles: check_array(found, (len(particles),)))

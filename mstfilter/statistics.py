@@ -12,8 +12,8 @@ several filter seeds on one scene are averaged first. A difference has a t inter
 and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume
 that the differences are symmetric about zero under the null hypothesis. Squared errors are skewed, and their
 differences often are too. So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is
-small. This is the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method.
-`experiments/comparison` has the error rates and the power of this rule.
+small. `p_claim` is the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's
+method. `experiments/comparison` has the error rates and the power of this rule.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Difference:
     n : int
         Number of units that both arms have.
     p_holm : float
-        `p_claim` adjusted for all comparisons of the table. It equals `p_claim` for a single comparison.
+        `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
         Two-sided p value of the studentised bootstrap, see `studentised_bootstrap`; NaN for fewer than five units.
     skewness : float
@@ -71,8 +71,8 @@ class Difference:
     def p_claim(self) -> float:
         """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
-        The factor accounts for the tail that a small sample of skewed differences often lacks. It was chosen by
-        simulation and is not derived; see `experiments/comparison`.
+        The factor accounts for the tail that a small sample of skewed differences often lacks. The factor was chosen
+        by simulation and is not derived; see `experiments/comparison`.
         """
         return float(np.minimum(1, np.fmax(self.p, self.p_bootstrap) * (1 + abs(self.skewness))))
 
@@ -159,7 +159,8 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
     """(mean of a resample - mean) / standard deviation of the resample.
 
-    The ratios of resamples of equal values are infinite. They are given as +-1e200, since quantiles interpolate.
+    The ratios of resamples of equal values are infinite. Infinite ratios are given as +-1e200, since quantiles
+    interpolate.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]

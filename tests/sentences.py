@@ -31,7 +31,7 @@ _BLOCKS = (
     r"<!--.*?-->",
     r"<[^>\n]+>",
 )
-_ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : )", re.MULTILINE)
+_ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : .*$)", re.MULTILINE)
 _END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*\[$]*[A-Z`])")
 
 

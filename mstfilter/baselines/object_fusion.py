@@ -2,9 +2,9 @@
 
 >>> mstfilter.preset("object_fusion")
 
-This is a re-implementation of the idea of Xu et al. 2019 ("MID-Fusion: Octree-based Object-Level Multi-Instance
-Dynamic SLAM") within the interfaces of this package. It is not a port of their program. At every pause these steps
-are performed:
+The baseline is a re-implementation of the idea of Xu et al. 2019 ("MID-Fusion: Octree-based Object-Level
+Multi-Instance Dynamic SLAM") within the interfaces of this package. The baseline is not a port of their program. At
+every pause these steps are performed:
 
 1. The transition of the filter tracks the objects of the map through the clip.
 2. The masks of the single-frame segmentation are matched with the rendered map by overlap.

@@ -1,6 +1,6 @@
 """Updates without crossover: samples alone, predictions alone, or the union of both.
 
-They replace the update of `mst`, and leave all other parts of the filter and their random streams unchanged:
+The updates replace the update of `mst`, and leave all other parts of the filter and their random streams unchanged:
 
 >>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
 

@@ -1,8 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
-An action has one outcome under each hypothesis. Its expected information is the mutual information between the
-hypothesis and the outcome. The hypothesis determines the outcome. So this is the entropy of the weights summed over
-equal outcomes, which is at most the entropy of the weights.
+An action has one outcome under each hypothesis. The expected information of an action is the mutual information
+between the hypothesis and the outcome. The hypothesis determines the outcome. So this is the entropy of the weights
+summed over equal outcomes, which is at most the entropy of the weights.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -62,7 +62,8 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. It is called only if `tolerance` > 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. The function is called only if
+        `tolerance` > 0.
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float

@@ -14,12 +14,12 @@ hypothesis (`Hypothesis.occupancy`). Queries of segmentations and actions use on
 indices (x, y, z); `Belief.voxel` and `Belief.box` convert metres. Pixels are (column, row). A region is a bool array
 of the grid's shape, or voxels (..., 3). Entropy and information are in nats; divide by log 2 for bits.
 
-**Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. Its
-expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
-weights summed over equal outcomes. It is at most `partition_entropy()`, which is at most log n. It measures only
-differences between the hypotheses. Errors that all of them share have no effect. Outcomes that differ in one voxel
-are different. With `tolerance` (in voxels or pixels), outcomes that differ by much less than the tolerance count as
-equal (formula in `mstfilter.belief.information`).
+**Information.** Every action (look at a region, look from a camera, push) has one outcome under each hypothesis. The
+expected information of an action is the mutual information of hypothesis and outcome. Without noise this is the
+entropy of the weights summed over equal outcomes. The expected information is at most `partition_entropy()`, which is
+at most log n. The expected information measures only differences between the hypotheses. Errors that all of them
+share have no effect. Outcomes that differ in one voxel are different. With `tolerance` (in voxels or pixels),
+outcomes that differ by much less than the tolerance count as equal (formula in `mstfilter.belief.information`).
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ class Belief:
         return largest
 
     def _entropy_of_faces(self, axis: int) -> np.ndarray:
-        """H(S | B) of the faces between voxels and the next ones along an axis. This axis comes first."""
+        """H(S | B) of the faces between voxels and the next ones along an axis. The chosen axis comes first."""
         cells = np.moveaxis(self._refined.cells, axis, 0)
         lower, upper = cells[:-1], cells[1:]
         differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
@@ -247,9 +247,9 @@ class Belief:
     def partition_entropy(self, region: Any = None, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation of a region (default: the whole grid).
 
-        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s of the region. This
-        is also the information of the true segmentation of the region. Without region and tolerance it is an upper
-        bound of the information of every outcome that the labels determine. The distance for the tolerance is
+        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s of the region. The
+        entropy is also the information of the true segmentation of the region. Without region and tolerance it is an
+        upper bound of the information of every outcome that the labels determine. The distance for the tolerance is
         `information.partition_distance`.
         """
         cells, sizes = self._region(region)
@@ -281,8 +281,8 @@ class Belief:
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``. These are all voxels of all objects with a voxel in
-        the region. Other objects that these objects would push are ignored.
+        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``. The moved voxels are all voxels of all objects with a
+        voxel in the region. Other objects that these objects would push are ignored.
         """
         moved = self._refined.objects_in(self._region(region)[0])[self._refined.objects]
         return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)

@@ -3,7 +3,7 @@
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
-These components are for the resamplers of `mstfilter.smc` that compare particles:
+The components are for the resamplers of `mstfilter.smc` that compare particles:
 ``Clusters(similarity=WeightedCoverage())``, ``Coalesced(equivalence=SameSegmentation())``.
 """
 

@@ -43,7 +43,7 @@ CHANNELS = (
 class Architecture(ABC):
     """Builds a completion network that the user trained.
 
-    Its weights are in the folder of a model (`mstfilter.trained`).
+    The weights of the network are in the folder of a model (`mstfilter.trained`).
 
     The file ``model.toml`` of the folder has the name of the class as `architecture`.
     """
@@ -52,8 +52,8 @@ class Architecture(ABC):
     def build(self) -> nn.Module:
         """The network with arbitrary weights.
 
-        Its input is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. Its output are logits, (b, X, Y, Z) or
-        (b, 1, X, Y, Z).
+        The input of the network is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. The outputs of the
+        network are logits, (b, X, Y, Z) or (b, 1, X, Y, Z).
         """
 
 

@@ -54,7 +54,7 @@ class ConflictGraph:
     Notes
     -----
     Vertices are numbered by their first voxel in a scan with x fastest. If two objects begin at the same voxel, the
-    proposed object is first. This is the authors' numbering.
+    proposed object is first. The numbering is the authors' numbering.
     """
 
     side: np.ndarray  #: (n,) int 0 proposed, 1 predicted

@@ -2,7 +2,7 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. The projection onto free space clears voxels of every predicted hypothesis j. It keeps a share Q_j of its voxels.
+1. The projection onto free space clears voxels of every predicted hypothesis j. A hypothesis keeps a share Q_j.
 2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
 
        log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
@@ -11,8 +11,8 @@
    resampling selects candidates before they are built, and only selected candidates are built.
 
 Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
-observation, few predictions lie in it. So every particle is projected into this set. This is the manifold filter of
-Koval, Pollard and Srinivasa (2015).
+observation, few predictions lie in it. So every particle is projected into this set. The method is the manifold
+filter of Koval, Pollard and Srinivasa (2015).
 
 One crossover has these steps (figure 5):
 
@@ -90,7 +90,7 @@ class Crossover(Bounded):
         """A hypothesis from the objects of both parents.
 
         If one parent has no objects, the result is the other parent. An object keeps the identity of the largest
-        predicted object in it. It keeps the motion history if its voxels are exactly those predicted.
+        predicted object in it. An object keeps the motion history if its voxels are exactly those predicted.
         """
         check_grid("the proposed hypothesis", proposed, predicted.grid)
         if not predicted.objects:
@@ -259,8 +259,7 @@ class _Child:
         return (size == kept) & (size == self.graph.size[heads])
 
     def _occupancy(self, labels: np.ndarray, parents: tuple[Hypothesis, Hypothesis]) -> Occupancy:
-        """The larger probability of the parents, limited to at least .5 in labelled voxels and at most .5
-        elsewhere."""
+        """The larger probability of the parents: at least .5 in labelled voxels, at most .5 elsewhere."""
         owner, p = labels.copy(), np.where(labels > 0, np.float16(0.5), np.float16(0))
         heir = np.searchsorted(self.groups, self.group) + 1
         heir[~np.isin(self.group, self.groups)] = 0

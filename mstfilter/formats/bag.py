@@ -108,7 +108,7 @@ class BagFile:
         raise InputError(f"bag {self.path} lists messages of {topic} but holds none", "copy it again")
 
     def index(self, topic: str) -> list[Entry]:
-        """Every message of a topic with a header, in the order of the file. It reads all messages once."""
+        """Every message of a topic with a header, in the order of the file. All messages are read once."""
         entries: list[Entry] = []
         for logged, message in self._messages(topic):
             stamp = message.header.stamp

@@ -129,8 +129,8 @@ class Still(PauseRule):
     levels : float
         A block differs if its grey level (of 255) changes by this value, or by six times its noise if that is more.
     region : tuple of 4 float
-        Part of the image that is used: left, top, right, bottom as shares of width and height. It can exclude people
-        behind the table.
+        Part of the image that is used: left, top, right, bottom as shares of width and height. The selected part can
+        exclude people behind the table.
     """
 
     hold_s: NonNegativeFloat = 0.5

@@ -53,7 +53,7 @@ class RecordingFormat(ABC):
     @classmethod
     @abstractmethod
     def detects(cls, path: Path) -> bool:
-        """Whether the names of files show that a path has this layout. It raises no error."""
+        """Whether the names of files show that a path has this layout. The method raises no error."""
 
     @abstractmethod
     def open(self, path: Path) -> Recording:

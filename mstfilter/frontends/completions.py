@@ -15,7 +15,7 @@ A shape is in metres, in the frame of the camera (x right, y down, z forward) or
 * ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probability of voxels with edge ``voxel_size`` along
   the axes of the frame. The first corner is ``origin`` (3,).
 
-A voxel is inside a mesh if its centre is inside. This is decided by the parity of crossings along three axes, of
+A voxel is inside a mesh if its centre is inside. Inside is decided by the parity of crossings along three axes, of
 which two must agree. So small holes have no effect. A voxel is occupied by a cloud if it contains a point. Spaces
 enclosed by such voxels are filled.
 """

@@ -78,10 +78,10 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     Parameters
     ----------
     form : {"crisp", "cleaned"}
-        The form *crisp* has 1 on both sides of every true border and 0 elsewhere. It is for `UcmTree`. The form
-        *cleaned* has the measured strength near true borders and 0 elsewhere. It is for the learned tree, which was
-        fitted to measured strengths. The quality of the best cut on 16 simulated images with measured, crisp and
-        cleaned boundaries is .914, .485, .952 for the learned tree and .868, .998, .901 for `UcmTree`.
+        The form *crisp* has 1 on both sides of every true border and 0 elsewhere. *crisp* is for `UcmTree`. The form
+        *cleaned* has the measured strength near true borders and 0 elsewhere. *cleaned* is for the learned tree,
+        which was fitted to measured strengths. The quality of the best cut on 16 simulated images with measured,
+        crisp and cleaned boundaries is .914, .485, .952 for the learned tree and .868, .998, .901 for `UcmTree`.
     measured : BoundaryModel
         Model of the measured strength.
     """

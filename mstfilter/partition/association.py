@@ -7,7 +7,7 @@
 A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller of
 the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects that share
 voxels.) The *main object* of a segment is the predicted object with which it shares most readings. An object that is
-the main object of no segment and has fewer than about 60 readings is in no conflict. Such readings come from other
+the main object of no segment and has fewer than about 60 readings is in no conflict. The readings come from other
 objects nearby.
 
 In each connected component, at most one segment continues a predicted object. Two rules are applied in order:

@@ -16,8 +16,8 @@ of the predictions. The log odds of "one object" are
         + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
 
 where R is the probability that a prediction is valid, and W <= R the weight of the predictions that explain both
-cells. The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`. They were fitted in
-`experiments/partition_fit`.
+cells. The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`. The coefficients were fitted
+in `experiments/partition_fit`.
 
 The alternatives of a component are the partitions that the samples and the predictions give it. If a prediction does
 not explain a cell, each sample in turn determines which predicted object the cell joins. Every mixture of the
@@ -182,8 +182,8 @@ class Cells:
     def draw(self, rng: np.random.Generator, log_odds: np.ndarray, n: int) -> np.ndarray:
         """n partitions (n, K). The components are drawn independently.
 
-        In each component, the alternatives are drawn by systematic selection. Their numbers equal their probabilities
-        up to rounding.
+        In each component, the alternatives are drawn by systematic selection. The number of draws of each equals its
+        probability up to rounding.
         """
         drawn = np.zeros((n, self.samples.shape[1]), np.int64)
         used = 0
@@ -225,7 +225,7 @@ def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> 
 
 
 def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """A reading (K,) of each cell (m,) with the labels of the cell. It is not from a small cell that was joined."""
+    """A reading (K,) of each cell (m,) with the labels of the cell, not from a small cell that was joined."""
     own = np.flatnonzero(cell == exact)
     return own[np.unique(cell[own], return_index=True)[1]]
 
@@ -233,8 +233,8 @@ def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
 def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """A prediction (k,) of cells of these sizes (k,), with objects for the cells that it does not explain.
 
-    Such a cell joins the predicted object with most readings in its segment of the sample (k,). If there is no such
-    object, the segment is an object.
+    An unexplained cell joins the predicted object with most readings in its segment of the sample (k,). If there is
+    no such object, the segment is an object.
     """
     filled = prediction.copy()
     for segment in np.unique(sample[prediction == 0]):
@@ -251,8 +251,8 @@ def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -
 
     `same` (e,) are the probabilities that the cells of a pair belong to one object. `joined` (p, e) states which
     partitions join the pair. The mixture minimises the cross entropy between `same` and the total probability of the
-    partitions that join the pair. `weights` (e,) weight the pairs. The problem is convex. It is solved by expectation
-    maximisation for the proportions of a mixture.
+    partitions that join the pair. `weights` (e,) weight the pairs. The problem is convex. The problem is solved by
+    expectation maximisation for the proportions of a mixture.
     """
     q = np.full(len(joined), 1 / len(joined))
     for _ in range(_STEPS):

@@ -3,9 +3,9 @@
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # a candidate for each predicted hypothesis
 
-It replaces section IV-D of the paper. In the paper, a sample of the image and a prediction are two sets of voxels,
-which are crossed. In this update, both are partitions of the depth readings of the last frame. The voxels of an
-object are estimated again from everything that was observed of it.
+The update replaces section IV-D of the paper. In the paper, a sample of the image and a prediction are two sets of
+voxels, which are crossed. In this update, both are partitions of the depth readings of the last frame. The voxels of
+an object are estimated again from everything that was observed of it.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. Q_j^lambda is used as the probability that prediction j *holds*, that is, shows the present scene.
@@ -17,15 +17,15 @@ object are estimated again from everything that was observed of it.
    Segments and predicted objects form a *conflict graph*. In its *components*, segments continue predicted objects by
    the rules in `mstfilter.partition.association`. At most one segment continues an object that is split. The other
    segments are new objects. The paper draws which conflicts end in a merge. Here the partition determines it.
-4. **Occluded objects.** A predicted object without conflict has no readings or very few. It is kept in a candidate
-   with probability (Q_j q)^lambda, where q is the share of its voxels that the frame does not observe as free. Q_j
-   measures whether the prediction is reliable, and q whether this object is still there.
+4. **Occluded objects.** A predicted object without conflict has no readings or very few. An occluded object is kept
+   in a candidate with probability (Q_j q)^lambda, where q is the share of its voxels that the frame does not observe
+   as free. Q_j measures whether the prediction is reliable, and q whether this object is still there.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). A
    visible object is completed from its readings in this frame and from the views of the objects that it continues. An
    occluded object is completed from its views only. The completer drops views that the frame refutes. An object
    without any voxel is removed. Observations are kept, and completions are not: no voxel from a completion at an
    earlier pause is used again. The exception is an occluded object without views, which occurs if the completer does
-   not use views. It keeps its voxels outside free space.
+   not use views. The object keeps its voxels outside free space.
 
 At the first pause the candidates are the samples, so every segment is a new object. No hypothesis contains an object
 that no frame has shown.

@@ -3,8 +3,8 @@
 >>> svg = quality_figure(times, qualities, weights, {"without past": [...]}, {"one blob": [...]})
 >>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
 
-Each function returns the text of an ``<svg>`` element. It uses the colours and fonts of its page, so it follows a
-light or a dark theme. The same values give the same text.
+Each function returns the text of an ``<svg>`` element. The figure uses the colours and fonts of its page, so it
+follows a light or a dark theme. The same values give the same text.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
 >>> numbers.summary, numbers.tiles, numbers.steps[-1].mean
 
-They are read from the run folder alone. The run may be finished or interrupted.
+The numbers are read from the run folder alone. The run may be finished or interrupted.
 """
 
 from __future__ import annotations

@@ -177,8 +177,8 @@ def save_rerun(source: RunFolder | Recording, path: str | Path) -> Path:
 def show_rerun(path: str | Path) -> None:
     """Open a file in the viewer of rerun, and wait until its window is closed.
 
-    The viewer listens only on 127.0.0.1, on a free port. Its analytics are off. rerun sends none if the variable
-    ``CI`` is set, which is set only for the viewer.
+    The viewer listens only on 127.0.0.1, on a free port. The viewer's analytics are off. rerun sends none if the
+    variable ``CI`` is set, which is set only for the viewer.
     """
     import_rerun()
     environment = {k: v for k, v in os.environ.items() if k != "FORCE_RERUN_ANALYTICS"} | {"CI": "1"}

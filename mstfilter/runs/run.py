@@ -3,7 +3,7 @@
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
 All input is checked before the folder is made. An interrupted run is resumed by the same call with the same
-configuration, seed and recording. Its result equals that of an uninterrupted run.
+configuration, seed and recording. The result equals that of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Configurations of the filters with which a run is compared. Their samples use the completer of the filter."""
+    """Configurations of the filters with which a run is compared. They keep the completer of the filter."""
     parts = (config.get(slot) or {} for slot in ("proposal", "update"))
     proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
     proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
@@ -72,7 +72,7 @@ def filter_recording(
     config : mapping
         A configuration from `mstfilter.presets.load_config`.
     path : Path
-        The run folder. It must be new, empty, or of the same interrupted run.
+        The run folder. The folder must be new, empty, or of the same interrupted run.
     seed : int
         Seed of all random streams.
     replace : bool

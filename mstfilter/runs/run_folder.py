@@ -18,7 +18,7 @@ Layout::
 
 A pause is written under a temporary name and renamed when it is complete. So an interrupted run has only complete
 pauses. `filter_recording` resumes from state.npz of the last pause, which contains the step, the seed and a hash of
-run.json. Its arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same
+run.json. The arrays ``particles/...`` are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same
 bytes in all files except seconds.json.
 """
 
@@ -402,7 +402,7 @@ class RunFolder:
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed.
 
-        It is kept in `scene_cache`, since a report uses it many times.
+        The state is kept in `scene_cache`, since a report uses it many times.
         """
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"):

@@ -11,7 +11,7 @@ one process uses them too.
 9
 >>> scene_cache.clear()
 
-`scene_cache` is the only global state of the package. It changes the duration of a run but never its results.
+`scene_cache` is the only global state of the package. The cache changes the duration of a run but never its results.
 """
 
 from __future__ import annotations

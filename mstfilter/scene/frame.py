@@ -39,8 +39,8 @@ def depth_sigma(z: ArrayLike) -> np.ndarray:
     """Standard deviation (m) of a depth reading at z-depth `z` (m), in the shape of `z`.
 
     The sensor measures disparity, so the standard deviation grows with the square of depth: sigma = 0.00185 m (z /
-    m)^2. The factor was fitted to table patches of 45 Kinect v1 and Xtion frames (0.6 to 1.5 m). It fits them within
-    10 % up to 1.2 m.
+    m)^2. The factor was fitted to table patches of 45 Kinect v1 and Xtion frames (0.6 to 1.5 m). The factor fits the
+    patches within 10 % up to 1.2 m.
     """
     z = np.asarray(z)
     return _SIGMA_AT_ONE_METRE * z * z
@@ -65,7 +65,7 @@ def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarr
     """The image in the bytes of a PNG, JPEG or TIFF file, decoded with the `flags` of ``cv2.imdecode``.
 
     Raises InputError with the message `problem` if the bytes are not an image, or an image of more than `MAX_PIXELS`
-    pixels. Such an image is not decoded.
+    pixels. An image above the limit is not decoded.
     """
     import cv2
 
@@ -200,7 +200,7 @@ class Frame:
     camera : Camera
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
-        Pixels that show the robot. They are unknown, neither background nor free space.
+        Pixels that show the robot. Robot pixels are unknown, neither background nor free space.
     views : tuple of Frame
         Frames of other cameras at the same time, without views. All cameras need a pose in the same world.
     """

@@ -186,7 +186,7 @@ _Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
-    """A finding if a value is outside its usual limits. It stops the run if the value is impossible."""
+    """A finding if a value is outside its usual limits. The finding stops the run if the value is impossible."""
     if not usual[0] <= value <= usual[1]:
         yield Finding(not possible[0] <= value <= possible[1], text, hints)
 

@@ -264,8 +264,8 @@ class Recording:
 
         The first clip is the first pause alone, and each other clip goes from one pause to the next.
 
-        The first call warns if the input is not plausible. It raises InputError if no hypothesis can be correct
-        (`mstfilter.scene.examine`).
+        The first call warns if the input is not plausible. The first call raises InputError if no hypothesis can be
+        correct (`mstfilter.scene.examine`).
         """
         self._examined  # noqa: B018
         clips = []
@@ -311,7 +311,7 @@ class UsesFiles(ABC):
 
     @abstractmethod
     def check_files(self, recording: Recording) -> None:
-        """Raise InputError if a file is missing or cannot be used for a recording. It is called before a run."""
+        """Raise InputError before a run if a file is missing or cannot be used for a recording."""
 
 
 def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:

@@ -1,7 +1,7 @@
 """Voxel grids and hypotheses.
 
-A `Hypothesis` is the particle of MST. It has an object label for every voxel, with 0 for free space. The z axis of
-the world points up, and the table is at z = 0.
+A `Hypothesis` is the particle of MST. A hypothesis has an object label for every voxel, with 0 for free space. The z
+axis of the world points up, and the table is at z = 0.
 
 >>> import numpy as np
 >>> from mstfilter.scene import Hypothesis, VoxelGrid
@@ -240,7 +240,7 @@ class ObjectRecord:
     def born(
         cls, label: int, birth: int, completion_key: str | None = None, views: tuple[ObjectView, ...] = ()
     ) -> ObjectRecord:
-        """The record of a new object. Its id is ``65536 * birth + label``, which differs for different births."""
+        """The record of a new object. The id ``65536 * birth + label`` is different for different births."""
         return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key, views=views)
 
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:

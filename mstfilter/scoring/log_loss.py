@@ -17,11 +17,11 @@ largest one, can still give a small gain.
 
     ES = sum_i w_i d(h_i, y) - 1/2 sum_ij w_i w_j d(h_i, h_j)
 
-This score is proper. It is never shown without its floor. The floor is the score of the same hypotheses with one draw
-of noise at the border of each, at the rate that is best on other scenes.
+The energy score is proper. The energy score is never shown without its floor. The floor is the score of the same
+hypotheses with one draw of noise at the border of each, at the rate that is best on other scenes.
 
 Counts of forecasts and outcomes are stored by category of the question, so that losses can be split. A split loss is
-only a description. It is not a proper score, because its questions depend on the truth.
+only a description. A split loss is not a proper score, because its questions depend on the truth.
 """
 
 from __future__ import annotations

@@ -132,8 +132,8 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
 def object_metrics(table: Overlap) -> dict[str, float]:
     """Metrics of the objects of one hypothesis: columns of the table against the truth; see the module.
 
-    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Each of
-      these has at least a tenth of the true object's size.
+    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Each of the
+      parts has at least a tenth of the true object's size.
     - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
     - *missed*: true objects for which no object of the hypothesis contains more than half, and that contain more than
       half of no object.
@@ -182,8 +182,8 @@ def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
 def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
     """The hypothesis of least expected loss, which has the largest weighted mean similarity to the others.
 
-    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. It is the best single answer
-    among the hypotheses if the truth has their distribution.
+    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. The result is the best single
+    answer among the hypotheses if the truth has their distribution.
     """
     return int(np.argmax(pairwise_quality(labels) @ np.asarray(weights, dtype=np.float64)))
 

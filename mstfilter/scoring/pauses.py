@@ -44,7 +44,7 @@ class PauseEstimate:
     hypotheses : sequence of Hypothesis or of (X, Y, Z) arrays
         A `Hypothesis` also has probabilities of its voxels.
     weights : (n,) array
-        Their sum is 1.
+        The sum of the weights is 1.
     frame : int, optional
         Frame of the recording at this pause.
     grid : VoxelGrid, optional

@@ -1,7 +1,7 @@
 """Quality of a segmentation, trivial baselines, and the visibility of objects.
 
 Weighted coverage takes, for every region of one segmentation, the region of the other that overlaps it best (Jaccard
-index J). It averages J by size:
+index J). Weighted coverage averages J by size:
 
     side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
 
@@ -15,7 +15,7 @@ There are three forms, by name:
     The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
     Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.
 ``authors``
-    The authors' program. Objects only, but both sides are divided by the volume of the FIRST argument. It is
+    The authors' program. Objects only, but both sides are divided by the volume of the FIRST argument. The form is
     not symmetric, and too high if the first argument is too small.
 
 >>> import numpy as np
@@ -170,7 +170,7 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     t : int
         Number of the pause.
     min_pixels : float
-        Number of pixels from which an image shows an object, for 640 x 480 pixels. It scales with the area.
+        Number of pixels from which an image shows an object, for 640 x 480 pixels. The number scales with the area.
 
     Raises
     ------

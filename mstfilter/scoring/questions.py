@@ -1,8 +1,8 @@
 """Questions about a recording, and the answers of a weighted set of hypotheses.
 
-A question asks whether two voxels belong to one object. The recording alone determines the questions of a pause. They
-depend neither on the ground truth nor on a hypothesis. So all methods answer the same questions, and the true
-probabilities are the best answer.
+A question asks whether two voxels belong to one object. The recording alone determines the questions of a pause. The
+questions depend neither on the ground truth nor on a hypothesis. So all methods answer the same questions, and the
+true probabilities are the best answer.
 
 >>> questions = ask(recording, t=2)                            # 20,000 pairs of voxels
 >>> p = questions.forecasts(labels, weights)                   # sum_i w_i [same object in hypothesis i]
@@ -10,9 +10,9 @@ probabilities are the best answer.
 >>> float(np.mean((p - y) ** 2))                               # Brier score
 
 **Law of the questions.** The questions at pause t are about voxels above the table that the depth images of pause t
-do not observe as free. These voxels also lie on a depth reading above the table, or up to 10 cm behind one along the
-camera's z axis, at pause t or earlier. The first voxel u is uniform among them. The second voxel v is uniform among
-those within 8 voxels of u, without u.
+do not observe as free. The voxels in question also lie on a depth reading above the table, or up to 10 cm behind one
+along the camera's z axis, at pause t or earlier. The first voxel u is uniform among them. The second voxel v is
+uniform among those within 8 voxels of u, without u.
 
 **Noise at the border.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns the
 forecasts of the hypotheses with noise. With probability e, each voxel independently takes the label of one of its six
@@ -21,10 +21,11 @@ neighbours. Only voxels at a border change. The expectation over the noise is co
     p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]
 
 Here u' = u with probability 1 - e, and else one of the six neighbours of u (beyond the grid: u itself). The voxel v'
-is defined in the same way. The probability that object k fills v according to hypothesis i is o_i,v(k). It comes from
-the occupancy, or is 1 for the label of a hypothesis without probabilities. The minimum is the probability of both
-voxels if the object is a level set of its probabilities, {v : o(v) >= U} with one uniform U. Shapes are then nested.
-On six tuning scenes the log loss of this forecast is .004 nats lower than with independent voxels.
+is defined in the same way. The probability that object k fills v according to hypothesis i is o_i,v(k). The
+probability comes from the occupancy, or is 1 for the label of a hypothesis without probabilities. The minimum is the
+probability of both voxels if the object is a level set of its probabilities, {v : o(v) >= U} with one uniform U.
+Shapes are then nested. On six tuning scenes the log loss of this forecast is .004 nats lower than with independent
+voxels.
 """
 
 from __future__ import annotations

@@ -9,9 +9,8 @@ This module imports torch.
 The network works on images of 320 pixels per row (`encode_image`). A frame is reduced to this size, and the resulting
 maps are interpolated. The blocks have a half, a quarter and an eighth of this resolution. At the input and the
 output, 2 x 2 pixels are packed as channels. The outputs are the log odds that a pixel is at the border of an object
-and that it belongs to an object. Another output is the offset to the object's centre in the image (after D. Neven, B.
-De Brabandere, M. Proesmans, L. Van Gool, "Instance segmentation by jointly optimizing spatial embeddings and
-clustering bandwidth", CVPR 2019).
+and that it belongs to an object. Another output is the offset to the object's centre in the image (after Neven et
+al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ Most objects are convex. So depth has a concave crease or a step where two objec
 the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
 length, b baseline, z depth) is affine on every plane, and its noise does not depend on the range. So the largest
 eigenvalue of its Hessian responds to creases and steps only. Colour adds boundaries that are not visible in depth.
-Its weight is lower, because print on a box is not a boundary.
+The weight of colour is lower, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model for the clip's last frame. Its `component_key` includes the content that it uses."""
+        """The model for the clip's last frame. The `component_key` of the model includes the content that it uses."""
 
 
 @dataclass(frozen=True)

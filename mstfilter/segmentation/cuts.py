@@ -169,7 +169,7 @@ def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OptimalCut(CutSampler):
-    """Returns the optimal cut `n` times, without randomness. It is the single-frame baseline (SceneCut)."""
+    """Returns the optimal cut `n` times, without randomness. `OptimalCut` is the single-frame baseline (SceneCut)."""
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         cut = optimal_cut(tree, w)

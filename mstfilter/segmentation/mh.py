@@ -1,6 +1,6 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
-The chain starts at the optimal cut c*. Its target is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
+The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
 ``s2 = sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The second form is
 for values that are log odds (`MergeLogOdds`), which need no scale.
 
@@ -14,7 +14,7 @@ for values that are log odds (`MergeLogOdds`), which need no scale.
 
 A `MoveRule` proposes the next cut. MoveNode (`NodeMoves`) draws one of the n nodes of the cut, and then *up* or
 *down* with equal probability. A move up replaces the node and all its siblings, which must be in the cut, by their
-parent. A move down replaces the node by its children. Each of m siblings proposes the same move up, so the
+parent. A move down replaces the node by its children. Each of the m siblings proposes the same move up, so the
 probability of this move is ``g(up) = m / (2 n)``. The reverse move has probability ``1 / (2 n')``, where n' is the
 number of nodes after the move up. A rule draws a choice, which determines the move:
 
@@ -155,9 +155,9 @@ class NodeMoves(MoveRule):
 class AuthorsMoves(MoveRule):
     """The moves of the authors' program, including its error: the target distribution is not stationary.
 
-    The choice is uniform over (node, direction). A move up is allowed for every node except the root. It removes all
-    nodes of the cut below the parent. The program takes 1 / M as the forward probability of a move up. But each
-    sibling in the cut proposes the same move, so merges are accepted too often.
+    The choice is uniform over (node, direction). A move up is allowed for every node except the root. A move up
+    removes all nodes of the cut below the parent. The program takes 1 / M as the forward probability of a move up.
+    But each sibling in the cut proposes the same move, so merges are accepted too often.
     """
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:
@@ -294,7 +294,8 @@ class MetropolisHastingsCuts(CutSampler):
         Rule of the local moves: the exact rule of the paper, or the rule of the authors' program, which has a wrong
         forward probability.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move. It is used only with a temperature.
+        Fraction of steps that redraw a random subtree instead of a local move. Redraws are used only with a
+        temperature.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool

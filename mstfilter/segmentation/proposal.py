@@ -64,9 +64,9 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its readings are on the table, behind it or outside the workspace. It is also
-    background if fewer than `min_points` readings remain. The fields are for an image of 640 x 480 pixels, and are
-    scaled by the area of the image.
+    A region is background if most of its readings are on the table, behind it or outside the workspace. A region is
+    also background if fewer than `min_points` readings remain. The fields are for an image of 640 x 480 pixels, and
+    are scaled by the area of the image.
     """
 
     min_points: int = 60
@@ -126,7 +126,8 @@ class TreeCutProposal(Proposal):
     Parameters
     ----------
     sampler : CutSampler
-        Draws the cuts. It must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
+        Draws the cuts. The sampler must match the value: a `temperature` for log odds, `sigma2` for
+        `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}

@@ -16,7 +16,7 @@ array([[1, 1],
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
 in order of the mean strength of their common border. The height of a merge is this mean strength. A logistic curve
 maps it to P(boundary), the probability that the merge joins different objects. `start` is P(boundary) of the merge
-that makes a node. It is near 0 if the node lies inside one object, and near 1 if it contains several.
+that makes a node. `start` is near 0 if the node lies inside one object, and near 1 if it contains several.
 """
 
 from __future__ import annotations

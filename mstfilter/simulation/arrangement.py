@@ -84,7 +84,7 @@ def _contact_distance(
 ) -> float:
     """Least distance in metres from `goal` along a direction at which object k overlaps no object.
 
-    It is found by steps inwards until the first overlap, and then by bisection.
+    The distance is found by steps inwards until the first overlap, and then by bisection.
     """
     direction = np.array([np.cos(angle), np.sin(angle)])
 

@@ -1,8 +1,8 @@
 """Drawing of flat charts: printed cartons and labels, wood, cloth, speckle, glaze, peel.
 
-Each function takes a generator and the size of the chart in metres. It returns an RGB uint8 image with 0.4 mm per
-pixel, which `textures` scales to the resolution of the camera. Colours have low saturation, like real packaging under
-office light in a cheap camera.
+Each function takes a generator and the size of the chart in metres. The function returns an RGB uint8 image with 0.4
+mm per pixel, which `textures` scales to the resolution of the camera. Colours have low saturation, like real
+packaging under office light in a cheap camera.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.printing import wood

@@ -91,7 +91,7 @@ class PushLoop:
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
         """n pushes towards objects, with a free place for the finger to come down. The scene does not change.
 
-        They are drawn towards true objects, so most of them move something. Some move nothing or drop an object.
+        Pushes are drawn towards true objects, so most of them move something. Some move nothing or drop an object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)

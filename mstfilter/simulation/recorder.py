@@ -235,12 +235,12 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
 
 
 def cached_path(family: SceneFamily, seed: int, folder: Path) -> Path:
-    """The path at which `cached_recording` stores a recording in a folder. It need not exist."""
+    """The path at which `cached_recording` stores a recording in a folder. The folder need not exist."""
     return folder / f"{family.name}-{seed}-{recipe_key(family, seed)}"
 
 
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
-    """The folder of a simulated recording. It is simulated if it does not exist or has changed on disk.
+    """The folder of a simulated recording. The recording is simulated if it does not exist or has changed on disk.
 
     `overrides` are fields of the family to change. Recordings are stored in `folder`, by default `recordings` in
     `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be

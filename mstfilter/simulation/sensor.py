@@ -1,10 +1,10 @@
 """Models of a structured-light depth sensor and of a colour camera.
 
 In depth, pixels on depth edges are shifted sideways, with some neighbours shifted together. Disparity has Gaussian
-noise and is rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). This gives sigma =
-1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the left of
-objects), at some depth edges, on surfaces at a grazing angle, and out of range. Colour has exposure, blur of the
-optics, photon noise, and the sRGB curve.
+noise and is rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). The rounding gives
+sigma = 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the
+left of objects), at some depth edges, on surfaces at a grazing angle, and out of range. Colour has exposure, blur of
+the optics, photon noise, and the sRGB curve.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.sensor import DepthSensor

@@ -11,7 +11,7 @@ one array, so shading is one gather. Charts show the outside with their upper ed
 >>> len(skin.charts), skin.gloss < 0.2
 (7, True)
 
-The `Room` consists of table top, floor, wall, light and exposure. It is drawn for each scene (`draw_room`).
+The `Room` consists of table top, floor, wall, light and exposure. The room is drawn for each scene (`draw_room`).
 
 >>> from mstfilter.simulation.textures import draw_room
 >>> room = draw_room(np.random.default_rng(0), texel=0.004)

@@ -13,8 +13,8 @@ with torsional and rolling friction. The finger is a capsule on three slides wit
 above it is visible but touches nothing.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates candidate lines through the objects from the saved state. It takes the first line that moves enough objects
-and drops none. Physics is fast compared with rendering, so dozens of candidates are tried.
+simulates candidate lines through the objects from the saved state. `choose_push` takes the first line that moves
+enough objects and drops none. Physics is fast compared with rendering, so dozens of candidates are tried.
 """
 
 from __future__ import annotations
@@ -119,8 +119,9 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
-    Object k of the world is shapes[k]. Its id in images, voxels and poses is k + 1. Objects start far away. `place`
-    puts one object on the table. The arm of the finger is visible and casts shadows but touches nothing.
+    Object k of the world is shapes[k]. The id of the object in images, voxels and poses is k + 1. Objects start far
+    away. `place` puts one object on the table. The arm of the finger is visible and casts shadows but touches
+    nothing.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:

@@ -4,11 +4,12 @@
 
 Run r equals ``filter.run(observations, seeds[r])`` bit for bit, because it draws from the same streams.
 
-The components are called once per step with the particles of all runs, as one population of R n particles. This is
-possible if the `batched` of each component is True (stated by its author) or None (tried; models of
-`StateSpaceModel.of`, programs). A component gets no axis of runs. It must treat each row independently, and take the
-shape of its draws from its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of
-each run from the stream of this run. Observations and inputs that differ between runs are repeated for each row.
+The components are called once per step with the particles of all runs, as one population of R n particles. One call
+for all runs is possible if the `batched` of each component is True (stated by its author) or None (tried; models of
+`StateSpaceModel.of`, programs). A component gets no axis of runs. A component must treat each row independently, and
+take the shape of its draws from its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the
+rows of each run from the stream of this run. Observations and inputs that differ between runs are repeated for each
+row.
 
 The results are checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number of runs changes, some
 runs are compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a

@@ -2,7 +2,7 @@
 
 >>> state, infos = filter.run(observations, seed=0, checkpoint="run.npz")     # run it again after an interruption
 
-The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
+The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
 renamed. So a process that is killed leaves the state of a complete step. All draws depend on the seed and the step
 only, so a continued run equals an uninterrupted one. A run with another seed, filter, model or observation is
 refused. If the filter contains functions, another version of Python is refused too.

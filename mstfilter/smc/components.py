@@ -189,7 +189,7 @@ class Kld(Size):
     With k occupied bins this takes n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample size
     in particle filters through KLD-sampling"). Fox counts the bins while drawing. Here the masses W_b of the bins are
     known. n is the least number with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected number of bins that n
-    draws occupy. This holds for any resampling scheme, and gives slightly more particles than Fox's method.
+    draws occupy. The bound holds for any resampling scheme, and gives slightly more particles than Fox's method.
 
     Parameters
     ----------

@@ -42,12 +42,12 @@ def energy_distance(
     """Energy distance between two weighted populations (Szekely and Rizzo 2013), in the units of the distance.
 
     2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second population. For numbers
-    it is the square of `scipy.stats.energy_distance`. It is 0 if both populations represent the same distribution,
-    and else positive.
+    it is the square of `scipy.stats.energy_distance`. The energy distance is 0 if both populations represent the same
+    distribution, and else positive.
 
-    ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. It must be of negative
-    type (`mstfilter.forecasts.is_negative_type`). Otherwise the result can be 0 for different distributions. Default:
-    The default is Euclidean, for arrays and mappings of arrays.
+    ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
+    of negative type (`mstfilter.forecasts.is_negative_type`). Otherwise the result can be 0 for different
+    distributions. Default: The default is Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -79,8 +79,9 @@ class Measured(ResamplerWrapper):
     """Measures the energy distance between the weighted particles before a selection and the particles after it.
 
     The selection itself does not change. ``notes["energy_distance"]`` is the distance, which `selection_distance`
-    collects. Its mean over seeds is the squared error that the selection adds. For numbers, this is twice the
-    integral over z of the variance of the share of particles below z. `distance` is defined as for `energy_distance`.
+    collects. The mean of the distance over seeds is the squared error that the selection adds. For numbers, this is
+    twice the integral over z of the variance of the share of particles below z. `distance` is defined as for
+    `energy_distance`.
     """
 
     distance: Callable[[Any], np.ndarray] | None = None
@@ -178,15 +179,16 @@ def run_variance(
 
         f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
 
-    W_e and V_e are the weights of the descendants of e before and after the selection. This is the ratio of the
-    probabilities that two draws have different ancestors. For independent selections of particles with different
-    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` it is an approximation. It assumes
-    that pairs of particles with different ancestors are selected together in proportion to their weights.
+    W_e and V_e are the weights of the descendants of e before and after the selection. The factor f_s is the ratio of
+    the probabilities that two draws have different ancestors. For independent selections of particles with different
+    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` it is an approximation. The
+    approximation assumes that pairs of particles with different ancestors are selected together in proportion to
+    their weights.
 
     With a lag L (Olsson and Douc 2019), ancestors L steps earlier replace those at time 0 in the estimate for the
     mean. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts
-    are added. This reduces the noise of the estimates and keeps them valid when all particles share one ancestor. The
-    bias is small if the model forgets its state in L steps.
+    are added. The lag reduces the noise of the estimates and keeps them valid when all particles share one ancestor.
+    The bias is small if the model forgets its state in L steps.
 
     All estimates are of first order in 1 / n, and too low for small n. With 300 particles they are within 15 % of the
     variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of means are
@@ -360,9 +362,9 @@ def set_energy_score(
 def pit(population: Population, truth: Any, rng: np.random.Generator) -> np.ndarray:
     """Probability integral transform (d,) of the true vector under a population of vectors, coordinate by coordinate.
 
-    ``F(y-) + U (F(y) - F(y-))``, where F is the weighted distribution function and U is uniform. It is uniform on [0,
-    1] if the truth has the distribution of the population (Czado, Gneiting, Held 2009). Over many data sets,
-    ``scipy.stats.kstest(values, "uniform")`` tests the calibration of a filter.
+    ``F(y-) + U (F(y) - F(y-))``, where F is the weighted distribution function and U is uniform. The result is
+    uniform on [0, 1] if the truth has the distribution of the population (Czado, Gneiting, Held 2009). Over many data
+    sets, ``scipy.stats.kstest(values, "uniform")`` tests the calibration of a filter.
     """
     x, y = as_matrix(population.particles), np.asarray(truth, dtype=np.float64).reshape(-1)
     if x.shape[1] != len(y):

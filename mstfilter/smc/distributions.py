@@ -144,7 +144,7 @@ class _Independent(_Checked):
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether all numbers of a float or float64 array are finite. It is False also if their sum is not finite."""
+    """Whether all numbers of a float or float64 array, and their sum, are finite."""
     if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
         return math.isfinite(np.add.reduce(value, axis=None))
     return type(value) is float and math.isfinite(value)

@@ -9,8 +9,8 @@
 >>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
 
 `ClusterStratified` gives every group of similar particles a share of the selection by its weight, with at least one
-particle if possible. It then selects inside each group. A light group that differs from all others keeps a particle.
-Schemes that use only weights usually lose it. The schemes are exact in expectation.
+particle if possible. `ClusterStratified` then selects inside each group. A light group that differs from all others
+keeps a particle. Schemes that use only weights usually lose it. The schemes are exact in expectation.
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -258,7 +258,7 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
     """(m,) cluster of each particle; -1 if the particle has no weight.
 
     The heaviest particle without a cluster becomes the leader of a new cluster, with all remaining particles that are
-    similar enough to it. This is repeated.
+    similar enough to it. The assignment is repeated until all particles have a cluster.
     """
     cluster = np.full(len(weights), -1, np.int64)
     number = 0

@@ -76,14 +76,15 @@ class ParticleFilter(AtStep):
     proposal : Proposal, optional
         Draws new particles from the observation at every step.
     update : Update
-        Weights the particles by the observation. It is not needed if the transition weights the particles
+        Weights the particles by the observation. The update is not needed if the transition weights the particles
         (probabilistic programs).
     resampler : Resampler
         Selects particles by weight.
     trigger : Trigger
         Decides whether a step resamples. More than `n` particles are always resampled.
     lookahead : Lookahead, optional
-        For auxiliary filters. Particles are selected by weight times priority. It needs ``resample="before"``.
+        For auxiliary filters. Particles are selected by weight times priority. The lookahead needs
+        ``resample="before"``.
     rejuvenation : Rejuvenation, optional
         For resample-move filters. Moves the particles at the end of a step that resampled.
     size : Size, optional
@@ -270,7 +271,7 @@ class _Step:
         return selected, True
 
     def _resample(self, population: Population, n: int, stream: str) -> Population:
-        """Resampled particles. Their ancestors are -1 if the resampler does not report them."""
+        """Resampled particles. The ancestors are -1 if the resampler does not report them."""
         resampler = self.filter.resampler
         selected = _checked(resampler.resample(self.rng(stream), population, n), resampler)
         if "ancestor" in selected.parents:
@@ -353,7 +354,7 @@ class _Step:
         return fused, False
 
     def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
-        """Move the particles by `rejuvenation`. Their parents do not change."""
+        """Move the particles by `rejuvenation`. The parents of particles do not change."""
         rejuvenation = self.filter.rejuvenation
         if rejuvenation is None:
             return chosen
@@ -400,7 +401,7 @@ class _Step:
 
 
 class _Slot:
-    """Wraps the calls of components. It measures wall time, and adds step and slot to error messages.
+    """Wraps the calls of components. The wrapper measures wall time, and adds step and slot to error messages.
 
     >>> with slot("transition"):
     ...     moved = transition.predict(rng, population, observation)

@@ -47,7 +47,7 @@ def nonlinear_gaussian(
     """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
 
     `f` and `h` return the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
-    row. They may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of T entries.
+    row. The functions may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of T entries.
 
     `Q` and `P0` may be singular, for example if noise acts only on the velocity. Then x_t has no density given
     x_{t-1}. The model has no `log_transition` (for `P0`: no `log_initial`), and functions that need it raise
@@ -266,7 +266,8 @@ def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[
 
     Given x_{t-1} the state is N(f(x_{t-1}), Q), and `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000,
     section II D). The arguments are as in `nonlinear_gaussian`. `jacobian` returns the derivatives of `h`, (n, k, d)
-    or (k, d). It is computed for all particles together. The ExtendedKalmanFilter of filterpy holds a single state.
+    or (k, d). The update is computed for all particles together. The ExtendedKalmanFilter of filterpy holds a single
+    state.
     """
     Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
 
@@ -284,9 +285,9 @@ def ukf_proposal(
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
 
-    It needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are those of
-    filterpy's MerweScaledSigmaPoints: the spread of the points, the weight of the central point, and the secondary
-    spread. The other arguments are as in `nonlinear_gaussian`.
+    The update needs no derivatives (van der Merwe, Doucet, de Freitas, Wan 2000). `alpha`, `beta` and `kappa` are
+    those of filterpy's MerweScaledSigmaPoints: the spread of the points, the weight of the central point, and the
+    secondary spread. The other arguments are as in `nonlinear_gaussian`.
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 

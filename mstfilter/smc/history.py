@@ -132,7 +132,7 @@ def _summary(name: str, a: np.ndarray) -> str:
 def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:
     """Iterate over a run, ``filter.iterate(observations, seed)``, and keep the results of the collectors.
 
-    Each collector is a function of (state, info). Its result must have the same shape at every step.
+    Each collector is a function of (state, info). The result of a collector must have the same shape at every step.
     """
     rows: dict[str, list[Any]] = {name: [] for name in collectors}
     state, times = None, []

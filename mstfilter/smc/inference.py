@@ -17,8 +17,8 @@ A model with parameters is a function that returns a filter:
   the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Otherwise the
   early states hardly change.
 - `smc_sampler` moves particles from the prior to the posterior by tempering (Del Moral, Doucet, Jasra 2006). The
-  likelihood must be computable. It estimates the evidence, and can find several modes. ``waste_free=True`` uses all
-  states of the moves.
+  likelihood must be computable. `smc_sampler` estimates the evidence, and can find several modes. ``waste_free=True``
+  uses all states of the moves.
 """
 
 from __future__ import annotations
@@ -86,8 +86,9 @@ class Chains(Table):
         Returns
         -------
         xarray.DataTree
-            Groups ``posterior`` and ``sample_stats``. The latter has ``log_evidence``, and ``lp`` for the
-            log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted, without paths.
+            Groups ``posterior`` and ``sample_stats``. The group ``sample_stats`` has ``log_evidence``, and ``lp`` for
+            the log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted, without
+            paths.
         """
         theta = self.theta[discard:].swapaxes(0, 1)
         if names and len(names) != theta.shape[2]:
@@ -208,7 +209,7 @@ def pmmh(
     Parameters
     ----------
     filter_of : callable
-        ``(theta) -> ParticleFilter`` for parameters (d,). Its components must be properly weighted.
+        ``(theta) -> ParticleFilter`` for parameters (d,). The components of the filter must be properly weighted.
     log_prior : callable
         ``(theta) -> float``; -inf outside of the support.
     start : (d,) or (R, d) array_like
@@ -306,7 +307,7 @@ def ensemble(
     filter_of, observations, log_prior, batched
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
-        First parameters. They must be different, and at least 2 d.
+        First parameters. There must be at least 2 d different ones.
     moves : optional
         Moves of emcee; the default is its stretch move.
     """
@@ -345,8 +346,8 @@ def particle_gibbs(
     filter_of : callable
         ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
     draw : callable
-        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. It is an exact draw
-        if the prior is conjugate, or a Metropolis step with `path_log_prob`.
+        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. The draw is an exact
+        draw if the prior is conjugate, or a Metropolis step with `path_log_prob`.
     start : (d,) array_like
         First parameters.
     """

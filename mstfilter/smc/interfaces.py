@@ -1,7 +1,7 @@
 """Interfaces of the components of a particle filter, and its `State` and `Info`.
 
-A component is a frozen dataclass. Its fields are hyperparameters, with bounds in their annotations (see
-`mstfilter.fields`), and one method defines its behaviour. Methods that draw random numbers take the generator as
+A component is a frozen dataclass. The fields of a component are hyperparameters, with bounds in their annotations
+(see `mstfilter.fields`), and one method defines its behaviour. Methods that draw random numbers take the generator as
 first argument. All methods work on whole populations, so a component can share work between particles.
 
 >>> from dataclasses import dataclass
@@ -124,7 +124,7 @@ class Update(Component):
 
 
 class Resampler(Component):
-    """Selects particles by weight. Base class of schemes that compare particles. They define `resample`.
+    """Selects particles by weight. Base class of schemes that compare particles. The schemes define `resample`.
 
     A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
     """
@@ -178,8 +178,8 @@ class WeightResampler(Resampler):
 class TransformResampler(Resampler):
     """A resampler that makes new particles instead of selecting some, for example by transport. Define `resample`.
 
-    The result has n particles with equal weights, the log mean of the old ones. It has no parents, since a new
-    particle has several ancestors. The mean of the new particles equals the weighted mean of the old ones up to
+    The result has n particles with equal weights, the log mean of the old ones. The result has no parents, since a
+    new particle has several ancestors. The mean of the new particles equals the weighted mean of the old ones up to
     rounding. Expectations of other functions are not kept exactly, so the resampler is not properly weighted.
     """
 
@@ -242,7 +242,7 @@ class Lookahead(Component):
 
     @abstractmethod
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
-        """(n,) log priority of each particle x_{t-1} given y_t. It must be finite: -inf would bias the filter."""
+        """(n,) finite log priority of each particle x_{t-1} given y_t; -inf would bias the filter."""
 
 
 class Rejuvenation(Component):
@@ -256,8 +256,8 @@ class Rejuvenation(Component):
 
         `population` holds the weighted particles x_t after the observation. `previous` holds their x_{t-1} row by
         row; None at the first step. The result has as many particles in the same order and with unchanged log
-        weights. They are moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant. `observation` is y_t; None if
-        it is missing.
+        weights. The particles are moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant. `observation` is
+        y_t; None if it is missing.
         """
 
 

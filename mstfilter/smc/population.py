@@ -11,8 +11,8 @@ array([0.25, 0.25, 0.5 ])
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
 particles on access. `take` selects from all of these. Rows of arrays are copied, and objects are shared.
 
-A population is immutable. It does not copy the given arrays but holds read-only views of them. Do not write to an
-array after a population was made from it; pass ``array.copy()`` if you need to.
+A population is immutable. A population does not copy the given arrays but holds read-only views of them. Do not write
+to an array after a population was made from it; pass ``array.copy()`` if you need to.
 """
 
 from __future__ import annotations
@@ -346,7 +346,7 @@ class Population(Table):
         )
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
-        """The result of a resampling. It is `take` with ``parents["ancestor"]`` and additional notes."""
+        """The result of a resampling. The result is `take` with ``parents["ancestor"]`` and additional notes."""
         return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:

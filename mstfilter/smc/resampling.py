@@ -1,7 +1,7 @@
 """Resampling by weight: schemes with equal output weights.
 
 W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, and f = frac(n
-W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. They differ in the variance of N_i.
+W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. The schemes differ in the variance of N_i.
 
 ==============  =================================================  ====================================
 scheme          N_i                                                variance of N_i
@@ -211,7 +211,7 @@ class Killing(WeightResampler):
 class LargestWeights(WeightResampler):
     """Selects the n particles of largest weight, with equal weights and without random draws.
 
-    It is not properly weighted.
+    The scheme is not properly weighted.
 
     If weights are equal, the first particle is selected, since the sort in `select` is stable. If fewer than n
     particles have positive weight, they are repeated in turn.
@@ -317,8 +317,8 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    Fewer than 2000 indices are in ascending order. More indices are drawn in O(m + n). They ascend only from one
-    stratum of the weight to the next.
+    Fewer than 2000 indices are in ascending order. More indices are drawn in O(m + n). The indices ascend only from
+    one stratum of the weight to the next.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -347,7 +347,7 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
     """(n,) indices of many points, which are distributed to strata of equal weight.
 
-    It is four times as fast as a search for 10^6 points.
+    The method is four times as fast as a search for 10^6 points.
 
     Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. The
     bound is increased where it is too small.

@@ -69,8 +69,8 @@ def run_many(
         If True, `observations` is a list of sequences of T observations, one for each seed. Components that are
         called with all runs get the observations of a step by row.
     workers : int
-        Number of processes. With 1, the calling process is used. Other numbers start processes by joblib's loky.
-        These are new interpreters that get the filters by cloudpickle and limit the numerical libraries to one
+        Number of processes. With 1, the calling process is used. Other numbers start processes by joblib's loky. The
+        processes are new interpreters that get the filters by cloudpickle and limit the numerical libraries to one
         thread. InputError if a worker dies, with the runs that may have caused it.
     folder : path, optional
         Every finished run is stored in this folder, as ``arm/seed.npz``. Characters of an arm other than lower-case
@@ -175,7 +175,7 @@ class _Job:
         return self.ys[self.seeds.index(seed) % len(self.ys)]
 
     def chunks(self, found: Mapping[_Task, Collected], workers: int) -> list[_Chunk]:
-        """Missing runs for one call of a worker. They contain many seeds if these can be processed together."""
+        """Missing runs for one call of a worker. The runs contain many seeds if these can be processed together."""
         chunks = []
         for arm in self.arms:
             missing = [seed for seed in self.seeds if (arm, seed) not in found]

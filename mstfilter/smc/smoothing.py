@@ -6,14 +6,14 @@
 
 Three smoothers of a record return a tuple with one population per time:
 
-- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record. After many
-  resamplings all paths have the same beginning.
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It has more distinct
-  particles. It has a bias if the state depends on observations more than `lag` steps later.
+- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). `genealogy` needs only the record. After
+  many resamplings all paths have the same beginning.
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` has more
+  distinct particles. The result has a bias if the state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
   path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"`` or ``"rejection"``.
 
-They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
+The paths are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
 `paris` yields smoothed means of sums over the path while observations arrive, in constant memory.
 
@@ -137,11 +137,11 @@ def backward_paths(
         max f / p(x_{t+1} | y_0 .. y_t).
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
-        steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
-        The chain need not converge. Given x_{t+1}, a parent already has the distribution of "exact" after independent
-        selections of a bootstrap filter, and up to order 1 / N after other selections. So a small number of steps
-        causes no additional bias (Dau and Chopin 2023). Steps reduce the variance. Without accepted steps, the paths
-        are those of `genealogy`.
+        steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. The method needs a record with
+        parents. The chain need not converge. Given x_{t+1}, a parent already has the distribution of "exact" after
+        independent selections of a bootstrap filter, and up to order 1 / N after other selections. So a small number
+        of steps causes no additional bias (Dau and Chopin 2023). Steps reduce the variance. Without accepted steps,
+        the paths are those of `genealogy`.
     steps : int
         Number of Metropolis steps of "mcmc".
     log_bound : float
@@ -318,8 +318,7 @@ def paris(
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight, in random order (those of `independent_draws` are nearly
-    sorted)."""
+    """(n,) indices drawn independently by weight, in random order."""
     index = independent_draws(rng, population.weights, n)
     rng.shuffle(index)
     return index

@@ -13,8 +13,9 @@
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
 
-`metropolis` is the Metropolis-Hastings kernel of all chains of this package. It moves particles (`RandomWalkMove`,
-and `ProgramMove` for programs), parameters (`pmmh`, `smc_sampler`) and ancestors (`backward_paths`).
+`metropolis` is the Metropolis-Hastings kernel of all chains of this package. The kernel moves particles
+(`RandomWalkMove`, and `ProgramMove` for programs), parameters (`pmmh`, `smc_sampler`) and ancestors
+(`backward_paths`).
 """
 
 from __future__ import annotations
@@ -63,9 +64,10 @@ class StateSpaceModel(AtStep):
     log_likelihood : callable
         ``(particles, y) -> (n,)`` log p(y_t | x_t).
     log_initial : callable, optional
-        ``(particles) -> (n,)`` log p(x_0). It is needed by guided filters and moves.
+        ``(particles) -> (n,)`` log p(x_0). The function is needed by guided filters and moves.
     log_transition : callable, optional
-        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. It is needed by guided filters and moves.
+        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. The function is needed by guided filters and
+        moves.
     batched : bool or None
         Whether the functions treat each particle independently, so that they can be called with the particles of many
         runs (see `mstfilter.smc.batching`). None: With None, `run_many` tries it.
@@ -197,8 +199,8 @@ class Dynamics(_OfModel, DensityTransition):
     model : StateSpaceModel
         The model, with `log_transition` if there is a proposal.
     proposal : callable, optional
-        ``(particles, y) -> distribution`` of x_t, one row per particle. Its tails must not be lighter than those of
-        f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
+        ``(particles, y) -> distribution`` of x_t, one row per particle. The tails of the distribution must not be
+        lighter than those of f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
     """
 
     model: StateSpaceModel
@@ -252,7 +254,7 @@ class RandomWalkMove(Rejuvenation):
     model : StateSpaceModel
         The model with its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of them.
     scale : float or array_like
-        Standard deviation of a step, in the units of the state. It is fixed, so that the evidence is unbiased.
+        Standard deviation of a step, in the units of the state. The scale is fixed, so that the evidence is unbiased.
     steps : int
         Number of Metropolis steps per move.
     """
@@ -313,8 +315,8 @@ def metropolis(
     Parameters
     ----------
     state
-        One row per chain: an array, or a mapping of arrays. It also holds the log densities, so that those of the
-        present state are not evaluated again.
+        One row per chain: an array, or a mapping of arrays. The state also holds the log densities, so that those of
+        the present state are not evaluated again.
     propose : callable
         ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
         q(new | old)). A ratio of NaN (both states are impossible) is rejected.

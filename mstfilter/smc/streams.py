@@ -9,9 +9,9 @@ workers, the order of work, and the removal of a component change no other strea
 True
 
 A `Key` is data (an integer and a tuple) and can be stored. Generators are not stored. The generator of a key is
-numpy's PCG64. Its seed of 256 bits is the hash SHAKE-128 (FIPS 202) of the key. Streams of different keys are
-independent as far as a cryptographic hash behaves like a random function. The probability that two of a billion
-streams have the same seed is below 1e-50.
+numpy's PCG64. The seed of a generator of 256 bits is the hash SHAKE-128 (FIPS 202) of the key. Streams of different
+keys are independent as far as a cryptographic hash behaves like a random function. The probability that two of a
+billion streams have the same seed is below 1e-50.
 
 If components are called once for R runs of n particles, rows (R n, ...) are the particles, run by run. `Rows` are
 such arrays. `RunGenerators` draw them, with row r of every array from the generator of run r.

@@ -1,7 +1,7 @@
 """Resampling schemes that wrap another scheme, and resampling by transport.
 
-`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme. They change the order of the particles,
-merge equal ones, or change the weights.
+`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme. The wrappers change the order of the
+particles, merge equal ones, or change the weights.
 
 >>> import numpy as np
 >>> from mstfilter.smc import Coalesced, EnsembleTransform, FearnheadClifford, Population
@@ -40,7 +40,7 @@ MAX_TRANSPORT = 100_000
 class ResamplerWrapper(Resampler):
     """Base class of resamplers that change the input or the result of another resampler, `scheme`.
 
-    It is properly weighted if the wrapped resampler is.
+    The wrapper is properly weighted if the wrapped resampler is.
     """
 
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
@@ -225,8 +225,8 @@ class EnsembleTransform(TransformResampler):
     T_ij minimises the sum of ``T_ij |x_i - y_j|^2`` with row sums W_i and column sums 1 / n. The new particles are n
     sum_i T_ij x_i. The targets y_j are the old particles. If n differs from m, they are equally spaced ones in their
     order. In one dimension T is the monotone transport, found by sorting in O(m log m). Otherwise it is a linear
-    program of m n variables, so use a few hundred particles. It draws no random numbers. Mixtures have less variance
-    than the weighted particles. Particles are arrays of floats, or mappings of such arrays.
+    program of m n variables, so use a few hundred particles. The scheme draws no random numbers. Mixtures have less
+    variance than the weighted particles. Particles are arrays of floats, or mappings of such arrays.
 
     Reference: Reich (2013), "A nonparametric ensemble transform method for Bayesian inference", SIAM Journal on
     Scientific Computing 35.

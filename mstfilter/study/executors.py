@@ -2,7 +2,7 @@
 
 >>> outcomes = Local(workers=2).run(jobs, tell=print)
 
-A job is a mapping of plain values (see `mstfilter.study.jobs`). It always ends with a `JobOutcome`. An error in a
+A job is a mapping of plain values (see `mstfilter.study.jobs`). A job always ends with a `JobOutcome`. An error in a
 job, the death of a worker or an exceeded time limit does not stop the other jobs.
 """
 
@@ -63,9 +63,9 @@ class Executor(Bounded, ABC):
 class Local(Executor):
     """Runs jobs in processes of this machine, one thread each.
 
-    Each worker is a `pebble.ProcessPool` of one process. It is started with ``spawn`` and runs many jobs. If a worker
-    dies or exceeds the time limit of its job, it is replaced. As with `multiprocessing`, a script that uses this
-    class needs ``if __name__ == "__main__":``.
+    Each worker is a `pebble.ProcessPool` of one process. The process is started with ``spawn`` and runs many jobs. If
+    a worker dies or exceeds the time limit of its job, it is replaced. As with `multiprocessing`, a script that uses
+    this class needs ``if __name__ == "__main__":``.
 
     Parameters
     ----------

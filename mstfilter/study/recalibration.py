@@ -3,9 +3,9 @@
 >>> add_log_loss(rows, counts)            # adds recalibrated_log_loss, recalibrated_log_loss_same, ..., energy_floor
 >>> fitted = fit_recalibration(rows, counts, [("s1", "mst")])  # to score the scenes of another study
 
-Recalibration and the floor of the energy score need other scenes of the same family and arm. These are the other
-scenes of the study, or the scenes to which a given recalibration was fitted. Filter seeds of one scene are never on
-both sides.
+Recalibration and the floor of the energy score need other scenes of the same family and arm. The scenes of the fit
+are the other scenes of the study, or the scenes to which a given recalibration was fitted. Filter seeds of one scene
+are never on both sides.
 """
 
 from __future__ import annotations

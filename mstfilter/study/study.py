@@ -1,4 +1,4 @@
-"""Runs a study. It checks everything first, then makes every missing run, and then writes the tables.
+"""Runs a study. `run_study` checks everything first, then makes every missing run, and then writes the tables.
 
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
@@ -67,7 +67,7 @@ def run_study(
     Parameters
     ----------
     path : Path
-        The study folder. It must be new, empty, or from an earlier call.
+        The study folder. The folder must be new, empty, or from an earlier call.
     executor : Executor, optional
         By default, one process for each core of this machine.
     overrides : sequence of str

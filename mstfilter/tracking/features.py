@@ -6,8 +6,8 @@
 Features are detected once in the whole image and shared by all hypotheses and segments.
 
 Automatic exposure and white balance change the colour of the whole image when something moves. In real clips, most of
-an untouched table differs by more than 12 grey levels. `matched_colour` removes this change. It fits a gain and an
-offset per channel where the depth is unchanged.
+an untouched table differs by more than 12 grey levels. `matched_colour` removes this change. The function fits a gain
+and an offset per channel where the depth is unchanged.
 """
 
 from __future__ import annotations

@@ -11,9 +11,9 @@ depth m, the cost of a point is
 The score S is the mean cost of the counted points, plus a term for the fraction of visible points on pixels that the
 flow traces back to another object. The term distinguishes two objects that look the same. A lower score is better.
 
-`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour. It compares
-every moved point with the measurement at its pixel, so errors of the tracked mask have no effect. Colour determines
-motions that depth does not determine, for example the rotation of a can about its axis.
+`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
+`refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
+effect. Colour determines motions that depth does not determine, for example the rotation of a can about its axis.
 
 >>> MotionResidual().score(track, T)                      # doctest: +SKIP
 >>> refine_motion(track, T)                               # doctest: +SKIP
@@ -119,7 +119,7 @@ def _gradients(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def refine_motion(track: Track, T: np.ndarray) -> np.ndarray:
-    """Improve a motion (4, 4) of a segment. It is returned unchanged if too few points can be compared."""
+    """Improve a motion (4, 4) of a segment. The motion is returned unchanged if too few points can be compared."""
     points, colours = track.sample(_N_REFINED)
     grey = colours.mean(axis=1)
     for gate in _GATES:

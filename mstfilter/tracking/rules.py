@@ -122,7 +122,7 @@ class MotionRule(Checked, ABC):
     @returns(_check_candidates)
     @abstractmethod
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """Possible motions of a segment, at least one. It is called once for all hypotheses."""
+        """Possible motions of a segment, at least one. The method is called once for all hypotheses."""
 
     @returns(_check_choice)
     @abstractmethod
@@ -240,7 +240,8 @@ class MstRule(MotionRule):
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame. These are additional candidates.
+        Number of best candidates that are refined against the whole last frame. Refined motions are additional
+        candidates.
     search_above : float
         If every score is larger than this value, the object is searched for around its last position. A negative
         value disables the search.

@@ -1,14 +1,14 @@
 """Checks that a program treats its particles independently and draws only by `sample`.
 
 A program processes all particles in one pass. By mistake it may mix them (``x.mean()``, ``previous["x"][0]``), draw
-from another generator, or keep values between steps. Such a program runs without an error, but its weights are wrong.
-`Guard` checks some steps of each kind: the first and the second, then the 9th, 66th, 515th, ... (8^k + k, which also
-detects a fault of every third step):
+from another generator, or keep values between steps. A program with this fault runs without an error, but its weights
+are wrong. `Guard` checks some steps of each kind: the first and the second, then the 9th, 66th, 515th, ... (8^k + k,
+which also detects a fault of every third step):
 
 1. The first two steps run again with the same random numbers. All values and log weights must equal those of the
    first run.
-2. A few particles run alone with the same values. Their distributions and returned values must be those of the step.
-   They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
+2. A few particles run alone with the same values. The distributions and returned values must be those of the step.
+   The particles are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
 3. Particles of a `per_particle` program also run alone. In the first two steps, each particle gets copies of the
    lists, dictionaries, sets and arrays in the closure and the globals of the function, as before the step.
 4. If there is a guide, a step is also drawn from the model. The guide must be able to draw these values, and the two
@@ -440,11 +440,13 @@ _KNOWN: set[type] = set()
 
 
 def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
-    """Raise if draws of a user's distribution of numbers do not have its density. It is checked once for each class.
+    """Raise if draws of a user's distribution of numbers do not have its density.
 
-    The distribution function is the integral of the density between sorted draws. Its distance from the uniform
-    distribution is below .12 for 1000 draws of the true distribution, with a false-alarm rate of 1e-12 (Dvoretzky,
-    Kiefer, Wolfowitz).
+    The density is checked once for each class.
+
+    The distribution function is the integral of the density between sorted draws. The distance of this integral from
+    the uniform distribution is below .12 for 1000 draws of the true distribution, with a false-alarm rate of 1e-12
+    (Dvoretzky, Kiefer, Wolfowitz).
     """
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:

@@ -42,7 +42,7 @@ class SiteHandler(ABC):
     draws : bool
         Whether the values are new rather than given.
     strict : bool
-        Whether a log density of NaN or +inf is an error. It is used for single particles that are drawn.
+        Whether a log density of NaN or +inf is an error. The check is used for single particles that are drawn.
     """
 
     observes = True

@@ -41,7 +41,8 @@ def sample(name: str, distribution: Any) -> Any:
     name : str
         Unique within a step, except for sites in different branches of a `switch`.
     distribution : Distribution
-        A distribution of this package, frozen of scipy.stats, or of torch. Its parameters have one row per particle.
+        A distribution of this package, frozen of scipy.stats, or of torch. The parameters of the distribution have
+        one row per particle.
 
     Returns
     -------
@@ -72,7 +73,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     probs : (k,) or (n, k) array_like
         Probabilities of the k branches.
     branches : sequence of callables
-        Each branch is called once with the rows of `args` that belong to its particles. It may call `sample`,
+        Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
         `observe` and `switch`. A site with the same name in several branches is one array. The value is NaN (0 for
         integers) for particles that did not reach the site. A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
@@ -111,7 +112,7 @@ class PerParticle(AtStep):
 
 
 def per_particle(function: Callable[..., Any]) -> PerParticle:
-    """Mark a program whose set of sites may differ between particles. It runs once for every particle."""
+    """Mark a program whose set of sites may differ between particles. The program runs once for every particle."""
     return PerParticle(function)
 
 
@@ -143,7 +144,7 @@ class Trace(Mapping[str, Any]):
 
 
 class FrozenList(list[Any]):
-    """A list in a `Trace`. It is immutable. ``items + [new]`` and ``list(items)`` are new lists."""
+    """A list in a `Trace`. A `FrozenList` is immutable. ``items + [new]`` and ``list(items)`` are new lists."""
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise TypeError("a list in a particle is read-only: write items + [new], or change list(items)")

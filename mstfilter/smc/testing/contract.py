@@ -1,8 +1,8 @@
 """Common parts of all contracts: the base class, its run without pytest, and helpers that describe failures.
 
-A contract is a test class for pytest. It defines the arguments of a call (`inputs`), the call (`call`), and the
-requirements of every result (`check_result`). Each ``test_`` method checks one more property. The first line of its
-docstring states the property, and the message of a failed assertion states how it is violated:
+A contract is a test class for pytest. A contract defines the arguments of a call (`inputs`), the call (`call`), and
+the requirements of every result (`check_result`). Each ``test_`` method checks one more property. The first line of
+its docstring states the property, and the message of a failed assertion states how it is violated:
 
 >>> class TriggerContract(Contract):
 ...     def call(self, component, rng, inputs):
@@ -53,7 +53,7 @@ _Test = TypeVar("_Test", bound=Callable[..., None])
 
 
 def statistical(test: _Test) -> _Test:
-    """Mark a test that uses random samples. It fails with probability `FALSE_ALARM` for a correct component."""
+    """Mark a test that uses random samples. The test fails with probability `FALSE_ALARM` for a correct component."""
     test.statistical = True  # type: ignore[attr-defined]
     return test
 

@@ -90,7 +90,7 @@ class Sample:
     Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
     betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
     mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, its largest value
-    over any number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no
+    over any number of calls exceeds 1 / p with probability at most p. The test needs no normal approximation and no
     variance. So a scheme that gives very many copies in rare calls passes. Calls may be added if the result is not
     clear.
     """
@@ -130,8 +130,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expectation of each particle and group.
 
-        It exceeds log(2 / p) with probability at most p. The result is 0 if the mean is less than four standard
-        errors away. 16 copies are added to all calls, for particles that are rarely selected.
+        The evidence exceeds log(2 / p) with probability at most p. The result is 0 if the mean is less than four
+        standard errors away. 16 copies are added to all calls, for particles that are rarely selected.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)

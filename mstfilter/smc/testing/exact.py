@@ -46,15 +46,15 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 class ExactContract(PopulationContract):
     """Properties of components with exact draws to compare with.
 
-    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. It returns three
-    items. The first is a population of `n` particles before the call. The second is a population of exact draws, or
-    with exact weights, after the call. The third is the observation. An optional fourth item
-    ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides. It makes the weights f / q of a guided
-    move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. `exact` returns
+    three items. The first is a population of `n` particles before the call. The second is a population of exact
+    draws, or with exact weights, after the call. The third is the observation. An optional fourth item
+    ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides. The factor makes the weights f / q of
+    a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
 
     The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 rows, the tests detect a
-    standard deviation that is wrong by 2 %, and a shift by 3 % of it. They also detect missing tails with 0.1 % of
-    the probability, and a correlation of 0.02 between particles.
+    standard deviation that is wrong by 2 %, and a shift by 3 % of it. The tests also detect missing tails with 0.1 %
+    of the probability, and a correlation of 0.02 between particles.
     """
 
     exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None

@@ -34,11 +34,11 @@ _N = 6
 
 
 class TransitionContract(BatchedContract, ExactContract):
-    """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
+    """The contract of every `Transition`. The two statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
-    these rows, and the observation. For a guided move it also returns log p(y_t | x_t), as a function of x_t. If the
-    transition weights by the observation, the population of x_t has these weights.
+    The test of the distribution needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from
+    f(x_t | x_{t-1}) given these rows, and the observation. For a guided move it also returns log p(y_t | x_t), as a
+    function of x_t. If the transition weights by the observation, the population of x_t has these weights.
     """
 
     slot = "transition"
@@ -152,7 +152,7 @@ class TransitionContract(BatchedContract, ExactContract):
     def _moves(self, component: Any, inputs: dict[str, Any], seed: int = 0) -> np.ndarray:
         """(300, n, d + 1) results of 300 calls: coordinates, and the change of the log weight.
 
-        They are rounded, since the order of a sum changes its last bits.
+        The results are rounded, since the order of a sum changes its last bits.
         """
         given, moves = inputs["population"], []
         for k in range(300):
@@ -238,7 +238,7 @@ class DensityTransitionContract(TransitionContract):
 
 
 class ProposalContract(BatchedContract, ExactContract):
-    """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Proposal`. The only statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
     particles, and the observation. For the initial proposal these are draws of p(x_0). An optional third item
@@ -289,7 +289,7 @@ class ProposalContract(BatchedContract, ExactContract):
 
 
 class UpdateContract(BatchedContract, ExactContract):
-    """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Update`. The only statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of p(x |
     y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one, with
@@ -389,7 +389,7 @@ class UpdateContract(BatchedContract, ExactContract):
 
 
 class RejuvenationContract(ExactContract):
-    """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Rejuvenation`. The only statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
     population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and y_t, and

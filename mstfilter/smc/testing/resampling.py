@@ -4,8 +4,8 @@ A resampler must be properly weighted. A particle of normalised weight W_i gets 
 that together carry W_i if their weights differ. `mstfilter.smc.testing.copies` lists the weights and numbers of
 particles of the tests: n = m, n < m and n > m, ties, zeros, heavy and light weights.
 
-A scheme that makes new particles instead of copies is a `TransformResampler` and has another law. It keeps the
-weighted mean of the particles, and its output weights are equal.
+A scheme that makes new particles instead of copies is a `TransformResampler` and has another law. The new population
+keeps the weighted mean of the particles, and its output weights are equal.
 
 A scheme may be correct and slow. For example, the cost of rejection grows with max w / mean w. The generator of the
 statistical tests counts its draws. A case that exceeds the budget is skipped as "too slow at this weight". The clock
@@ -52,7 +52,7 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 
 
 class ResamplerContract(Contract):
-    """The contract of every `Resampler`. Its statistical tests have a false-alarm rate of at most 1e-6 each.
+    """The contract of every `Resampler`. The statistical tests have a false-alarm rate of at most 1e-6 each.
 
     The particles of the example must differ. The tests detect a deviation of a mean of about six standard errors in
     the calls of a `Case`, and at least 0.3 % of the particle's weight.
