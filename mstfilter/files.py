@@ -280,7 +280,7 @@ def folder_name(name: str) -> str:
     """A folder name for any text, which differs for different texts on every file system.
 
     Lower-case letters, digits, ``_`` and ``-`` are kept. Other texts, long texts and names that Windows reserves
-    become such letters, ``~`` and a hash.
+    become these characters, ``~`` and a hash.
     """
     plain = re.sub(r"[^a-z0-9_-]+", "_", name.lower())[:60]
     if plain == name and name and not re.fullmatch(r"con|prn|aux|nul|(com|lpt)[0-9]", name):

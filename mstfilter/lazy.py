@@ -85,7 +85,7 @@ def late(location: str, summary: str) -> Callable[..., Any]:
 def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> Iterator[Callable[..., None]]:
     """The function to call for progress: of a bar of `mstfilter.report.progress` if `progress` is True.
 
-    Otherwise it is `progress` itself, or a function that does nothing if `progress` is False.
+    In other cases the function is `progress` itself, or a function that does nothing if `progress` is False.
     """
     if progress is True:
         with getattr(import_module("mstfilter.report.progress"), bars)(*([what] if what else [])) as advance:

@@ -306,7 +306,7 @@ class Belief:
     ) -> Action | None:
         """The action of largest expected information in nats; the first one if several are equal.
 
-        None if no action has `at_least` nats. Then the hypotheses agree on all outcomes.
+        None if no action has `at_least` nats. In this case the hypotheses agree on all outcomes.
         """
         values = [information(action) for action in actions]
         if np.isnan(values).any():
@@ -350,8 +350,8 @@ class Belief:
     def estimate(self, loss: Callable[[Hypothesis, Hypothesis], float] | None = None) -> Hypothesis:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
-        By default, the loss is 1 - quality (weighted coverage in the form ``objects``). Then the result is the best
-        single answer among the hypotheses, if the true scene has their distribution.
+        By default, the loss is 1 - quality (weighted coverage in the form ``objects``). With this loss, the result is
+        the best single answer among the hypotheses, if the true scene has their distribution.
         """
         hypotheses, mass = self._merged
         if loss is None:

@@ -15,7 +15,7 @@ visible surface. A method that is faster for many boxes together overrides `fill
 `arbitrate` makes the label grid. If several completions contain a voxel, these rules apply:
 
 1. A voxel with readings belongs to the object with most readings in it.
-2. Otherwise it belongs to the object with the largest probability, if this reaches the threshold.
+2. A voxel without readings belongs to the object with the largest probability, if this reaches the threshold.
 3. Ties go to the object with the nearest visible surface.
 
 The result does not depend on the order of the objects: renumbered completions give renumbered labels.

@@ -17,7 +17,7 @@ A shape is in metres, in the frame of the camera (x right, y down, z forward) or
 
 A voxel is inside a mesh if its centre is inside. Inside is decided by the parity of crossings along three axes, of
 which two must agree. So small holes have no effect. A voxel is occupied by a cloud if it contains a point. Spaces
-enclosed by such voxels are filled.
+enclosed by occupied voxels are filled.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     min_iou : float
         Smallest IoU of a mask with the stored mask, both without pixels that cannot belong to an object.
     other : Completer, optional
-        Completer of masks without a stored mask. By default, such a mask is an error.
+        Completer of masks without a stored mask. By default, a mask without a stored mask is an error.
     """
 
     folder: str = ""

@@ -106,7 +106,7 @@ class Sam2Tracker(PackageTracker):
 
 @lru_cache(maxsize=1)
 def _load_sam2(config: str, checkpoint: str, digest: str, device: str) -> Any:
-    """The video predictor. The last one is cached."""
+    """The video predictor. The last predictor is cached."""
     build = imported("sam2.build_sam", _SAM2).build_sam2_video_predictor
     return build(config, checkpoint, device=device)
 
@@ -165,7 +165,7 @@ class CutieTracker(PackageTracker):
 
 @lru_cache(maxsize=1)
 def _load_cutie(checkpoint: str, digest: str, device: str) -> tuple[Any, Any]:
-    """Network and configuration with the package's defaults, without its download. The last one is cached."""
+    """Network and configuration with the package's defaults, without its download. The last network is cached."""
     module = imported("cutie.model.cutie", _CUTIE)
     hydra, omegaconf = imported("hydra", _CUTIE), imported("omegaconf", _CUTIE)
     import torch

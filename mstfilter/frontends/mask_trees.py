@@ -10,9 +10,9 @@ Two masks of a set are disjoint, or one contains the other. Leaf 0 of the tree i
 The remaining part of a mask that contains masks is also a leaf. The root joins everything and is never in a cut.
 
 The distribution of the cuts is defined by a walk that starts at the largest masks. Consider a mask with score s that
-contains masks with mean score m. The walk stops there with probability s / (s + m). Otherwise it visits these masks
-and the remaining part. `node_values` returns values w for which this is the Gibbs distribution exp(sum of w over the
-cut). So every `CutSampler` at temperature 1 draws from it.
+contains masks with mean score m. The walk stops there with probability s / (s + m). If it does not stop, the walk
+visits these masks and the remaining part. `node_values` returns values w for which this is the Gibbs distribution
+exp(sum of w over the cut). So every `CutSampler` at temperature 1 draws from it.
 """
 
 from __future__ import annotations
@@ -133,9 +133,9 @@ def nested_masks(
 
     Use it for the output of automatic mask generators. Masks are processed in order of falling score. A mask is
     compared with every mask kept before. A pair must share at most ``1 - share`` of the smaller mask. If the area of
-    one mask is less than `share` of the other, it may also share at least `share` of the smaller mask. Otherwise the
-    mask is dropped. The smaller mask then loses the pixels outside the mask that contains it. Common pixels of two
-    neighbours go to the mask with the higher score.
+    one mask is less than `share` of the other, it may also share at least `share` of the smaller mask. In all other
+    cases the mask is dropped. The smaller mask then loses the pixels outside the mask that contains it. Common pixels
+    of two neighbours go to the mask with the higher score.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

@@ -1,7 +1,7 @@
 """Components that use the ground truth of a recording.
 
 A component gets a clip, which contains no truth. So a component that inherits `UsesTruth` is bound to a recording
-before a run. `bind_truth` binds all such components of a filter, including nested ones:
+before a run. `bind_truth` binds all components that use the truth of a filter, including nested ones:
 
 >>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth

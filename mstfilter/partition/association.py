@@ -21,7 +21,7 @@ In each connected component, at most one segment continues a predicted object. T
 If the component has one segment and one object, more than 50 % is sufficient. These rules have the following
 consequences:
 
-- If an object is *split* and no segment has this share of its readings, no segment continues the object. The track of
+- If an object is *split* and no segment has enough of its readings, no segment continues the object. The track of
   this object ends, its views are deleted, and the segments are new objects.
 - If several objects are *merged* into one segment, the segment continues all of them.
 - A segment that continues no object is a new object.

@@ -6,8 +6,8 @@
 >>> labels = cells.draw(rng, log_odds, 20)                        # (20, K) object of each cell in each draw
 
 A sample groups the readings by its segments. A prediction groups them by the objects that lie at the readings. A cell
-is a set of readings that no such partition separates: the cells are the common refinement of all partitions. A
-component is a set of cells that are connected by joins in the partitions.
+is a set of readings that no sample and no prediction separates: the cells are the common refinement of all
+partitions. A component is a set of cells that are connected by joins in the partitions.
 
 For two cells, f_image is the share of the samples in which both belong to one object. f_prediction is the same share
 of the predictions. The log odds of "one object" are
@@ -233,8 +233,8 @@ def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
 def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """A prediction (k,) of cells of these sizes (k,), with objects for the cells that it does not explain.
 
-    An unexplained cell joins the predicted object with most readings in its segment of the sample (k,). If there is
-    no such object, the segment is an object.
+    An unexplained cell joins the predicted object with most readings in its segment of the sample (k,). If no
+    predicted object has readings there, the segment is an object.
     """
     filled = prediction.copy()
     for segment in np.unique(sample[prediction == 0]):

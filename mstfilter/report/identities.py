@@ -5,9 +5,9 @@
 >>> identities.colours(t, k)                        # {label: (r, g, b)}
 
 Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
-From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. Otherwise it is
-matched by its overlap with the last pause. If there is a ground truth, it is matched first, and its labels persist.
-Identities are used only for colours and change no number.
+From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. An object without a
+known parent is matched by its overlap with the last pause. If there is a ground truth, it is matched first, and its
+labels persist. Identities are used only for colours and change no number.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Cache of intermediate results, identified by the content of their input.
 
 Some results depend only on the data and not on the hypothesis. Examples are the boundary map of a frame and the flow
-between two frames. `memo` stores such results. All hypotheses of a step share them. A second run on the same data in
-one process uses them too.
+between two frames. `memo` stores results of this kind. All hypotheses of a step share them. A second run on the same
+data in one process uses them too.
 
 >>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)

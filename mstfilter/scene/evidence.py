@@ -76,7 +76,7 @@ class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
     A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The first
-    margin is for the extent of the voxel. The second is for the sensor noise at this range
+    margin is for the extent of the voxel. The second margin is for the sensor noise at this range
     (`mstfilter.scene.depth_sigma`). Voxels without a measurement (no reading, the robot, outside the image, behind a
     surface) are unknown and are kept. A voxel with a measured point inside is kept.
 

@@ -139,7 +139,7 @@ def _numbers(value: object) -> np.ndarray:
 
 
 def occupied_box(mask: np.ndarray) -> tuple[slice, ...] | None:
-    """Slices of the smallest box that contains all True cells of a mask; None if there are no such cells."""
+    """Slices of the smallest box that contains all True cells of a mask; None if there are none."""
     box = []
     for axis in range(mask.ndim):
         hits = np.flatnonzero(mask.any(axis=tuple(a for a in range(mask.ndim) if a != axis)))

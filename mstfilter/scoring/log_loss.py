@@ -9,7 +9,7 @@
 have no uncertainty of shape. Noise at their borders makes forecasts less certain where they are often wrong.
 Recalibration removes this effect. Forecasts are recalibrated by isotonic regression, fitted to other scenes. The
 score is the mean log loss in nats; lower is better. Noise at the border is added if it lowers the loss on the other
-scenes. So a forecaster that adds such noise itself gains nothing (`experiments/information` shows this for all
+scenes. So a forecaster that adds noise at borders gains nothing (`experiments/information` shows this for all
 methods). Forecasters are compared by what they distinguish. Noise of another kind, or at a higher rate than the
 largest one, can still give a small gain.
 

@@ -178,8 +178,8 @@ def measure_pause(
     Returns
     -------
     row : dict
-        Metrics of `mstfilter.scoring.metrics` and `score_belief`. Without ground truth, only those that do not need
-        it. ``qualities`` and ``energy_noise`` are lists, which tables omit.
+        Metrics of `mstfilter.scoring.metrics` and `score_belief`. Without ground truth, only metrics that need no
+        truth are returned. ``qualities`` and ``energy_noise`` are lists, which tables omit.
     counts : (r, 1001, 7) int32, or None without ground truth
         As in `BeliefScore`.
     """

@@ -87,8 +87,8 @@ class MergeLogOdds(CutValue):
 
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. So exp(v(c)) is proportional to the probability
     that exactly the merges above the cut join different objects. The values are log probabilities, so cuts are
-    sampled at a temperature, without a scale sigma. If the tree has odds (`LearnedTree`), they are used. Otherwise
-    `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
+    sampled at a temperature, without a scale sigma. If the tree has odds (`LearnedTree`), they are used. Without
+    odds, `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:

@@ -132,8 +132,8 @@ class TreeCutProposal(Proposal):
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is
-        ``log p(c) - log p(c*)`` as in the paper and the authors' program. Then p counts twice, in the draw and in the
-        weight.
+        ``log p(c) - log p(c*)`` as in the paper and the authors' program. With "p", p counts twice, in the draw and
+        in the weight.
     threshold : float
         Smallest probability of an occupied voxel.
     """

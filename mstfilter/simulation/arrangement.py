@@ -1,7 +1,7 @@
 """Placement of objects on the table: clusters, touching pairs of equal objects (twins), stacks and hidden objects.
 
 Each object is moved towards the cluster until it nearly touches another object (bisection on MuJoCo's contacts). So
-contacts are controlled. Then the physics runs until all objects are at rest.
+contacts are controlled. After placement, the physics runs until all objects are at rest.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 `Stage` holds the poses that are rendered. `PixelRays` casts one ray through each pixel and stores what it hits.
 `LightMap` stores light on the table. The result of a ray is valid until a body moves that the ray hits before or
-after the motion. The light at a point from a light source is valid until a body moves between them. Both are decided
-by conservative bounds (`solids.may_meet`). So the images equal those of casting every ray in every frame.
+after the motion. The light at a point from a light source is valid until a body moves between them. Rays and light
+are decided by conservative bounds (`solids.may_meet`). So the images equal those of casting every ray in every frame.
 """
 
 from __future__ import annotations

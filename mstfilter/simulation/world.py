@@ -381,9 +381,9 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Choose a push that moves objects by simulating candidates. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. Otherwise it is the one that
-    moves most and topples fewest. Candidates that drop an object or leave one in motion are discarded. Raises
-    InputError if no candidate moves any object.
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If none does, the candidate
+    is taken that moves most and topples fewest. Candidates that drop an object or leave one in motion are discarded.
+    Raises InputError if no candidate moves any object.
     """
     saved = world.save()
     best: tuple[float, FingerPush] | None = None

@@ -14,8 +14,8 @@ row.
 The results are checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number of runs changes, some
 runs are compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a
 call for the same runs in another order. If the results differ, a component that states ``batched=True`` raises
-InputError. Otherwise, or if they differ only by rounding, `NotTogether` states the reason, and the runs must be made
-one by one.
+InputError. For other components, or if results differ only by rounding, `NotTogether` states the reason, and the runs
+must be made one by one.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def energy_distance(
     distribution, and else positive.
 
     ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
-    of negative type (`mstfilter.forecasts.is_negative_type`). Otherwise the result can be 0 for different
+    of negative type (`mstfilter.forecasts.is_negative_type`). For other distances, the result can be 0 for different
     distributions. Default: The default is Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
@@ -205,7 +205,7 @@ def run_variance(
         Number of steps, at least 1. By default, all steps. Time and memory grow with n times the lag.
     function : callable, optional
         ``(particles) -> (n, ...)``, whose weighted mean is estimated. By default, the particles if they are an array.
-        Otherwise means have the shape (T, 0).
+        For other particles, means have the shape (T, 0).
 
     Returns
     -------

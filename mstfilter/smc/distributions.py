@@ -17,8 +17,8 @@ generator, or, without an inverse, from their probabilities.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
 `Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves and
-lookaheads evaluate values that a model may exclude. Inside `hypothetical`, such a row has the log density NaN, which
-a move rejects.
+lookaheads evaluate values that a model may exclude. Inside `hypothetical`, a row out of range has the log density
+NaN, which a move rejects.
 """
 
 from __future__ import annotations

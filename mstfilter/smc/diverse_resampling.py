@@ -184,11 +184,11 @@ def checked_similarity(similarity: Similarity, population: Population) -> np.nda
 class ClusterStratified(Resampler):
     """Allocates particles to clusters by weight (at least one to each if n allows it), and draws by weight inside.
 
-    If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
-    gets max(1, W_g / c) particles on average, with sum max(1, W_g / c) = n, rounded systematically. The particles of
-    a cluster share its weight, so any such allocation is unbiased. Clusters below `least_mass` may lose all
-    particles: each gets W_g / c on average. If this is below 1 and the cluster gets a particle, the particle has
-    weight c. ``notes["clusters"]`` is the number of clusters.
+    If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. With more particles,
+    cluster g gets max(1, W_g / c) particles on average, with sum max(1, W_g / c) = n, rounded systematically. The
+    particles of a cluster share its weight, so any allocation of this kind is unbiased. Clusters below `least_mass`
+    may lose all particles: each gets W_g / c on average. If this is below 1 and the cluster gets a particle, the
+    particle has weight c. ``notes["clusters"]`` is the number of clusters.
 
     Parameters
     ----------

@@ -162,9 +162,9 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
     """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
 
     `initial` (K,) has the probabilities of x_0. Row i of `transition` (K, K) has those of x_t given x_{t-1} = i. If
-    it has a first axis of T entries, entry t moves x_{t-1} to x_t, and entry 0 is not used. ``log_likelihood(y)``
-    (K,) is log p(y_t | x_t = 0 .. K-1, which is -inf if impossible. The function may also have the parameters ``t``
-    and ``u``.
+    `transition` has a first axis of T entries, entry t moves x_{t-1} to x_t, and entry 0 is not used.
+    ``log_likelihood(y)`` (K,) is log p(y_t | x_t = 0 .. K-1, which is -inf if impossible. The function may also have
+    the parameters ``t`` and ``u``.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.

@@ -49,9 +49,9 @@ def nonlinear_gaussian(
     `f` and `h` return the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
     row. The functions may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of T entries.
 
-    `Q` and `P0` may be singular, for example if noise acts only on the velocity. Then x_t has no density given
-    x_{t-1}. The model has no `log_transition` (for `P0`: no `log_initial`), and functions that need it raise
-    InputError. A conditional path is then drawn without ancestor sampling.
+    `Q` and `P0` may be singular, for example if noise acts only on the velocity. With a singular `Q`, x_t has no
+    density given x_{t-1}. The model has no `log_transition` (for `P0`: no `log_initial`), and functions that need it
+    raise InputError. A conditional path is then drawn without ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
@@ -111,7 +111,7 @@ class _Noises:
 
 
 class _OfStep:
-    """A function of particles, and of the step `t` and its input `u` if it has such parameters."""
+    """A function of particles, and of the step `t` and its input `u` if it has these parameters."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.parameters = function, step_parameters(function, 1)

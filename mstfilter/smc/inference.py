@@ -14,8 +14,8 @@ A model with parameters is a function that returns a filter:
 - `ensemble` does the same with the walkers of emcee, which need no scale.
 - `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Otherwise the
-  early states hardly change.
+  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Without a
+  density, the early states hardly change.
 - `smc_sampler` moves particles from the prior to the posterior by tempering (Del Moral, Doucet, Jasra 2006). The
   likelihood must be computable. `smc_sampler` estimates the evidence, and can find several modes. ``waste_free=True``
   uses all states of the moves.
@@ -107,7 +107,7 @@ class Chains(Table):
         return integrated_time(self.theta[discard:], quiet=True)
 
     def effective_sizes(self, discard: int = 0) -> np.ndarray:
-        """(d,) numbers of independent draws that estimate a mean equally well. The parameters are as above."""
+        """(d,) numbers of independent draws that estimate a mean equally well, without the first `discard` iterations."""
         n_iterations, n_chains, _ = self.theta[discard:].shape
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 
@@ -220,8 +220,8 @@ def pmmh(
         Whether ``filter_of`` also accepts parameters (d, m), with a column for each of m particles of several chains.
         All chains then move in one batch of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
-        parameters. Some of them are compared. If they differ, InputError is raised, or the runs are made one by one
-        with a warning.
+        parameters. Some estimates are compared. If the estimates differ, InputError is raised, or the runs are made
+        one by one with a warning.
     paired : bool
         If True, `observations` are sequences of observations, one for each chain.
 
@@ -400,7 +400,7 @@ def smc_sampler(
 
     At each temperature the particles are weighted, resampled, and moved by Metropolis steps that leave prior *
     likelihood^temperature invariant. With fixed `temperatures` and `scale`, the estimate of the evidence is unbiased.
-    If they are chosen from the particles, they add a bias of order 1 / n (Beskos, Jasra, Kantas, Thiery 2016).
+    Values that are chosen from the particles add a bias of order 1 / n (Beskos, Jasra, Kantas, Thiery 2016).
 
     Parameters
     ----------

@@ -267,7 +267,7 @@ class Distribution(ABC):
     Attributes
     ----------
     discrete : bool
-        Whether the values are integers. Then a lookahead uses the mode, and a move draws new values.
+        Whether the values are integers. For integers, a lookahead uses the mode, and a move draws new values.
     draws_numbers : bool
         Whether draws are known not to be NaN. If False, programs check the draws.
     """

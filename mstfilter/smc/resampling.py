@@ -134,10 +134,10 @@ class Ssp(WeightResampler):
     """Srinivasan sampling process: N_i is floor or ceil of n W_i, for any order of the particles.
 
     Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability down / (up +
-    down), a increases and b decreases by `up`. Otherwise a decreases and b increases by `down`. Then one of the two
-    is 0 or 1, which is final. The other one is paired again. Here all pairs of a round are processed together, so
-    log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative association, ordering and convergence of
-    resampling methods").
+    down), a increases and b decreases by `up`. With the remaining probability, a decreases and b increases by `down`.
+    After this step, one of the two is 0 or 1, which is final. The other fraction is paired again. Here all pairs of a
+    round are processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative
+    association, ordering and convergence of resampling methods").
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:

@@ -12,8 +12,8 @@
 
 Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. The
 runs of an arm are processed together, as arrays of the particles of all runs, if its components treat each particle
-independently (see `mstfilter.smc.batching`). Otherwise they are made one by one. Run k of every arm has the same seed
-and so the same random streams. So differences between arms have less noise than those of independent runs.
+independently (see `mstfilter.smc.batching`). In other cases the runs are made one by one. Run k of every arm has the
+same seed and so the same random streams. So differences between arms have less noise than those of independent runs.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def write_starter(kind: str, path: Path, target: str = "") -> Starter:
     """Write a commented component of one of `starter_kinds` that works, and its test ``test_NAME.py``.
 
     `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if there is a
-    file for them. Raises InputError if there is no such file, the name cannot be imported, or a file already exists.
+    file for them. Raises InputError if the kind has no file, the name cannot be imported, or a file already exists.
     """
     check_choice("the target", target or "scenes", _TARGETS)
     kinds = starter_kinds(target)

@@ -2,9 +2,9 @@
 
 Two results are accumulated over the frames of the clip:
 
-- The first is a grid of points of the first frame, followed forward (for rigid fits).
-- The second is a pull map. The pull map has, for every pixel of the last frame, its position in the first frame. The
-  pull map converts label images of ``clip.before`` to label images of ``clip.after`` by one gather each.
+- The first result is a grid of points of the first frame, followed forward (for rigid fits).
+- The second result is a pull map. The pull map has, for every pixel of the last frame, its position in the first
+  frame. The pull map converts label images of ``clip.before`` to label images of ``clip.after`` by one gather each.
 
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP

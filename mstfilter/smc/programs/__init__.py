@@ -9,9 +9,9 @@
 (1000,)
 
 The function runs once per step for all particles. `previous` is a mapping from names to arrays with one row per
-particle; None at the first step. The new particles are also such a mapping. The mapping has an array for each
-`sample`, and for each entry of a mapping that the function returns. `observe` adds log p(value) to the log weights.
-None is a missing value and adds nothing. A program may also contain:
+particle; None at the first step. The new particles are also a mapping. The mapping has an array for each `sample`,
+and for each entry of a mapping that the function returns. `observe` adds log p(value) to the log weights. None is a
+missing value and adds nothing. A program may also contain:
 
 - `switch(name, probs, branches, ...)` draws a branch for each particle and runs each branch on its particles;
 - `per_particle` marks a function that runs once for every particle, so that the names may differ between particles.

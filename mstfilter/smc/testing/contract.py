@@ -59,7 +59,7 @@ def statistical(test: _Test) -> _Test:
 
 
 def prerequisite(test: _Test) -> _Test:
-    """Mark a test on which later tests depend. If it fails, `check_properties` skips the later tests."""
+    """Mark a test on which later tests depend. If the marked test fails, `check_properties` skips the later tests."""
     test.prerequisite = True  # type: ignore[attr-defined]
     return test
 

@@ -47,8 +47,8 @@ class ExactContract(PopulationContract):
     """Properties of components with exact draws to compare with.
 
     Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. `exact` returns
-    three items. The first is a population of `n` particles before the call. The second is a population of exact
-    draws, or with exact weights, after the call. The third is the observation. An optional fourth item
+    three items. The first item is a population of `n` particles before the call. The second item is a population of
+    exact draws, or with exact weights, after the call. The third item is the observation. An optional fourth item
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides. The factor makes the weights f / q of
     a guided move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
 

@@ -83,7 +83,7 @@ class TransitionContract(BatchedContract, ExactContract):
         component = skip_unless_properly_weighted(self.make())
 
         def moved(n: int, missing: bool = False, row: int | None = None) -> tuple[Population, Population]:
-            """Particles and their moves. For a single particle, those of the `row` of the exact draws."""
+            """Particles and their moves, or the single move of the `row` of the exact draws."""
             population, _, observation, *_ = self.exact_case(1, n)
             population = population.take(seeded(4).permutation(n) if row is None else np.array([row]))
             inputs = {"population": population, "observation": None if missing else observation}
