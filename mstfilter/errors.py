@@ -52,7 +52,7 @@ class LostRunError(InputError):
 class InputWarning(_WithHints, UserWarning):
     """Input that can be used but is probably not what was intended. Message and hints are as for `InputError`.
 
-    The command line shows it as one ``warning:`` line.
+    The command line shows the warning as one ``warning:`` line.
     """
 
     def __str__(self) -> str:
@@ -146,7 +146,7 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
 def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
     """The error for a library that cannot be imported: it states what needs the library, and how to install it.
 
-    `library` is its name. By default it is the module in the exception.
+    `library` is its name. By default the library is the module in the exception.
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
@@ -177,7 +177,7 @@ def place_in_user_file(error: BaseException) -> str | None:
     """``FILE, line N: TEXT`` for the line of a user's file in which an exception was raised; None if there is none.
 
     The line is in the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this
-    package nor to an installed library. For a syntax error, it is the file that the error names.
+    package nor to an installed library. For a syntax error, the place is in the file that the error names.
     """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{short_path(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"

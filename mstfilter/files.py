@@ -101,8 +101,8 @@ def locked(path: str | Path) -> Iterator[None]:
     """Reserve a file or folder, which need not exist, for this block. Removes the remains of a killed process.
 
     Raises InputError if another block of this or another process has reserved it. The lock is a file ``.NAME.lock``
-    beside `path`. The system releases it when the process ends. On file systems without locks, a second process is
-    not prevented.
+    beside `path`. The system releases the lock when the process ends. On file systems without locks, a second process
+    is not prevented.
     """
     target = Path(os.path.realpath(path))
     if _is_temporary(target.absolute()):  # no other process knows the name
@@ -146,7 +146,7 @@ def _reserve(file: Path, target: Path) -> int:
 
 
 def _lock(path: Path, flags: int) -> int | None:
-    """Open and lock a file or folder; None if it is already locked. Systems without locks only open it."""
+    """Open and lock a file or folder; None if it is already locked. Systems without locks only open the file."""
     descriptor = os.open(path, flags, 0o666)
     try:
         import fcntl
@@ -380,8 +380,8 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
 def weights_file(given: str, name: str, where: str, sha256: str = "") -> tuple[str, str]:
     """Absolute path and SHA-256 of a weights file that the user supplies for a network `name`.
 
-    Raises InputError if it is not given, does not exist, or has another hash than `sha256`. `where` is an address for
-    the hint. The hash of an unchanged file is computed once.
+    Raises InputError if the file is not given, does not exist, or has another hash than `sha256`. `where` is an
+    address for the hint. The hash of an unchanged file is computed once.
     """
     path = Path(given)
     if not given or not path.is_file():

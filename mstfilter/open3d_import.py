@@ -4,7 +4,7 @@
 >>> o3d = import_open3d()                            # doctest: +SKIP
 >>> o3d.geometry.PointCloud()                        # doctest: +SKIP
 
-Components call this function when they need open3d. No default component needs it.
+Components call this function when they need open3d. No default component needs open3d.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ A `Registry` joins the declarations of several packages. `mstfilter.presets.REGI
 Systematic()
 >>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
-A configuration is a nested mapping. A component in it is a name, or a mapping with ``component`` and fields. The kind
-of a field follows from its annotation. A field of type ``Resampler`` or ``Resampler | None`` holds a resampler, and
-one of type ``tuple[Evidence, ...]`` a list of evidence.
+A configuration is a nested mapping. A component in a configuration is a name, or a mapping with ``component`` and
+fields. The kind of a field follows from its annotation. A field of type ``Resampler`` or ``Resampler | None`` holds a
+resampler, and one of type ``tuple[Evidence, ...]`` a list of evidence.
 
 A component is imported when it is first built. Looking up a name imports nothing. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add it by an entry point ``kind.name`` of the group

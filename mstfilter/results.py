@@ -164,7 +164,7 @@ def check_array(
     kinds : str
         Kinds of numbers, as in `numpy.dtype.kind`: "b" bool, "iu" integers, "f" floats.
     at_least, at_most : float
-        Range of the values. Values outside it by a rounding error are clipped.
+        Range of the values. Values outside the range by a rounding error are clipped.
     finite : bool
         Whether infinite values are errors. NaN always is an error.
     """

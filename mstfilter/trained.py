@@ -52,7 +52,7 @@ class TrainedModel:
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     """The model of the package with this name, or else the model in this folder.
 
-    Raises InputError if it is missing, damaged, or of another architecture.
+    Raises InputError if the model is missing, damaged, or of another architecture.
     """
     given, packaged = Path(name), models_folder() / name
     folder = packaged if (given.name == name and packaged.is_dir()) or not given.is_dir() else given

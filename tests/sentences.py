@@ -24,9 +24,11 @@ _BLOCKS = (
     r"^\$\$.*?\$\$",  # formulas
     r"^[ ]*\|.*?$",  # tables
     r"^#.*?$",  # headings
-    r"^={3,}.*?^={3,}[ =]*$",  # tables of reStructuredText
+    r"^={3,}.*?^={3,}.*?^={3,}[ =]*$",  # tables of reStructuredText, with or without a head
+    r"^={3,}.*?^={3,}[ =]*$",
     r"^[ ]*(>>>|\.\.\.)[^\n]*\n(?:[^\n]+\n)*",  # examples and what they print
     r"^[ ]*\w[\w ]*\n[ ]*-{3,}$",  # sections of numpydoc
+    r"^(?![ ]*(?:[-*]|\d+\.) )([ ]*)\S[^\n]*$(?=\n\1[ ]{4}\S)",  # names and types above their description
     r"^\.\. .*?$",
     r"<!--.*?-->",
     r"<[^>\n]+>",

@@ -83,7 +83,7 @@ class ObjectFusion(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The map, updated by the clip. At the first pause it is the proposed segmentation."""
+        """The map, updated by the clip. At the first pause the map is the proposed segmentation."""
         if predicted is None:
             return union(None, proposed)
         maps, notes = [], []

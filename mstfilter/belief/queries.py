@@ -186,7 +186,7 @@ class Belief:
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where k_i is the most probable object of a voxel in
         hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities, so
         it contains a voxel whenever it contains a less probable one. `a` and `b` (..., 3) are broadcast against each
-        other. For a = b the result is the occupancy. For all voxels b it is the extent of the object at a.
+        other. For a = b the result is the occupancy. For all voxels b the result is the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -222,9 +222,9 @@ class Belief:
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
-        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))``. B: both voxels are occupied. S: they belong to
-        the same object. ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included
-        (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
+        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))``. B: both voxels are occupied. S: both voxels
+        belong to the same object. ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not
+        included (`occupancy_entropy`): H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
         for axis in range(3):
@@ -248,9 +248,9 @@ class Belief:
         """Entropy of the segmentation of a region (default: the whole grid).
 
         ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s of the region. The
-        entropy is also the information of the true segmentation of the region. Without region and tolerance it is an
-        upper bound of the information of every outcome that the labels determine. The distance for the tolerance is
-        `information.partition_distance`.
+        entropy is also the information of the true segmentation of the region. Without region and tolerance the
+        entropy is an upper bound of the information of every outcome that the labels determine. The distance for the
+        tolerance is `information.partition_distance`.
         """
         cells, sizes = self._region(region)
         rows = canonical_rows(self._refined.objects[:, cells])
@@ -317,7 +317,7 @@ class Belief:
     def best_push(self, tolerance: float = 0.0, where: Any = None, at_least: float = 1e-9) -> np.ndarray | None:
         """Voxel (3,) at which a push has the largest information (`push_map`).
 
-        `where` is a region that the finger can reach. By default it contains all voxels. None if no push has
+        `where` is a region that the finger can reach. By default the region contains all voxels. None if no push has
         `at_least` nats.
         """
         information = self.push_map(tolerance).ravel()

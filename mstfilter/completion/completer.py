@@ -139,7 +139,8 @@ class Completer(Checked, ABC):
     def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
         """`fill_many`, with a warning if the result ignores the input.
 
-        Raises InputError if it draws random numbers although `stochastic` is False, since results would be reused.
+        Raises InputError if a completer draws random numbers although `stochastic` is False, since results would be
+        reused.
         """
         before = _states(rngs)
         filled = self.fill_many(rngs, seen)

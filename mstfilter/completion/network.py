@@ -37,7 +37,7 @@ class NetworkCompleter(Completer, UsesFiles):
     weights : str
         Name of a trained model of the package, the folder of a model (`mstfilter.trained`), or an ONNX file.
     architecture : Architecture, optional
-        The architecture of the model in the folder. By default it is the architecture of this package.
+        The architecture of the model in the folder. By default the architecture is the architecture of this package.
     """
 
     weights: str = "completion"
@@ -45,7 +45,7 @@ class NetworkCompleter(Completer, UsesFiles):
 
     @property
     def network(self) -> TrainedNetwork:
-        """The network with its weights. Raises InputError if they are missing or cannot be used."""
+        """The network with its weights. Raises InputError if weights are missing or cannot be used."""
         try:
             from mstfilter.completion.unet import load_network
         except ImportError as error:

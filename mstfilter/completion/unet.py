@@ -213,7 +213,7 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
 
 
 def _checked(name: str, forward: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """The logits (b, X, Y, Z) of a user's network. Raises InputError if it fails or its output cannot be used."""
+    """The logits (b, X, Y, Z) of a user's network. Raises InputError if the network or its output cannot be used."""
     try:
         out = forward(x)
     except Exception as error:  # of the user's code or of the runtime: any

@@ -8,7 +8,7 @@
        log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
 
    depends only on its parents. w_i and w_j are the weights of the parents, and lambda is `quality_exponent`. So
-   resampling selects candidates before they are built, and only selected candidates are built.
+   resampling selects among unbuilt candidates, and only selected candidates are built.
 
 Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
 observation, few predictions lie in it. So every particle is projected into this set. The method is the manifold
@@ -145,7 +145,8 @@ class CrossoverUpdate(Update):
     ) -> Population:
         """The candidates of all pairs, which are built on access.
 
-        Without a prediction, the result is the proposed samples. Without a proposal, it is the refined predictions.
+        Without a prediction, the result is the proposed samples. Without a proposal, the result is the refined
+        predictions.
         """
         if predicted is None:
             return union(None, proposed)

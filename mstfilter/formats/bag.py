@@ -4,9 +4,9 @@
 
 A topic must be named only if several topics are suitable. The camera matrix is read from the ``camera_info`` topic of
 the colour topic (for rectified images, its P). A frame consists of a colour and a depth image. By the time stamps of
-their headers, each is the nearest to the other. The stamps differ by at most `tolerance_s`. Depth must be registered
-to colour, with the same size and the same ``frame_id``. Transforms (tf) are not read. The camera is assumed not to
-move, and its pose is computed from the table.
+their headers, the two images are nearest to each other. The stamps differ by at most `tolerance_s`. Depth must be
+registered to colour, with the same size and the same ``frame_id``. Transforms (tf) are not read. The camera is
+assumed not to move, and its pose is computed from the table.
 
 In depth images, 16UC1 and mono16 are units of the depth scale (millimetres by convention, REP 118), and 32FC1 is
 metres. Compressed depth is a PNG, or the ``compressedDepth`` transport: a header of 12 bytes (quantisation A, B of

@@ -90,9 +90,9 @@ class _Workspace(BaseModel):
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or must be empty. No other process may write it. The camera has a pose if it is
-    known, and `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Other entries
-    of manifest.json, such as generator and seed, are given by name.
+    The new folder must not exist, or must be empty. No other process may write the folder. The camera has a pose if
+    it is known, and `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Other
+    entries of manifest.json, such as generator and seed, are given by name.
     """
 
     def __init__(

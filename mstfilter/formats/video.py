@@ -7,8 +7,8 @@ A reader is a subclass of `RecordingFormat`:
 ...     recording = reader.open(path)
 
 To read another layout, define a subclass in a file and pass it: ``mstfilter convert IN OUT --format ./mine.py:Mine``.
-The fields of the class are options of the command line. Build it with `Video`, which checks every frame when it is
-read. For arrays in memory use `Recording.from_arrays`.
+The fields of the class are options of the command line. Build the reader's recording with `Video`, which checks every
+frame when it is read. For arrays in memory use `Recording.from_arrays`.
 
 >>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())

@@ -11,8 +11,8 @@
 `mask_trackers`     SAM 2, EdgeTAM and Cutie through their packages
 ==================  ===================================================================
 
-The networks of the published system, COB and SiamMask, are files in ``models/published``. The registry loads them
-like components of users. No weights are part of the package, and none are downloaded.
+The networks of the published system, COB and SiamMask, are files in ``models/published``. The registry loads these
+files like components of users. No weights are part of the package, and none are downloaded.
 """
 
 from mstfilter.lazy import attach

@@ -50,10 +50,11 @@ class MaskProposal(Proposal, UsesFiles):
     folder : str
         The folder of masks.
     sampler : CutSampler
-        Draws the level of nested masks. At temperature 1 it has the distribution of `mstfilter.frontends.mask_trees`.
+        Draws the level of nested masks. At temperature 1 the sampler has the distribution of
+        `mstfilter.frontends.mask_trees`.
     objects : ObjectRule
-        Decides which masks are objects. Other masks, such as that of the table, are background. If they contain
-        masks, their parts are always used.
+        Decides which masks are objects. Other masks, such as that of the table, are background. If background masks
+        contain masks, their parts are always used.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.

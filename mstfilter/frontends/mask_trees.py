@@ -1,4 +1,4 @@
-"""Instance masks as a tree. Nested masks are its nodes, so levels of detail are cuts.
+"""Instance masks as a tree. Nested masks are the nodes of the tree, so levels of detail are cuts.
 
 >>> masks = np.zeros((3, 4, 6), bool)
 >>> masks[0, :, :4], masks[1, :, :2], masks[2, :, 2:4] = True, True, True     # an object, and its two parts
@@ -131,11 +131,11 @@ def nested_masks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The masks of a set with arbitrary overlaps, made disjoint or nested. Returns masks and scores.
 
-    Use it for the output of automatic mask generators. Masks are processed in order of falling score. A mask is
-    compared with every mask kept before. A pair must share at most ``1 - share`` of the smaller mask. If the area of
-    one mask is less than `share` of the other, it may also share at least `share` of the smaller mask. In all other
-    cases the mask is dropped. The smaller mask then loses the pixels outside the mask that contains it. Common pixels
-    of two neighbours go to the mask with the higher score.
+    Use this function for the output of automatic mask generators. Masks are processed in order of falling score. A
+    mask is compared with every mask kept before. A pair must share at most ``1 - share`` of the smaller mask. If the
+    area of one mask is less than `share` of the other, it may also share at least `share` of the smaller mask. In all
+    other cases the mask is dropped. The smaller mask then loses the pixels outside the mask that contains it. Common
+    pixels of two neighbours go to the mask with the higher score.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

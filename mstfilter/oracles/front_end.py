@@ -5,9 +5,9 @@
 >>> completer = TrueCompletion()                 # the true voxels of what a mask shows
 
 A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general, a
-true voxel belongs to the mask that contains its pixel. Among all pixels that show its object, this is the pixel
-nearest to the projection of the voxel. So a mask of a part of an object gets this part. A mask of two objects gets
-both.
+true voxel belongs to the mask that contains its pixel. Among all pixels that show the object of a voxel, this is the
+pixel nearest to the projection of the voxel. So a mask of a part of an object gets this part. A mask of two objects
+gets both.
 """
 
 from __future__ import annotations

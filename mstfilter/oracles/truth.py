@@ -7,8 +7,8 @@ before a run. `bind_truth` binds all components that use the truth of a filter, 
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies bind them automatically. The truth is not a field. So binding does not change the
-description of a component or its equality. Binding changes its `component_key`.
+``mstfilter run`` and studies bind these components automatically. The truth is not a field. So binding does not
+change the description of a component or its equality. Binding changes the `component_key` of a component.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@
 >>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object", for cells.pairs (e, 2)
 >>> labels = cells.draw(rng, log_odds, 20)                        # (20, K) object of each cell in each draw
 
-A sample groups the readings by its segments. A prediction groups them by the objects that lie at the readings. A cell
-is a set of readings that no sample and no prediction separates: the cells are the common refinement of all
-partitions. A component is a set of cells that are connected by joins in the partitions.
+A sample groups the readings by its segments. A prediction groups the readings by the objects that lie at the
+readings. A cell is a set of readings that no sample and no prediction separates: the cells are the common refinement
+of all partitions. A component is a set of cells that are connected by joins in the partitions.
 
 For two cells, f_image is the share of the samples in which both belong to one object. f_prediction is the same share
 of the predictions. The log odds of "one object" are

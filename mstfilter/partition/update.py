@@ -9,14 +9,16 @@ an object are estimated again from everything that was observed of it.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. Q_j^lambda is used as the probability that prediction j *holds*, that is, shows the present scene.
-2. **Partitions.** A sample groups the readings by its segments. A prediction groups them by the objects that lie at
-   the readings. All samples and predictions together give the odds that two readings belong to one object. Partitions
-   of the image are drawn by these odds (`mstfilter.partition.cells`). A drawn partition can agree with different
-   samples and predictions in different parts of the image. The paper crosses each sample with each prediction.
+2. **Partitions.** A sample groups the readings by its segments. A prediction groups the readings by the objects that
+   lie at the readings. All samples and predictions together give the odds that two readings belong to one object.
+   Partitions of the image are drawn by these odds (`mstfilter.partition.cells`). A drawn partition can agree with
+   different samples and predictions in different parts of the image. The paper crosses each sample with each
+   prediction.
 3. **Association.** Each partition is paired with a prediction j, which is drawn in proportion to w_j Q_j^lambda.
-   Segments and predicted objects form a *conflict graph*. In its *components*, segments continue predicted objects by
-   the rules in `mstfilter.partition.association`. At most one segment continues an object that is split. The other
-   segments are new objects. The paper draws which conflicts end in a merge. Here the partition determines it.
+   Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
+   predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an object that
+   is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the partition
+   determines the merges.
 4. **Occluded objects.** A predicted object without conflict has no readings or very few. An occluded object is kept
    in a candidate with probability (Q_j q)^lambda, where q is the share of its voxels that the frame does not observe
    as free. Q_j measures whether the prediction is reliable, and q whether this object is still there.

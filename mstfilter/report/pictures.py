@@ -131,7 +131,7 @@ def _occupied_points(volumes: Iterable[_Volume]) -> tuple[np.ndarray, VoxelGrid]
 def close_up(volumes: Iterable[_Volume], camera: Camera) -> tuple[float, float, float, float]:
     """Part of the image that shows all occupied voxels, with a margin: x, y, width, height in pixels.
 
-    The part has the proportions of the image. Without occupied voxels it is the whole image.
+    The part has the proportions of the image. Without occupied voxels the part is the whole image.
     """
     size = np.array([camera.width, camera.height], float)
     uv = camera.project(_occupied_points(volumes)[0])[0]

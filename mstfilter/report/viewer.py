@@ -34,7 +34,7 @@ from mstfilter.scene import Camera, Hypothesis, Recording, occupied_box, project
 
 @dataclass(frozen=True)
 class ScenePage:
-    """A page with scenes that can be rotated. A notebook shows it in place."""
+    """A page with scenes that can be rotated. A notebook shows the page in place."""
 
     text: str  #: HTML, self-contained
     title: str

@@ -55,8 +55,8 @@ class Cache:
         must not draw random numbers. The value must not be changed afterwards.
 
         If `stored_as` is a type, the value is also stored on disk (see `on_disk`). The type is an array, a dataclass
-        whose fields are arrays, strings or None, or a tuple of these. Use it only for values that take much longer to
-        compute than to read.
+        whose fields are arrays, strings or None, or a tuple of these. Use `stored_as` only for values that take much
+        longer to compute than to read.
         """
         return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
 

@@ -287,7 +287,7 @@ class Frame:
 class Clip:
     """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
-    `before` shows the scene at the previous pause and `after` at this pause. The frames between them show the action.
+    `before` shows the scene at the previous pause and `after` at this pause. The frames between both show the action.
     The first clip of a recording has one frame.
 
     Parameters

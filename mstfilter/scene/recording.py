@@ -277,9 +277,9 @@ class Recording:
     def in_world_of(self, other: Recording) -> Recording:
         """This recording with the workspace and the first camera pose of another recording, without true volumes.
 
-        Use it for parts of one session whose camera has the same pose at both first pauses: ``open_recording(path,
-        options=["start_s=30"]).in_world_of(first)``. Clips of the second part can then update hypotheses of the
-        first.
+        Use this method for parts of one session whose camera has the same pose at both first pauses:
+        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Clips of the second part can then update
+        hypotheses of the first.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()
@@ -304,7 +304,7 @@ class Recording:
 
 
 class UsesFiles(ABC):
-    """A component that reads files of the user. Inherit it in addition to the interface."""
+    """A component that reads files of the user. Inherit `UsesFiles` in addition to the interface."""
 
     #: Fields with paths of files or folders. A run whose files have changed is another run.
     path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")

@@ -6,12 +6,12 @@
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
 **Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses that consist only of labels
-have no uncertainty of shape. Noise at their borders makes forecasts less certain where they are often wrong.
-Recalibration removes this effect. Forecasts are recalibrated by isotonic regression, fitted to other scenes. The
-score is the mean log loss in nats; lower is better. Noise at the border is added if it lowers the loss on the other
-scenes. So a forecaster that adds noise at borders gains nothing (`experiments/information` shows this for all
-methods). Forecasters are compared by what they distinguish. Noise of another kind, or at a higher rate than the
-largest one, can still give a small gain.
+have no uncertainty of shape. Noise at the borders of objects makes forecasts less certain where forecasts are often
+wrong. Recalibration removes this effect. Forecasts are recalibrated by isotonic regression, fitted to other scenes.
+The score is the mean log loss in nats; lower is better. Noise at the border is added if it lowers the loss on the
+other scenes. So a forecaster that adds noise at borders gains nothing (`experiments/information` shows this for all
+methods). Forecasters are compared by the questions that their forecasts distinguish. Noise of another kind, or at a
+higher rate than the largest one, can still give a small gain.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 

@@ -187,7 +187,7 @@ def ask(recording: Recording, t: int, n: int = N_QUESTIONS) -> Questions:
     t : int
         Number of the pause.
     n : int
-        Number of questions. The seed of their draw depends only on the depth images of the pause.
+        Number of questions. The seed of the draw of the questions depends only on the depth images of the pause.
 
     Returns
     -------

@@ -6,8 +6,8 @@
 Most objects are convex. So depth has a concave crease or a step where two objects touch, and where an object touches
 the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
 length, b baseline, z depth) is affine on every plane, and its noise does not depend on the range. So the largest
-eigenvalue of its Hessian responds to creases and steps only. Colour adds boundaries that are not visible in depth.
-The weight of colour is lower, because print on a box is not a boundary.
+eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not visible
+in depth. The weight of colour is lower, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def above_table(frame: Frame) -> np.ndarray:
 
 
 def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame. Without a pose, it gets the pose relative to the fitted table (`fit_support_plane`)."""
+    """The camera of a frame, with a pose relative to the fitted table (`fit_support_plane`) if it has none."""
     camera = frame.camera
     return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
 

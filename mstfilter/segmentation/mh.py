@@ -359,7 +359,7 @@ class MetropolisHastingsCuts(CutSampler):
         return lambda value: -((best - value) ** 2) / s2
 
     def _values(self, rng: np.random.Generator, chain: CutChain, w: np.ndarray) -> Iterator[float]:
-        """Make steps of a chain without end. Yields the value of its cut after each step."""
+        """Make steps of a chain without end. Yields the value of the cut after each step."""
         random = _uniforms(rng).__next__
         local = LOCAL_MOVES[self.moves]()
         redraw = None

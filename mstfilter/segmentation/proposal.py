@@ -207,7 +207,8 @@ def complete_segments(
 
     Each sample is an array of segments, int64. ``mask_of(segment)`` returns (H, W) bool. Each distinct segment is
     completed once, with the stream ``"completion", segment``. So the result does not depend on the other segments. A
-    stochastic completer completes it again for each further sample, with the stream ``"completion", segment, k``.
+    stochastic completer completes a segment again for each further sample, with the stream
+    ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()

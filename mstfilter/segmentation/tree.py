@@ -15,8 +15,8 @@ array([[1, 1],
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
 in order of the mean strength of their common border. The height of a merge is this mean strength. A logistic curve
-maps it to P(boundary), the probability that the merge joins different objects. `start` is P(boundary) of the merge
-that makes a node. `start` is near 0 if the node lies inside one object, and near 1 if it contains several.
+maps this height to P(boundary), the probability that the merge joins different objects. `start` is P(boundary) of the
+merge that makes a node. `start` is near 0 if the node lies inside one object, and near 1 if it contains several.
 """
 
 from __future__ import annotations
@@ -258,8 +258,8 @@ def linkage_tree(
     """Watershed and average linkage of a pixel graph: higra's tree, merge heights (N,), leaf image (H, W).
 
     `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` returns the strength of the borders between
-    the watershed regions. By default it is the mean weight of the edges of a border. `arcs` (E,) is the border of
-    each edge, or -1 within a region. Returns None if there is only one region.
+    the watershed regions. By default the strength is the mean weight of the edges of a border. `arcs` (E,) is the
+    border of each edge, or -1 within a region. Returns None if there is only one region.
     """
     import higra as hg
 

@@ -77,7 +77,7 @@ def _check_seed(seed: int) -> None:
 
 
 class SimulatedScene:
-    """A world with its textures and sensors, for use step by step. `record_scene` records it."""
+    """A world with its textures and sensors, for use step by step. `record_scene` records the scene."""
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
         _check_seed(seed)

@@ -2,7 +2,7 @@
 
 The skin of a body consists of a few flat charts (`draw_skin`). Body coordinates and normal of a surface point
 determine its chart and its place in the chart (`texture_coordinates`). An `Atlas` holds the charts of all bodies in
-one array, so shading is one gather. Charts show the outside with their upper edge up, so text is never mirrored.
+one array, so shading is one gather. Charts show the outside with the upper edge up, so text is never mirrored.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape

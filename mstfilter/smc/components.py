@@ -65,8 +65,8 @@ class Branching(Transition):
     """Moves `branches` copies of every particle independently. The mean weight, and so the evidence, does not change.
 
     Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. From n of
-    n particles they keep all, and the filter degenerates. For discrete states with all successors as branches, this
-    is the filter of Fearnhead and Clifford (2003):
+    n particles these schemes keep all, and the filter degenerates. For discrete states with all successors as
+    branches, this is the filter of Fearnhead and Clifford (2003):
 
     >>> filter = replace(
     ...     bootstrap(model, n=50),

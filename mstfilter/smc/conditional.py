@@ -46,7 +46,7 @@ def conditional_path(
     filter : ParticleFilter
         Bootstrap or guided filter of a model or a program, with at least two particles.
     path : T particles, optional
-        The present path. Row t is the particle at time t. Without it, an ordinary filter draws the path.
+        The present path. Row t is the particle at time t. Without a given path, an ordinary filter draws the path.
 
     Returns
     -------

@@ -42,8 +42,8 @@ def energy_distance(
     """Energy distance between two weighted populations (Szekely and Rizzo 2013), in the units of the distance.
 
     2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second population. For numbers
-    it is the square of `scipy.stats.energy_distance`. The energy distance is 0 if both populations represent the same
-    distribution, and else positive.
+    the distance is the square of `scipy.stats.energy_distance`. The energy distance is 0 if both populations
+    represent the same distribution, and else positive.
 
     ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
     of negative type (`mstfilter.forecasts.is_negative_type`). For other distances, the result can be 0 for different
@@ -133,7 +133,7 @@ def coalescence(record: Record) -> Coalescence:
     """How fast the paths of the last particles coalesce (Jacob, Murray, Rubenthaler 2015).
 
     For equal weights and independent selections at every step, the genealogy is that of Wright and Fisher. Two
-    particles then share their ancestor s steps before with probability 1 - (1 - 1/n)^s.
+    particles then share an ancestor s steps before with probability 1 - (1 - 1/n)^s.
     """
     last = record.populations[-1]
     index, weights = np.flatnonzero(last.weights > 0), last.weights[last.weights > 0]
@@ -181,7 +181,7 @@ def run_variance(
 
     W_e and V_e are the weights of the descendants of e before and after the selection. The factor f_s is the ratio of
     the probabilities that two draws have different ancestors. For independent selections of particles with different
-    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` it is an approximation. The
+    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` the factor is an approximation. The
     approximation assumes that pairs of particles with different ancestors are selected together in proportion to
     their weights.
 
@@ -190,10 +190,10 @@ def run_variance(
     are added. The lag reduces the noise of the estimates and keeps them valid when all particles share one ancestor.
     The bias is small if the model forgets its state in L steps.
 
-    All estimates are of first order in 1 / n, and too low for small n. With 300 particles they are within 15 % of the
-    variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of means are
-    90 % too low (`experiments/run_variance/sizes.csv`). Take more particles if the log evidence's variance is above
-    .3.
+    All estimates are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
+    % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
+    means are 90 % too low (`experiments/run_variance/sizes.csv`). Take more particles if the log evidence's variance
+    is above .3.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ def log_score(population: Population, log_density: Callable[[Any], np.ndarray]) 
     """Log score ``-log sum_i w_i p(y | x_i)`` of a population in nats.
 
     ``log_density(particles)`` returns (n,) ``log p(y | x_i)``. y is an observation, or the true state under a kernel
-    around each particle. For discrete states it is 0 if equal and -inf if different.
+    around each particle. For discrete states the log density is 0 if equal and -inf if different.
     """
     values = np.asarray(log_density(population.particles), dtype=np.float64)
     if values.shape != (len(population),):

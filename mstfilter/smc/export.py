@@ -8,12 +8,12 @@ A class with `columns` is a `Table`. The columns of a table are a mapping from n
 which polars accepts too. An array with several entries per row becomes several columns: ``x_0``, ``x_1``, or
 ``x_0_1``.
 
-Trees are `xarray.DataTree`, the container of ArviZ 1.0 and later. ``arviz.InferenceData.from_datatree`` converts them
-for 0.2x. The group ``posterior`` has the draws, with dimensions (chain, draw, ...). The group ``sample_stats`` has
-numbers that belong to draws. Weighted particles are one chain. The unnormalised log weights of the particles are
+Trees are `xarray.DataTree`, the container of ArviZ 1.0 and later. ``arviz.InferenceData.from_datatree`` converts the
+trees for 0.2x. The group ``posterior`` has the draws, with dimensions (chain, draw, ...). The group ``sample_stats``
+has numbers that belong to draws. Weighted particles are one chain. The unnormalised log weights of the particles are
 ``sample_stats["log_weight"]`` (chain, draw). If the weights differ, ``posterior.attrs["weights"]`` is
-"sample_stats/log_weight". ArviZ treats all draws as equally weighted. So its summaries are valid only for draws
-without this attribute. To get equally weighted draws, resample:
+"sample_stats/log_weight". ArviZ treats all draws as equally weighted. So the summaries of ArviZ are valid only for
+draws without this attribute. To get equally weighted draws, resample:
 
 >>> Systematic().resample(rng, population, 1000).to_arviz()
 """

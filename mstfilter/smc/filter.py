@@ -94,8 +94,9 @@ class ParticleFilter(AtStep):
     n_proposed : int
         Number of particles that `proposal` draws at each step. 0 means `n`.
     resample : {"after", "before"}
-        With "after", particles are resampled after the update, as in MST. With "before", they are resampled before
-        the next prediction, as in textbooks. The population after a step then has the weights of its observation.
+        With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
+        before the next prediction, as in textbooks. The population after a step then has the weights of its
+        observation.
     """
 
     initial: Proposal | None = None
@@ -249,7 +250,7 @@ class _Step:
         return self.state.key.child(slot, self.state.t).generator()
 
     def select_before(self) -> tuple[Population | None, bool]:
-        """Select the particles x_{t-1} to move. Returns them and whether they were resampled."""
+        """Select the particles x_{t-1} to move. Returns the particles and whether they were resampled."""
         population, priority = self.state.population, None
         if population is None or self.filter.resample == "after":
             return population, False
@@ -333,7 +334,7 @@ class _Step:
         return fused
 
     def select_after(self, fused: Population, past: Population | None) -> tuple[Population, bool]:
-        """Select the particles to keep. Returns them and whether they were resampled."""
+        """Select the particles to keep. Returns the particles and whether they were resampled."""
         size, after = self.filter.size, self.filter.resample == "after"
         n = limit = self.filter.n
         if len(fused) <= n and not after and size is None:

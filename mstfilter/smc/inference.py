@@ -107,7 +107,7 @@ class Chains(Table):
         return integrated_time(self.theta[discard:], quiet=True)
 
     def effective_sizes(self, discard: int = 0) -> np.ndarray:
-        """(d,) numbers of independent draws that estimate a mean equally well, without the first `discard` iterations."""
+        """(d,) numbers of independent draws that estimate a mean equally well, after `discard` iterations."""
         n_iterations, n_chains, _ = self.theta[discard:].shape
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 

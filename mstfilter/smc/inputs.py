@@ -35,7 +35,7 @@ class WithInput:
     """An observation with the input of its step, given to a filter instead of the observation.
 
     The filter gives `y` to its components as the observation. The input belongs to the move from x_{t-1} to x_t. At
-    the first step it is available to the initial distribution and the likelihood.
+    the first step the input is available to the initial distribution and the likelihood.
     """
 
     y: Any  #: the observation; None if missing

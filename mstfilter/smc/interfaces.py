@@ -73,8 +73,8 @@ class Component(AtStep, ABC):
     def batched(self) -> bool | None:
         """Whether the component treats each particle independently, so that it can process several runs together.
 
-        True states that it does. With None, `run_many` tries it, and makes the runs one by one if the results differ
-        (see `mstfilter.smc.batching`). Default: With False, the runs are made one by one.
+        True states that particles are independent. With None, `run_many` tries this, and makes the runs one by one if
+        the results differ (see `mstfilter.smc.batching`). Default: With False, the runs are made one by one.
         """
         return False
 
@@ -136,7 +136,9 @@ class Resampler(Component):
 
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Select `n` particles. ``parents["ancestor"]`` of the result has their (n,) indices in `population`.
+        """Select `n` particles.
+
+        ``parents["ancestor"]`` of the result has the (n,) indices of the particles in `population`.
 
         A scheme that makes new particles inherits `TransformResampler`.
         """
@@ -324,7 +326,7 @@ class Distribution(ABC):
 
     @property
     def centre(self) -> np.ndarray:
-        """The mean, or the mode of a discrete distribution. A lookahead uses it instead of a draw."""
+        """The mean, or the mode of a discrete distribution. A lookahead uses the centre instead of a draw."""
         return self.mean
 
 
@@ -366,7 +368,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Record of a step. The size of its numbers does not depend on n. The `State` has the weights and parents."""
+    """Record of a step. The size of the record does not depend on n. The `State` has the weights and parents."""
 
     t: int  #: index of the observation, from 0
     n: int  #: particles after the step

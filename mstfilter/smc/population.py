@@ -88,7 +88,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     @property
     def n_built(self) -> int:
-        """Number of distinct candidates built so far. Selections by `take` share them."""
+        """Number of distinct candidates built so far. Selections by `take` share built candidates."""
         return len(self._built)
 
     def take(self, positions: np.ndarray) -> Candidates[_T]:

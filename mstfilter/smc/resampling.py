@@ -35,8 +35,8 @@ for each row of a matrix. A user's scheme is a `WeightResampler` whose `select` 
 Random schemes do not compare weights, so they have no ties. If weights are equal, `LargestWeights.select` (a stable
 sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first particle.
 
-Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class. In exact arithmetic it selects the same
-particles as `Systematic` and as ``Residual("systematic")`` for the same uniform number.
+Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class. In exact arithmetic this scheme selects the
+same particles as `Systematic` and as ``Residual("systematic")`` for the same uniform number.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).

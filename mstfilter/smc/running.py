@@ -86,8 +86,9 @@ def run_many(
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). From that step on, its log evidence is -inf and the other results are NaN.
-        `History.lost` has the reasons. `History.single` states why the runs of an arm were made one by one.
+        an observation (`LostRunError`). From that step on, the log evidence of a lost run is -inf and the other
+        results are NaN. `History.lost` has the reasons. `History.single` states why the runs of an arm were made one
+        by one.
 
     Warns
     -----
@@ -351,7 +352,7 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
 def _check_caller() -> None:
     """Raise InputError if a module that is being imported calls `run_many` with workers.
 
-    Workers import the modules of the functions that they get. So they would call `run_many` again, or wait for the
+    Workers import the modules of the functions that they get. So workers would call `run_many` again, or wait for the
     end of the import.
     """
     frame: FrameType | None = sys._getframe(2)

@@ -271,9 +271,9 @@ def paris(
 ) -> Iterator[np.ndarray]:
     """Smoothed means of an additive functional, online (PaRIS; Olsson and Westerborn 2017, algorithm 2).
 
-    After each observation it yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the last
-    population is stored, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards. A
-    step takes n^2 densities, or (1 + `steps` `n_draws`) n with "mcmc".
+    After each observation `paris` yields E[h_0(x_0) + h_1(x_0, x_1) + .. + h_t(x_{t-1}, x_t) | y_0 .. y_t]. Only the
+    last population is stored, with one statistic per particle: the mean over `n_draws` predecessors drawn backwards.
+    A step takes n^2 densities, or (1 + `steps` `n_draws`) n with "mcmc".
 
     Parameters
     ----------

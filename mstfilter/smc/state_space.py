@@ -70,7 +70,7 @@ class StateSpaceModel(AtStep):
         moves.
     batched : bool or None
         Whether the functions treat each particle independently, so that they can be called with the particles of many
-        runs (see `mstfilter.smc.batching`). None: With None, `run_many` tries it.
+        runs (see `mstfilter.smc.batching`). None: With None, `run_many` tests this.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -246,8 +246,8 @@ class RandomWalkMove(Rejuvenation):
 
     ``notes["accepted"]`` is the acceptance rate.
 
-    After a resampling several particles share a parent. A Markov kernel separates them, and leaves p(x_t | x_{t-1},
-    y_t) invariant. The weights do not change.
+    After a resampling several particles share a parent. A Markov kernel separates these particles, and leaves p(x_t |
+    x_{t-1}, y_t) invariant. The weights do not change.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ keys are independent as far as a cryptographic hash behaves like a random functi
 billion streams have the same seed is below 1e-50.
 
 If components are called once for R runs of n particles, rows (R n, ...) are the particles, run by run. `Rows` are
-arrays of this form. `RunGenerators` draw them, with row r of every array from the generator of run r.
+arrays of this form. `RunGenerators` draw `Rows`, with row r of every array from the generator of run r.
 """
 
 from __future__ import annotations

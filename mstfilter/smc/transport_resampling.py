@@ -223,10 +223,10 @@ class EnsembleTransform(TransformResampler):
     """Moves the particles to equal weights by optimal transport. New particles are mixtures of old ones.
 
     T_ij minimises the sum of ``T_ij |x_i - y_j|^2`` with row sums W_i and column sums 1 / n. The new particles are n
-    sum_i T_ij x_i. The targets y_j are the old particles. If n differs from m, they are equally spaced ones in their
-    order. In one dimension T is the monotone transport, found by sorting in O(m log m). In more dimensions T is a
-    linear program of m n variables, so use a few hundred particles. The scheme draws no random numbers. Mixtures have
-    less variance than the weighted particles. Particles are arrays of floats, or mappings of such arrays.
+    sum_i T_ij x_i. The targets y_j are the old particles. If n differs from m, the targets are equally spaced ones in
+    their order. In one dimension T is the monotone transport, found by sorting in O(m log m). In more dimensions T is
+    a linear program of m n variables, so use a few hundred particles. The scheme draws no random numbers. Mixtures
+    have less variance than the weighted particles. Particles are arrays of floats, or mappings of such arrays.
 
     Reference: Reich (2013), "A nonparametric ensemble transform method for Bayesian inference", SIAM Journal on
     Scientific Computing 35.

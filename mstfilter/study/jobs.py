@@ -33,7 +33,7 @@ from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
 
 def perform(job: Job) -> JobOutcome:
-    """Run a job. An error in it becomes its outcome.
+    """Run a job. An error in a job becomes its outcome.
 
     ``job["kind"]`` is "record" or "run". The other keys are those that `mstfilter.study.study` writes.
     """

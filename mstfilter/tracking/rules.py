@@ -1,7 +1,7 @@
 """Motion rules, which estimate the rigid motion of one object in a clip.
 
 A rule has two stages. `candidates` computes motions once per distinct segment, for all hypotheses. `choose` selects
-one of them per particle, possibly at random.
+one motion per particle, possibly at random.
 
 ================  ===========================================================================
 `PaperRule`       paper, Algorithm 2: SIFT if it has more than 5 inliers, else ICP if its error
@@ -162,7 +162,7 @@ class PaperRule(MotionRule):
         Largest root mean square distance in metres at which ICP is accepted. The published value of 1 mm is below the
         noise of a depth camera at 0.7 m, so ICP is almost never accepted.
     registration : Registration
-        Performs the ICP. The paper does not state the initial motion. Here it aligns the centroids.
+        Performs the ICP. The paper does not state the initial motion. Here the initial motion aligns the centroids.
     """
 
     min_inliers: int = 5

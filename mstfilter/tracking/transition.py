@@ -64,8 +64,8 @@ class Warp(Bounded):
         The method loses 3-14 % of the voxels per step.
     collisions : "deepest" or "label"
         Rule for a voxel that several objects cover. With "deepest", the voxel goes to the object in which it is
-        deepest, then to the object with the smaller residual. With "label", it goes to the object with the higher
-        label, as in the authors' program.
+        deepest, then to the object with the smaller residual. With "label", the voxel goes to the object with the
+        higher label, as in the authors' program.
     """
 
     method: Literal["smooth", "splat"] = "smooth"

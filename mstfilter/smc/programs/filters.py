@@ -317,7 +317,7 @@ def _run_once(
     n: int,
     single: bool = False,
 ) -> ProgramRun:
-    """One pass of a function. With `single`, it is without the particle axis."""
+    """One pass of a function. With `single`, the pass is without the particle axis."""
     run = ProgramRun(handler, n, single)
     run.function = function
     if isinstance(previous, dict):

@@ -1,9 +1,9 @@
 """Checks that a program treats its particles independently and draws only by `sample`.
 
-A program processes all particles in one pass. By mistake it may mix them (``x.mean()``, ``previous["x"][0]``), draw
-from another generator, or keep values between steps. A program with this fault runs without an error, but its weights
-are wrong. `Guard` checks some steps of each kind: the first and the second, then the 9th, 66th, 515th, ... (8^k + k,
-which also detects a fault of every third step):
+A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
+``previous["x"][0]``), draw from another generator, or keep values between steps. A program with this fault runs
+without an error, but its weights are wrong. `Guard` checks some steps of each kind: the first and the second, then
+the 9th, 66th, 515th, ... (8^k + k, which also detects a fault of every third step):
 
 1. The first two steps run again with the same random numbers. All values and log weights must equal those of the
    first run.

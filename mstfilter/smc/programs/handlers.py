@@ -196,8 +196,8 @@ class CopyHandler(SiteHandler):
 class ScoreHandler(SiteHandler):
     """Takes given values of each site, weights them by their density, and records the sites.
 
-    With `single` they are the values of one particle, without the particle axis. With `strict`, a log density of NaN
-    or +inf is an error.
+    With `single` the values are the values of one particle, without the particle axis. With `strict`, a log density
+    of NaN or +inf is an error.
     """
 
     draws = False

@@ -47,8 +47,7 @@ def sample(name: str, distribution: Any) -> Any:
     Returns
     -------
     ndarray ``(n, *event_shape)``
-        One row per particle, read-only. In a `per_particle` program it is a number or array
-        without that axis.
+        One row per particle, read-only. In a `per_particle` program the value is a number or array without that axis.
     """
     return _current().sample(name, distribution)
 
@@ -57,8 +56,8 @@ def observe(name: str, distribution: Any, value: Any) -> None:
     """Weight the particles by the probability of an observed value; None is a missing value and has no effect.
 
     `distribution` is the distribution of the observation given the particle. The value has the event shape of the
-    distribution. Or it is one value for each particle, of shape ``(n, *event_shape)``, such as the reading that the
-    particle assigns to an object. `name` is used in messages.
+    distribution. Or the value is one value for each particle, of shape ``(n, *event_shape)``, such as the reading
+    that the particle assigns to an object. `name` is used in messages.
     """
     _current().observe(name, distribution, value)
 

@@ -37,8 +37,8 @@ class TransitionContract(BatchedContract, ExactContract):
     """The contract of every `Transition`. The two statistical tests have a false-alarm rate of at most 1e-6 each.
 
     The test of the distribution needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from
-    f(x_t | x_{t-1}) given these rows, and the observation. For a guided move it also returns log p(y_t | x_t), as a
-    function of x_t. If the transition weights by the observation, the population of x_t has these weights.
+    f(x_t | x_{t-1}) given these rows, and the observation. For a guided move `exact` also returns log p(y_t | x_t),
+    as a function of x_t. If the transition weights by the observation, the population of x_t has these weights.
     """
 
     slot = "transition"
