@@ -29,10 +29,12 @@ _BLOCKS = (
     r"^[ ]*(>>>|\.\.\.)[^\n]*\n(?:[^\n]+\n)*",  # examples and what they print
     r"^[ ]*\w[\w ]*\n[ ]*-{3,}$",  # sections of numpydoc
     r"^(?![ ]*(?:[-*]|\d+\.) )([ ]*)\S[^\n]*$(?=\n\1[ ]{4}\S)",  # names and types above their description
+    r"^[^\n]+$(?=\n: )",  # terms of a glossary
     r"^\.\. .*?$",
     r"<!--.*?-->",
     r"<[^>\n]+>",
 )
+_CODE = r"``[^`]+``|`[^`]+`|\$[^$]+\$"
 _ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : .*$)", re.MULTILINE)
 _END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*\[$]*[A-Z`])")
 
@@ -45,7 +47,7 @@ def sentences(text: str) -> Iterator[str]:
     text = _ITEM.sub("\n\n", text)
     for paragraph in re.split(r"\n\s*\n", text):
         for sentence in _END.split(" ".join(paragraph.split())):
-            if len(re.findall(r"[A-Za-z]{2,}", sentence)) >= 3:
+            if len(re.findall(r"[A-Za-z]{2,}", re.sub(_CODE, "", sentence))) >= 3:
                 yield sentence.strip()
 
 
@@ -61,7 +63,7 @@ def texts() -> Iterator[tuple[str, str]]:
 
 def n_words(sentence: str) -> int:
     """Words of a sentence; an inline formula or piece of code counts as one."""
-    short = re.sub(r"``[^`]+``|`[^`]+`|\$[^$]+\$|\[[-+.\d, ]+\]", "x", sentence)
+    short = re.sub(_CODE + r"|\[[-+.\d, ]+\]", "x", sentence)
     return len(re.findall(r"[\w\].%]*[A-Za-z0-9][^\s]*", short))
 
 

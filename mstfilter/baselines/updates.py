@@ -29,7 +29,7 @@ class SamplesOnly(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The proposed population; without a proposal, the predicted one."""
+        """The proposed population, or the predicted population without a proposal."""
         return union(predicted if proposed is None else None, proposed)
 
 

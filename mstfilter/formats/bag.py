@@ -291,7 +291,7 @@ class Bag(VideoFormat):
     Parameters
     ----------
     colour : str
-        Colour topic. By default, the only one.
+        Colour topic. By default, the only colour topic.
     depth : str
         Depth topic. By default, the only one that is registered to colour.
     info : str

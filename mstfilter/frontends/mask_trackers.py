@@ -35,7 +35,7 @@ _SAM2, _CUTIE = "https://github.com/facebookresearch/sam2", "https://github.com/
 
 
 def thinned(clip: Clip, step: int) -> list[Frame]:
-    """Every `step`-th frame of a clip, and the last one."""
+    """Every `step`-th frame of a clip, and the last frame."""
     return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
 
 
@@ -50,7 +50,7 @@ class PackageTracker(MaskTracker, UsesFiles):
     device : str
         Device of torch.
     step : int
-        Every `step`-th frame is used, and the last one.
+        Every `step`-th frame and the last frame are used.
     sha256 : str
         Expected hash of the file; if empty, it is not compared.
     """

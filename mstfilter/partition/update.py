@@ -17,8 +17,8 @@ an object are estimated again from everything that was observed of it.
 3. **Association.** Each partition is paired with a prediction j, which is drawn in proportion to w_j Q_j^lambda.
    Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
    predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an object that
-   is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the partition
-   determines the merges.
+   is split. The other segments are new objects. The paper draws which conflicts end in a merge. In this update the
+   partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has no readings or very few. An occluded object is kept
    in a candidate with probability (Q_j q)^lambda, where q is the share of its voxels that the frame does not observe
    as free. Q_j measures whether the prediction is reliable, and q whether this object is still there.

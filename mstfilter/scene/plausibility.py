@@ -257,7 +257,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
     A table is parallel to the floor, and higher above the floor than objects are above a table. A table in front of a
     wall meets the wall at a right angle and extends far from it. The normal of a table points to the top of the
-    image. The normal of a wall does not.
+    image. The normal of a wall does not point there.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
@@ -349,8 +349,8 @@ class _Corners:
 def drift(first: Look, look: Look) -> tuple[float, float, float]:
     """Tilt (degrees), height (m) and shift (m) of the camera relative to its pose, from the first pause to another.
 
-    Tilt and height are those of the table, if few readings are left at z = 0. The shift is measured at corners of the
-    image on the table and outside the workspace.
+    If few readings are left at z = 0, tilt and height are those of the plane of the table. The shift is measured at
+    corners of the image on the table and outside the workspace.
     """
     tilt = height = shift = 0.0
     left = look.on_table.mean() / max(first.on_table.mean(), 1e-9)

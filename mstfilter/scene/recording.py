@@ -358,7 +358,8 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """Camera with a pose, and a workspace. Missing ones are computed from the frame of the first pause."""
+    """Camera with a pose, and a workspace. A missing pose or workspace is computed from the frame of the first
+    pause."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:

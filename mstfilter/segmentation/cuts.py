@@ -61,7 +61,7 @@ class SceneCutObjectness(CutValue):
     background_weight : float
         Area of a pixel that is not above the table. In SceneCut the area is 1. With 1, the table contributes most of
         v*. The width of the sampled distribution is relative to v*, so a larger table gives more random samples. With
-        0, cuts of the table have no cost, and chains spend their steps on them.
+        weight 0, cuts of the table have no cost, and chains spend their steps on these cuts.
     """
 
     background_weight: float = 0.003

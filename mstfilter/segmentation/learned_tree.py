@@ -239,7 +239,7 @@ class Agglomeration:
             self.merge(i, j, odds)
 
     def merge(self, i: int, j: int, odds: float) -> int:
-        """Merge two regions and return the number of the new one."""
+        """Merge two regions and return the number of the new region."""
         new = len(self.borders)
         self.merges.append((i, j, odds))
         self.sums[new] = self.sums[i] + self.sums[j]

@@ -80,7 +80,7 @@ class CutState:
         self.splittable -= bool(self.children[node])
 
     def apply(self, move: Move) -> None:
-        """Replace the removed nodes of a move by the added ones."""
+        """Replace the removed nodes of a move by the added nodes."""
         for node in move.removed:
             self._remove(node)
         for node in move.added:

@@ -13,8 +13,8 @@ Sizes and masses follow objects of the YCB set, rounded. The YCB set is describe
 manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3), 2015, table of
 objects. The objects are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl, banana, ball.
 The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not in the set
-and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, thicker than the real
-ones. A thinner wall would fall between the centres of 1 cm voxels and be missing in the true volume.
+and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, which is thicker than
+real walls. A thinner wall would fall between the centres of 1 cm voxels and be missing in the true volume.
 
 `label_voxels` returns the true volume: the voxels of each object, including hidden ones.
 

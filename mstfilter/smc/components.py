@@ -37,8 +37,8 @@ from mstfilter.smc.population import Population, as_matrix, union
 class Reweight(Update):
     """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights, as in the bootstrap filter.
 
-    If there are proposed particles, they are added to the predicted ones. `batched` states whether the function
-    treats each particle independently (see `Component.batched`).
+    Proposed particles, if any, are added to the predicted particles. `batched` states whether the function treats
+    each particle independently (see `Component.batched`).
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]

@@ -106,7 +106,7 @@ def selection_distance(state: State, info: Info) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Coalescence:
-    """The ancestors of the last particles of a run."""
+    """Ancestors of the last particles of a run."""
 
     #: (T,) int64: number of distinct ancestors at time t of the last particles of positive weight.
     ancestors: np.ndarray

@@ -15,8 +15,8 @@ Frozen distributions of scipy.stats and objects of torch.distributions can be us
 generator of torch is global, so its distributions are drawn by their inverse distribution function at uniforms of our
 generator, or, without an inverse, from their probabilities.
 
-A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
-`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves and
+A parameter out of range, in any row, raises InputError when the distribution is made. Arrays of `Normal` and
+`Student` raise InputError when the distribution is sampled, since their log density in this row is NaN. Moves and
 lookaheads evaluate values that a model may exclude. Inside `hypothetical`, a row out of range has the log density
 NaN, which a move rejects.
 """

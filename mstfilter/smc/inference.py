@@ -307,7 +307,7 @@ def ensemble(
     filter_of, observations, log_prior, batched
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
-        First parameters. There must be at least 2 d different ones.
+        First parameters. At least 2 d different parameters are needed.
     moves : optional
         Moves of emcee; the default is its stretch move.
     """

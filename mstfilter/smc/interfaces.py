@@ -84,7 +84,7 @@ class Proposal(Component):
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw `n` particles, repeating some if there are fewer distinct ones."""
+        """Draw `n` particles. Some are repeated if fewer distinct particles exist."""
 
 
 class Transition(Component):

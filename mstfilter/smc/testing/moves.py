@@ -240,7 +240,7 @@ class DensityTransitionContract(TransitionContract):
 class ProposalContract(BatchedContract, ExactContract):
     """The contract of every `Proposal`. The only statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
+    The test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
     particles, and the observation. For the initial proposal these are draws of p(x_0). An optional third item
     ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
     """
@@ -291,7 +291,7 @@ class ProposalContract(BatchedContract, ExactContract):
 class UpdateContract(BatchedContract, ExactContract):
     """The contract of every `Update`. The only statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of p(x |
+    The test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of p(x |
     y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one, with
     their constant factor, which is part of the evidence. For exact draws the factor is arbitrary, unless a fourth
     item of `exact` is the number log p(y).
@@ -391,9 +391,9 @@ class UpdateContract(BatchedContract, ExactContract):
 class RejuvenationContract(ExactContract):
     """The contract of every `Rejuvenation`. The only statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
-    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and y_t, and
-    y_t.
+    The statistical test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that
+    returns a population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and
+    y_t, and y_t.
     """
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
