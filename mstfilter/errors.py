@@ -6,8 +6,7 @@ The messages state what is wrong, where, and the value found, and then what to d
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
 ('record the frame again',)
 
-`check_number`, `check_integer`, `check_choice` and `check_component` check fields of components with the same
-wording.
+`check_number`, `check_integer`, `check_choice` and `check_component` check fields with the same wording.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ class _WithHints(Exception):
 class InputError(_WithHints, ValueError):
     """Input that cannot be used.
 
-    `message` is one line that states what is wrong, where, and the value found. Each hint is one line that states
-    what the user can do.
+    `message` is one line that states what is wrong, where, and the value found. A hint is one line that states what
+    to do.
     """
 
 

@@ -13,8 +13,7 @@ Traceback (most recent call last):
 mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
 
 Three annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded`. An example of such
-a subclass is the interface of a component, alone or as ``Interface | None``. All other annotations are only
-documentation.
+a subclass is the interface of a component, alone or as ``Interface | None``. Other annotations are documentation.
 
 After these checks, a ``__post_init__`` is called for conditions on several fields.
 """

@@ -101,8 +101,7 @@ def locked(path: str | Path) -> Iterator[None]:
     """Reserve a file or folder, which need not exist, for this block. Removes the remains of a killed process.
 
     Raises InputError if another block of this or another process has reserved it. The lock is a file ``.NAME.lock``
-    beside `path`. The system releases the lock when the process ends. On file systems without locks, a second process
-    is not prevented.
+    beside `path`. The system releases the lock when the process ends. File systems without locks do not prevent it.
     """
     target = Path(os.path.realpath(path))
     if _is_temporary(target.absolute()):  # no other process knows the name

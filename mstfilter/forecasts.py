@@ -11,8 +11,7 @@ table has how often each value of p was given, and how often the event then occu
 >>> fit(np.array([0.2, 0.9])).tolist()
 [0.5, 0.999]
 
-A forecast of a vector, a segmentation, or any other object is a weighted set. The energy score of a weighted set
-needs only distances:
+A forecast of a vector, a segmentation, or any other object is a weighted set. The energy score needs only distances:
 
 >>> distances = np.array([[0.0, 1.0], [1.0, 0.0]])  # between the two members of the set
 >>> energy_score([0.0, 1.0], distances, [0.5, 0.5])

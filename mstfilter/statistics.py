@@ -159,8 +159,7 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
     """(mean of a resample - mean) / standard deviation of the resample.
 
-    The ratios of resamples of equal values are infinite. Infinite ratios are given as +-1e200, since quantiles
-    interpolate.
+    The ratios of resamples of equal values are infinite. Infinite ratios are +-1e200, since quantiles interpolate.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]

@@ -9,8 +9,7 @@ every pause these steps are performed:
 1. The transition of the filter tracks the objects of the map through the clip.
 2. The masks of the single-frame segmentation are matched with the rendered map by overlap.
 3. The volume of every object is averaged with the images of the clip. The pose of each image comes from
-   frame-by-frame registration of depth and colour. Surface is used only within the mask of the object, and free space
-   everywhere.
+   frame-by-frame registration of depth and colour. Surface is used only within the object's mask.
 4. Masks without a match that do not show known objects become new objects, with the usual completion.
 
 There is one hypothesis. Wrong masks are never revised, and two objects are never merged. Between pauses the map is
@@ -261,8 +260,7 @@ class ObjectVolume:
         """The volume averaged with another image.
 
         `T` (4, 4) is the motion in world metres from the pose of the volume to the pose in the frame. `mask` and
-        `others` (H, W) bool are the pixels of this object and of others. Surface is integrated only in `mask`, and
-        free space everywhere.
+        `others` (H, W) bool are the pixels of this object and of others. Surface is integrated only in `mask`.
         """
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
         u, v, z, inside = frame.camera.pixels_of(move_points(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))

@@ -5,8 +5,8 @@
 >>> OccupiedComponents()               # connected components of the occupied space
 >>> ImageComponents()                  # connected components of the image above the table
 
-The floors use the pixels above the table and the completer, but no segmentation. A useful method must score better
-than the floors.
+The floors use the pixels above the table and the completer, but no segmentation. A useful method is better than the
+floors.
 """
 
 from __future__ import annotations

@@ -62,8 +62,7 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. The function is called only if
-        `tolerance` > 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. Called only if `tolerance` > 0.
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float

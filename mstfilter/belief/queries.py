@@ -317,8 +317,8 @@ class Belief:
     def best_push(self, tolerance: float = 0.0, where: Any = None, at_least: float = 1e-9) -> np.ndarray | None:
         """Voxel (3,) at which a push has the largest information (`push_map`).
 
-        `where` is a region that the finger can reach. By default the region contains all voxels. None if no push has
-        `at_least` nats.
+        `where` is a region that the finger can reach. By default it is the whole grid. None if no push has `at_least`
+        nats.
         """
         information = self.push_map(tolerance).ravel()
         reachable = np.arange(information.size) if where is None else _flat_region(self.grid, where)

@@ -139,8 +139,7 @@ class Completer(Checked, ABC):
     def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
         """`fill_many`, with a warning if the result ignores the input.
 
-        Raises InputError if a completer draws random numbers although `stochastic` is False, since results would be
-        reused.
+        Raises InputError if a completer draws random numbers although `stochastic` is False (results are reused).
         """
         before = _states(rngs)
         filled = self.fill_many(rngs, seen)
@@ -239,8 +238,8 @@ _FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing
 def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str | None:
     """How the probabilities of boxes ignore the input; None if they do not.
 
-    Two faults are detected: all probabilities are one number, or less than 2 % of the visible surface in all boxes is
-    occupied (0.5 or more).
+    The faults are: all probabilities are one number, or less than 2 % of the visible surface is occupied (0.5 or
+    more).
     """
     shown = [(p, one.surface) for p, one in zip(filled, seen, strict=True) if one.surface.any()]
     if sum(np.count_nonzero(surface) for _, surface in shown) < _FEW_VOXELS:

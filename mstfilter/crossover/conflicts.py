@@ -203,8 +203,7 @@ class Structure(Checked, ABC):
         Parameters
         ----------
         graph : networkx.Graph
-            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` of a vertex are in ascending
-            order.
+            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` of a vertex ascend.
         component : sequence of int
             Vertices of one connected component, ascending.
 

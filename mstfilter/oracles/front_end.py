@@ -6,8 +6,8 @@
 
 A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general, a
 true voxel belongs to the mask that contains its pixel. Among all pixels that show the object of a voxel, this is the
-pixel nearest to the projection of the voxel. So a mask of a part of an object gets this part. A mask of two objects
-gets both.
+pixel nearest to the projection of the voxel. So a mask of a part of an object gets this part. A mask of two gets
+both.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ class TrueCompletion(UsesTruth, Completer):
     """The true voxels of the objects that a mask shows. A mask without true objects keeps its visible surface.
 
     `objects` determines which pixels can belong to an object. True voxels are assigned to these pixels. A mask with
-    75 % of an object's pixels gets all voxels of the object. Objects with less than 10 % of a mask, and less than
-    half in it, are ignored.
+    75 % of an object's pixels gets all voxels of the object. Objects with less than 10 % of a mask and less than half
+    in it are ignored.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)

@@ -10,8 +10,8 @@ The time of an observation is the index of its clip. A resampler gets no clip. S
 are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best.
 
 Replacing one stage shows what a perfect stage would add to the present filter. Replacing all stages but one shows
-what this stage costs a filter that is perfect elsewhere. The two differences are not equal because stages correct
-errors of each other.
+what this stage costs a filter that is perfect elsewhere. The differences are not equal, since stages correct errors
+of each other.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@
 A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller of
 the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects that share
 voxels.) The *main object* of a segment is the predicted object with which it shares most readings. An object that is
-the main object of no segment and has fewer than about 60 readings is in no conflict. The readings come from other
-objects nearby.
+the main object of no segment and has fewer than about 60 readings is in no conflict. The readings come from objects
+nearby.
 
 In each connected component, at most one segment continues a predicted object. Two rules are applied in order:
 
@@ -18,8 +18,7 @@ In each connected component, at most one segment continues a predicted object. T
 2. The second rule uses all segments. The object is continued by the segment with more than 80 % of the readings that
    all segments share with it.
 
-If the component has one segment and one object, more than 50 % is sufficient. These rules have the following
-consequences:
+If the component has one segment and one object, more than 50 % is sufficient. Consequences of these rules:
 
 - If an object is *split* and no segment has enough of its readings, no segment continues the object. The track of
   this object ends, its views are deleted, and the segments are new objects.

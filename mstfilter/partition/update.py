@@ -12,8 +12,7 @@ an object are estimated again from everything that was observed of it.
 2. **Partitions.** A sample groups the readings by its segments. A prediction groups the readings by the objects that
    lie at the readings. All samples and predictions together give the odds that two readings belong to one object.
    Partitions of the image are drawn by these odds (`mstfilter.partition.cells`). A drawn partition can agree with
-   different samples and predictions in different parts of the image. The paper crosses each sample with each
-   prediction.
+   different samples and predictions in different parts of the image. The paper crosses samples with predictions.
 3. **Association.** Each partition is paired with a prediction j, which is drawn in proportion to w_j Q_j^lambda.
    Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
    predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an object that
@@ -29,8 +28,8 @@ an object are estimated again from everything that was observed of it.
    earlier pause is used again. The exception is an occluded object without views, which occurs if the completer does
    not use views. The object keeps its voxels outside free space.
 
-At the first pause the candidates are the samples, so every segment is a new object. No hypothesis contains an object
-that no frame has shown.
+At the first pause the candidates are the samples, so every segment is a new object. Hypotheses have no objects that
+no frame has shown.
 """
 
 from __future__ import annotations

@@ -6,8 +6,7 @@
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
 
 The classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods with these names. The methods
-import this module when they are called (`mstfilter.lazy.late`). Pages are self-contained: nothing is loaded from a
-network.
+import this module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
 """
 
 from __future__ import annotations

@@ -278,8 +278,8 @@ class Recording:
         """This recording with the workspace and the first camera pose of another recording, without true volumes.
 
         Use this method for parts of one session whose camera has the same pose at both first pauses:
-        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Clips of the second part can then update
-        hypotheses of the first.
+        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Clips of one part then update hypotheses
+        of the other.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()
@@ -358,8 +358,7 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """Camera with a pose, and a workspace. A missing pose or workspace is computed from the frame of the first
-    pause."""
+    """Camera with a pose, and a workspace. What is not given is computed from the frame of the first pause."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:

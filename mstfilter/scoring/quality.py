@@ -9,8 +9,7 @@ There are three forms, by name:
 
 ``objects`` (default)
     Objects only (label 0 is not a region). ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V is the volume
-    of all objects of that segmentation. The form is symmetric. Missing, invented, split and merged objects all
-    reduce it.
+    of all objects of that segmentation. The form is symmetric. Missing, invented, split and merged objects reduce it.
 ``paper``
     The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
     Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.

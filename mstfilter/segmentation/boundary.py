@@ -34,8 +34,7 @@ _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE L
 def above_table(frame: Frame) -> np.ndarray:
     """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without a reading.
 
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane with most
-    readings.
+    One unit is 3.2 mm of depth at 1 m. The table is z = 0 with a camera pose, else the plane with most readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
 
@@ -148,8 +147,8 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
 
-    Concave curvature is the largest eigenvalue of the Hessian, and convex curvature is minus the smallest. `resize`
-    is the image width / 640.
+    Concave curvature is the largest eigenvalue of the Hessian, convex curvature minus the smallest. `resize` is the
+    image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

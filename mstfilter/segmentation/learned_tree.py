@@ -2,8 +2,7 @@
 
 Watershed regions of a boundary map are merged. The pair with the lowest log odds is merged first. The log odds that
 two regions are different objects are linear in `FEATURES` of their border and of their union. The features are
-recomputed when a region grows. A model file lists the features and their weights, which were fitted on simulated
-scenes only.
+recomputed when a region grows. A model file has the features and their weights, fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees

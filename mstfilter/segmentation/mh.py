@@ -291,11 +291,10 @@ class MetropolisHastingsCuts(CutSampler):
     thinning : int
         Number of steps between samples.
     moves : {"node", "authors"}
-        Rule of the local moves: the exact rule of the paper, or the rule of the authors' program, which has a wrong
-        forward probability.
+        Rule of the local moves: the exact rule of the paper, or that of the authors, with a wrong forward
+        probability.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move. Redraws are used only with a
-        temperature.
+        Fraction of steps that redraw a random subtree instead of a local move. Used only with a temperature.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -379,7 +378,7 @@ def _uniforms(rng: np.random.Generator) -> Iterator[float]:
 def _autocorrelation(trace: np.ndarray) -> float | None:
     """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
 
-    A chain shorter than about 50 autocorrelation times underestimates them, so a low value is no proof of
+    A chain shorter than about 50 autocorrelation times underestimates them, so a low value does not prove
     convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:

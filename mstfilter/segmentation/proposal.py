@@ -126,14 +126,12 @@ class TreeCutProposal(Proposal):
     Parameters
     ----------
     sampler : CutSampler
-        Draws the cuts. The sampler must match the value: a `temperature` for log odds, `sigma2` for
-        `SceneCutObjectness`.
+        Draws the cuts, and must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is
-        ``log p(c) - log p(c*)`` as in the paper and the authors' program. With "p", p counts twice, in the draw and
-        in the weight.
+        ``log p(c) - log p(c*)`` as in the paper and the authors' program. With "p", p counts twice.
     threshold : float
         Smallest probability of an occupied voxel.
     """

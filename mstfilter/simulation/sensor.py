@@ -66,8 +66,8 @@ class DepthSensor(Bounded):
     def read(self, rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray) -> np.ndarray:
         """Depth image (H, W) float32 in metres, NaN for no reading.
 
-        `depth` (H, W) is the true z-depth in metres, with NaN for no surface. `slant` (H, W) is the cosine of the
-        angle of incidence.
+        `depth` (H, W) is the true z-depth in metres, with NaN for no surface. `slant` (H, W) is the cosine of
+        incidence.
         """
         h, w = depth.shape
         edge = _depth_edges(depth)

@@ -71,8 +71,8 @@ def texture_coordinates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chart number (n,) of surface points, and place (n, 2) in it, 0 .. 1 from its upper left corner.
 
-    `points` and outward unit `normals` (n, 3) are in the body's frame, in metres. `plain` (n,) bool are points of
-    pieces with one colour.
+    `points` and outward unit `normals` (n, 3) are in the body's frame, in metres. `plain` (n,) bool are points with
+    one colour.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":

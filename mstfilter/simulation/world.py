@@ -120,8 +120,7 @@ class PhysicsWorld:
     """Objects on a table, and a finger.
 
     Object k of the world is shapes[k]. The id of the object in images, voxels and poses is k + 1. Objects start far
-    away. `place` puts one object on the table. The arm of the finger is visible and casts shadows but touches
-    nothing.
+    away. `place` puts one object on the table. The arm of the finger is visible but touches nothing.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:

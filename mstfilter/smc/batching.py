@@ -8,14 +8,12 @@ The components are called once per step with the particles of all runs, as one p
 for all runs is possible if the `batched` of each component is True (stated by its author) or None (tried; models of
 `StateSpaceModel.of`, programs). A component gets no axis of runs. A component must treat each row independently, and
 take the shape of its draws from its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the
-rows of each run from the stream of this run. Observations and inputs that differ between runs are repeated for each
-row.
+rows of each run from the stream of this run. Observations and inputs that differ between runs are given by row.
 
 The results are checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number of runs changes, some
 runs are compared with a call for that run alone. At the first call of a component, up to 64 runs are compared with a
 call for the same runs in another order. If the results differ, a component that states ``batched=True`` raises
-InputError. For other components, or if results differ only by rounding, `NotTogether` states the reason, and the runs
-must be made one by one.
+InputError. For other components, or if results differ only by rounding, `NotTogether` states the reason.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class Measured(ResamplerWrapper):
 
     The selection itself does not change. ``notes["energy_distance"]`` is the distance, which `selection_distance`
     collects. The mean of the distance over seeds is the squared error that the selection adds. For numbers, this is
-    twice the integral over z of the variance of the share of particles below z. `distance` is defined as for
+    twice the integral over z of the variance of the share of particles below z. `distance` is as for
     `energy_distance`.
     """
 
@@ -182,8 +182,8 @@ def run_variance(
     W_e and V_e are the weights of the descendants of e before and after the selection. The factor f_s is the ratio of
     the probabilities that two draws have different ancestors. For independent selections of particles with different
     ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` the factor is an approximation. The
-    approximation assumes that pairs of particles with different ancestors are selected together in proportion to
-    their weights.
+    approximation assumes that pairs of particles with different ancestors are selected in proportion to their
+    weights.
 
     With a lag L (Olsson and Douc 2019), ancestors L steps earlier replace those at time 0 in the estimate for the
     mean. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts
@@ -192,8 +192,7 @@ def run_variance(
 
     All estimates are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
     % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
-    means are 90 % too low (`experiments/run_variance/sizes.csv`). Take more particles if the log evidence's variance
-    is above .3.
+    means are 90 % too low (`experiments/run_variance/sizes.csv`). Take more particles above a variance of .3.
 
     Parameters
     ----------
@@ -349,7 +348,7 @@ def set_energy_score(
     ``sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``, which is half the `energy_distance` to a population that
     consists of the truth. `truth` is one particle: an array (...), a mapping of arrays, or an object.
     ``distance(particles)`` is defined as for `energy_distance`. `mstfilter.forecasts.is_negative_type` checks whether
-    it makes the score proper.
+    it is proper.
     """
     particles = population.particles
     if isinstance(particles, Mapping):

@@ -17,8 +17,8 @@ generator, or, without an inverse, from their probabilities.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. Arrays of `Normal` and
 `Student` raise InputError when the distribution is sampled, since their log density in this row is NaN. Moves and
-lookaheads evaluate values that a model may exclude. Inside `hypothetical`, a row out of range has the log density
-NaN, which a move rejects.
+lookaheads evaluate values that a model may exclude. Inside `hypothetical`, such rows have the log density NaN, which
+moves reject.
 """
 
 from __future__ import annotations
@@ -344,8 +344,7 @@ def _cholesky(cov: np.ndarray) -> np.ndarray:
 class MultivariateNormal(_Checked):
     """Gaussian vectors.
 
-    The mean `loc` is (d,) for all particles or (n, d). The covariance `cov` is (d, d) or (n, d, d), positive
-    definite.
+    The mean `loc` is (d,) for all particles or (n, d). The covariance `cov` (d, d) or (n, d, d) is positive definite.
     """
 
     loc: Any

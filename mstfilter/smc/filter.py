@@ -70,21 +70,19 @@ class ParticleFilter(AtStep):
     initial : Proposal
         Draws the particles of the first step. The first observation updates these particles, and the first prediction
         is in the second step. If `initial` is None or equal to `proposal`, the first step has only proposed
-        particles, as in MST.
+        particles.
     transition : Transition
         Moves the particles from the previous time to the present time. If None, the particles do not move.
     proposal : Proposal, optional
         Draws new particles from the observation at every step.
     update : Update
-        Weights the particles by the observation. The update is not needed if the transition weights the particles
-        (probabilistic programs).
+        Weights the particles by the observation. Not needed if the transition weights the particles.
     resampler : Resampler
         Selects particles by weight.
     trigger : Trigger
         Decides whether a step resamples. More than `n` particles are always resampled.
     lookahead : Lookahead, optional
-        For auxiliary filters. Particles are selected by weight times priority. The lookahead needs
-        ``resample="before"``.
+        For auxiliary filters. Particles are selected by weight times priority. Needs ``resample="before"``.
     rejuvenation : Rejuvenation, optional
         For resample-move filters. Moves the particles at the end of a step that resampled.
     size : Size, optional
@@ -95,8 +93,7 @@ class ParticleFilter(AtStep):
         Number of particles that `proposal` draws at each step. 0 means `n`.
     resample : {"after", "before"}
         With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
-        before the next prediction, as in textbooks. The population after a step then has the weights of its
-        observation.
+        before the next prediction, as in textbooks. The weights after a step are then those of its observation.
     """
 
     initial: Proposal | None = None
@@ -464,7 +461,6 @@ def keep_freed_memory() -> None:
 
     After this, glibc keeps freed arrays of up to 32 MB (its largest value) instead of returning them to the system
     after every step. Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of
-    the time of resampling a million weights. The memory of the block is never used. Other C libraries are not
-    affected.
+    the time of resampling a million weights. The block is never used. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

@@ -2,8 +2,8 @@
 
 >>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
 
-For a model with Gaussian noise and nonlinear functions, the updates of the extended and the unscented Kalman filter
-are good proposals.
+For a model with Gaussian noise and nonlinear functions, the updates of extended and unscented Kalman filters are good
+proposals.
 
 >>> filter = rao_blackwellised(model, n=100)
 >>> state, infos = filter.run(observations, seed=0)
@@ -266,8 +266,7 @@ def ekf_proposal(f: _Map, Q: Any, h: _Map, R: Any, jacobian: _Map) -> Callable[[
 
     Given x_{t-1} the state is N(f(x_{t-1}), Q), and `h` is linearised at its mean (Doucet, Godsill, Andrieu 2000,
     section II D). The arguments are as in `nonlinear_gaussian`. `jacobian` returns the derivatives of `h`, (n, k, d)
-    or (k, d). The update is computed for all particles together. The ExtendedKalmanFilter of filterpy holds a single
-    state.
+    or (k, d). The update is computed for all particles together. filterpy's class holds a single state.
     """
     Q, R = (_definite(name, given) for name, given in (("Q", Q), ("R", R)))
 

@@ -18,7 +18,7 @@ A model with parameters is a function that returns a filter:
   density, the early states hardly change.
 - `smc_sampler` moves particles from the prior to the posterior by tempering (Del Moral, Doucet, Jasra 2006). The
   likelihood must be computable. `smc_sampler` estimates the evidence, and can find several modes. ``waste_free=True``
-  uses all states of the moves.
+  uses all moved states.
 """
 
 from __future__ import annotations
@@ -87,8 +87,7 @@ class Chains(Table):
         -------
         xarray.DataTree
             Groups ``posterior`` and ``sample_stats``. The group ``sample_stats`` has ``log_evidence``, and ``lp`` for
-            the log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted, without
-            paths.
+            the log density, except for `particle_gibbs`, where they are unknown. Draws are equally weighted.
         """
         theta = self.theta[discard:].swapaxes(0, 1)
         if names and len(names) != theta.shape[2]:
@@ -220,8 +219,8 @@ def pmmh(
         Whether ``filter_of`` also accepts parameters (d, m), with a column for each of m particles of several chains.
         All chains then move in one batch of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
-        parameters. Some estimates are compared. If the estimates differ, InputError is raised, or the runs are made
-        one by one with a warning.
+        parameters. Some estimates are compared. If the estimates differ, InputError is raised, or single runs are
+        made with a warning.
     paired : bool
         If True, `observations` are sequences of observations, one for each chain.
 

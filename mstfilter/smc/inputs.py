@@ -11,8 +11,8 @@ If a function of a model has a parameter named ``t`` or ``u``, it gets time or i
 has t = 0. The transition to x_t is called with t >= 1. An observation without input is given unchanged.
 
 A filter gives both to a component by `Component.at_step`, which returns the component for that step. A component or
-model that has functions among its fields names them in `step_functions`. Other components override `at_step`, or
-ignore time and inputs.
+model that has functions among its fields names them in `step_functions`. Others override `at_step`, or ignore time
+and inputs.
 """
 
 from __future__ import annotations

@@ -200,8 +200,7 @@ class Population(Table):
     particles : ndarray (n, ...) | mapping of ndarray (n, ...) | sequence of n objects | Candidates
         The particles, treated as immutable; shared, not copied.
     log_weights : (n,) float
-        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. By default, all log weights
-        are 0.
+        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. The default is 0.
     parents : mapping
         ``"previous"`` and ``"proposed"`` have (n,) integer indices of the parents in the previous population or among
         the proposed particles, with -1 for none. The filter numbers both, and an update keeps the numbers.

@@ -75,8 +75,7 @@ def run_many(
     folder : path, optional
         Every finished run is stored in this folder, as ``arm/seed.npz``. Characters of an arm other than lower-case
         letters, digits, ``_`` and ``-`` are replaced by a hash. The same call makes only the missing runs. InputError
-        if a stored run was made with another filter, other observations or other collectors, or if its file is
-        damaged.
+        if a stored run was made with another filter, other observations or other collectors, or is damaged.
     progress : bool or callable
         True shows a progress bar. A function is called as ``progress(done, total)`` when runs finish.
     **collectors
@@ -87,8 +86,7 @@ def run_many(
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
         an observation (`LostRunError`). From that step on, the log evidence of a lost run is -inf and the other
-        results are NaN. `History.lost` has the reasons. `History.single` states why the runs of an arm were made one
-        by one.
+        results are NaN. `History.lost` has the reasons. `History.single` has the reasons for single runs.
 
     Warns
     -----
@@ -352,8 +350,8 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
 def _check_caller() -> None:
     """Raise InputError if a module that is being imported calls `run_many` with workers.
 
-    Workers import the modules of the functions that they get. So workers would call `run_many` again, or wait for the
-    end of the import.
+    Workers import the modules of the functions that they get. So workers would call `run_many` again, or wait
+    forever.
     """
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:

@@ -66,8 +66,7 @@ class StateSpaceModel(AtStep):
     log_initial : callable, optional
         ``(particles) -> (n,)`` log p(x_0). The function is needed by guided filters and moves.
     log_transition : callable, optional
-        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. The function is needed by guided filters and
-        moves.
+        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     batched : bool or None
         Whether the functions treat each particle independently, so that they can be called with the particles of many
         runs (see `mstfilter.smc.batching`). None: With None, `run_many` tests this.

@@ -7,8 +7,8 @@ cache under the same paths and have the same version of mstfilter. If a worker d
 another worker. After ``allowed-failures`` (3) deaths, the job has failed. If a job exceeds its time limit, the
 worker's nanny restarts the process of the worker. If no worker is left for a while, an error ends the wait.
 
-A worker sends the outcome of a job as an event, not as the value of the task. So the outcome remains if the worker
-dies later.
+A worker sends the outcome of a job as an event, not as the value of the task. So the outcome remains if it dies
+later.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
 
 The identity of a run is a hash of its configuration, its recording, its seed, the files of mstfilter and of the user,
 and the versions of the libraries. A simulated recording is hashed as its recipe. Other recordings are hashed as their
-content with the ground truth. A run is not repeated if its identity has not changed. Equal runs of two studies have
-equal identities.
+content with the ground truth. A run is not repeated if its identity has not changed. Equal runs have equal
+identities.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 >>> fitted = fit_recalibration(rows, counts, [("s1", "mst")])  # to score the scenes of another study
 
 Recalibration and the floor of the energy score need other scenes of the same family and arm. The scenes of the fit
-are the other scenes of the study, or the scenes to which a given recalibration was fitted. Filter seeds of one scene
-are never on both sides.
+are the other scenes of the study, or the scenes to which a given recalibration was fitted. Seeds of one scene are
+never on both sides.
 """
 
 from __future__ import annotations

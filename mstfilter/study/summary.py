@@ -186,8 +186,7 @@ def summarise(
         The arm with which others are compared.
     cost : sequence of str
         Columns of time and memory. The columns are averaged over all pauses and not compared. A stage that a step
-        lacks took 0 seconds. If an arm has several filter seeds, the first is omitted, since it fills the cache for
-        later runs.
+        lacks took 0 seconds. If an arm has several filter seeds, the first is omitted, since it fills the cache.
     reported_only : collection of str
         Arms that are not part of the comparisons.
     """

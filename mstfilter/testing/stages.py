@@ -295,8 +295,8 @@ def run_contract(
     """Test all properties of a component whose interface has a contract.
 
     ``example(rng, n)`` returns a population and an observation that the component can process. The default is the
-    function ``example`` in the module of its class. Without one, the example is a scene for components of images, and
-    numbers for others.
+    function ``example`` in the module of its class. Without one, the example is a scene for components of images,
+    else numbers.
 
     ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
     observation; see the contract. The default is the function ``exact`` in the module of its class, if there is one.

@@ -240,11 +240,10 @@ class MstRule(MotionRule):
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame. Refined motions are additional
-        candidates.
+        Number of best candidates that are refined against the whole last frame. These motions are candidates too.
     search_above : float
-        If every score is larger than this value, the object is searched for around its last position. A negative
-        value disables the search.
+        If every score is larger than this value, the object is searched for around its last position. Disabled if
+        negative.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration

@@ -167,8 +167,7 @@ class MaskTracker(Checked, ABC):
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame, one for each of the masks (H, W) bool of the first frame.
 
-        An empty mask states that the object is lost. Masks may overlap. The result for a mask should not depend on
-        others.
+        An empty mask states that the object is lost. Masks may overlap. Results for masks should be independent.
         """
 
 

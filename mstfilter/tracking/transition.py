@@ -79,8 +79,8 @@ class Warp(Bounded):
     ) -> WarpResult:
         """Move objects. If all motions are the identity, the result contains the same hypothesis object.
 
-        `motions` maps labels to motions in world metres. Objects without an entry do not move. The `residuals` of the
-        motions break ties.
+        `motions` maps labels to motions in world metres. Objects without an entry do not move. The `residuals` break
+        ties.
         """
         matrices = {k: T.as_matrix() for k, T in motions.items()}
         moving = {k: T for k, T in matrices.items() if not np.array_equal(T, np.eye(4))}

@@ -188,8 +188,8 @@ class ProgramMove(_OfProgram, Rejuvenation):
 
     Continuous sites take a Gaussian step of `scale` standard deviations of the site's distribution. Discrete sites
     are drawn from their distribution. Both distributions depend on earlier sites, so the reverse density takes a
-    second run at the proposed values. The branches of `switch` do not change. ``notes["accepted"]`` is the rate of
-    accepted steps.
+    second run at the proposed values. The branches of `switch` do not change. ``notes["accepted"]`` is the acceptance
+    rate.
 
     Parameters
     ----------

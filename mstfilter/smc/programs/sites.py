@@ -41,8 +41,7 @@ def sample(name: str, distribution: Any) -> Any:
     name : str
         Unique within a step, except for sites in different branches of a `switch`.
     distribution : Distribution
-        A distribution of this package, frozen of scipy.stats, or of torch. The parameters of the distribution have
-        one row per particle.
+        A distribution of this package, frozen of scipy.stats, or of torch. The parameters have one row per particle.
 
     Returns
     -------

@@ -91,8 +91,8 @@ class Sample:
     betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
     mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, the largest value of
     the product over any number of calls exceeds 1 / p with probability at most p. The test needs no normal
-    approximation and no variance. So a scheme that gives very many copies in rare calls passes. Calls may be added if
-    the result is not clear.
+    approximation and no variance. So a scheme that gives very many copies in rare calls passes. Calls may be added in
+    unclear cases.
     """
 
     def __init__(self, case: Case) -> None:

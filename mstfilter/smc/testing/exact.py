@@ -79,8 +79,7 @@ class ExactContract(PopulationContract):
         Probabilities of intervals, means and spreads are compared. Sums detect columns that share a random number.
 
         The difference of two weighted means is normal, up to errors that a twentieth of the level allows for. A tail
-        is compared if its probability is at least that of 50 of the largest weights, so that no rare weight is
-        decisive.
+        is compared if its probability is at least that of 50 of the largest weights, so no rare weight decides.
         """
         samples = []
         for log_weights in (lw, exact_lw):
