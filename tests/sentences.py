@@ -41,6 +41,7 @@ _END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*\[$]*[A-Z`])")
 
 def sentences(text: str) -> Iterator[str]:
     """Sentences of a page or a docstring. A colon before a capital letter also ends a sentence."""
+    text += "\n"  # a docstring may end with an example
     for pattern in _BLOCKS:
         text = re.sub(pattern, "\n\n", text, flags=re.MULTILINE | re.DOTALL if ".*?" in pattern else re.MULTILINE)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)

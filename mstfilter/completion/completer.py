@@ -160,7 +160,7 @@ class Completer(Checked, ABC):
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
-        """Complete several masks of a frame. The pose of the frame places it in the grid.
+        """Complete several masks of a frame. The pose of a frame places the frame in the grid.
 
         Parameters
         ----------

@@ -108,7 +108,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Almost certain odds of the truth, so that draws are as near to it as possible.
+    """Almost certain odds of the truth, so that draws are as near to the truth as possible.
 
     A cell belongs to the true object of most of its readings.
     """

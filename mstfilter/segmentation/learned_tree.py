@@ -178,8 +178,8 @@ def pair_features(
 ) -> np.ndarray:
     """The named features (k, f) of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
 
-    `border` (k, B) are the common borders of the pairs, seen from `a`. `table_a` and `table_b` (k, B) are their
-    borders with the table, with zeros if there is none. `scale` is the image width / 640.
+    `border` (k, B) are the common borders of the pairs, seen from `a`. `table_a` and `table_b` (k, B) are the borders
+    of a and b with the table, with zeros if there is none. `scale` is the image width / 640.
     """
     pair = _PairMeasures(a, b, border, table_a, table_b, scale)
     return np.stack([FEATURES[name](pair) for name in names], axis=1)

@@ -227,7 +227,7 @@ def pmmh(
     Raises
     ------
     InputError
-        If a chain starts where the prior is zero, or 20 estimates of the evidence at its start are zero.
+        If a chain starts where the prior is zero, or 20 estimates of the evidence there are zero.
     """
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])

@@ -284,7 +284,7 @@ def paris(
     transition : DensityTransition
         The transition of the model, ``Dynamics(model)``.
     n_draws : int
-        At least 2, since with one the variance grows as that of the genealogy.
+        At least 2, since with one draw the variance grows as that of `genealogy`.
     method, steps, log_bound
         As in `backward_paths`.
 

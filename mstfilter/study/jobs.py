@@ -116,7 +116,7 @@ def _run(job: Job) -> None:
 
 
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
-    """The metrics of each pause of a run. The counts of its forecasts are written into its folder."""
+    """The metrics of each pause of a run. The counts of the run's forecasts are written into its folder."""
     measured = [
         measure_pause(
             recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)

@@ -102,8 +102,8 @@ class SiftMatching(Bounded):
     ----------
     mutual : bool
         If True, keep a pair only if each feature is the best match of the other and passes the ratio test (`ratio`).
-        If False, keep every pair within all three radii, as the authors' program does. Clusters reject the wrong
-        ones.
+        If False, keep every pair within all three radii, as the authors' program does. Clustering rejects wrong
+        pairs.
     ratio : float
         Largest ratio of the best to the second best descriptor distance. Used if `mutual`.
     descriptor_radius : float
