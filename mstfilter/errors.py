@@ -1,10 +1,12 @@
-"""Errors and warnings that a user can mend: what is wrong, where, the value found; then what to do.
+"""Errors and warnings that a user can correct.
+
+The messages state what is wrong, where, and the value found, and then what to do.
 
 >>> from mstfilter.errors import InputError
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
 ('record the frame again',)
 
-`check_number`, `check_integer`, `check_choice` and `check_component` check the fields of components with one wording.
+`check_number`, `check_integer`, `check_choice` and `check_component` check fields with the same wording.
 """
 
 from __future__ import annotations
@@ -33,23 +35,23 @@ class _WithHints(Exception):
 class InputError(_WithHints, ValueError):
     """Input that cannot be used.
 
-    `message` is one line: what is wrong, where, and the value found. Each hint is one line: what the user can do
-    about it.
+    `message` is one line that states what is wrong, where, and the value found. A hint is one line that states what
+    to do.
     """
 
 
 class MissingLibraryError(InputError):
-    """A library or a system package that a chosen component needs is not there."""
+    """A library or a system package that a chosen component needs is missing."""
 
 
 class LostRunError(InputError):
-    """No particle explains an observation: the estimate of the evidence is 0, and the run cannot continue."""
+    """No particle explains an observation. The estimate of the evidence is 0, and the run cannot continue."""
 
 
 class InputWarning(_WithHints, UserWarning):
-    """Input that can be used but is probably not what was meant; message and hints as for `InputError`.
+    """Input that can be used but is probably not what was intended. Message and hints are as for `InputError`.
 
-    The command line shows it as one ``warning:`` line.
+    The command line shows the warning as one ``warning:`` line.
     """
 
     def __str__(self) -> str:
@@ -58,7 +60,7 @@ class InputWarning(_WithHints, UserWarning):
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Put `where` in front of the message of an InputError in the block, unless the message contains it."""
+    """Put `where` before the message of an InputError in the block, unless the message contains it."""
     try:
         yield
     except InputError as error:
@@ -74,7 +76,7 @@ def reason(error: BaseException) -> str:
 
 
 def printable(text: str) -> str:
-    """One line of at most 1500 characters; the control characters of a terminal become escape sequences.
+    """One line of at most 1500 characters, in which control characters of a terminal are escape sequences.
 
     Names and values in files of unknown origin may contain them.
     """
@@ -84,7 +86,7 @@ def printable(text: str) -> str:
 
 
 def suggestion(name: str, names: Iterable[str]) -> list[str]:
-    """A hint with the known name that is closest to an unknown one; no hint if none is close."""
+    """A hint with the known name that is closest to an unknown name; no hint if none is close."""
     return [f"did you mean {close}?" for close in difflib.get_close_matches(name, list(names), n=1)]
 
 
@@ -127,7 +129,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
 
 
 def check_component(name: str, value: Any, interface: type, optional: bool = False) -> None:
-    """Raise InputError unless `value` is an instance of `interface`, or None where it is optional."""
+    """Raise InputError unless `value` is an instance of `interface`, or None if it is optional."""
     if isinstance(value, interface) or (optional and value is None):
         return
     hints = []
@@ -141,9 +143,9 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
 
 
 def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
-    """The error for a library that cannot be imported: `what` needs it, and how to install it.
+    """The error for a library that cannot be imported: it states what needs the library, and how to install it.
 
-    `library` is its name; by default that of the module in the exception.
+    `library` is its name. By default the library is the module in the exception.
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
@@ -170,10 +172,10 @@ _PACKAGES = {
 
 
 def place_in_user_file(error: BaseException) -> str | None:
-    """``FILE, line N: TEXT`` of the line of a user's file in which an exception was raised; None if there is none.
+    """``FILE, line N: TEXT`` for the line of a user's file in which an exception was raised; None if there is none.
 
-    It is the deepest frame of the traceback, or of the traceback of the cause, in a Python file that belongs neither
-    to this package nor to an installed library. A syntax error is in the file that it names.
+    The line is in the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this
+    package nor to an installed library. For a syntax error, the place is in the file that the error names.
     """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{short_path(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"
@@ -190,7 +192,7 @@ def place_in_user_file(error: BaseException) -> str | None:
 
 
 def exhausted(error: BaseException) -> InputError | None:
-    """What to tell the user if memory or disk space ran out; None for another error."""
+    """The message for the user if memory or disk space ran out; None for other errors."""
     if isinstance(error, MemoryError) or "allocate" in str(error):  # cv2 and torch have no class for it
         return InputError("out of memory", "use fewer workers, fewer particles or larger voxels")
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -207,13 +209,13 @@ def describe_error(error: BaseException) -> str:
 
 
 def _is_of_user(file: str) -> bool:
-    """Whether a file of a frame exists and is neither of this package nor of an installed library."""
+    """Whether the file of a frame exists and belongs neither to this package nor to an installed library."""
     libraries = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
     folders = [str(Path(__file__).parent), *libraries]
     return Path(file).is_file() and not any(Path(file).is_relative_to(folder) for folder in folders)
 
 
 def short_path(file: str | Path) -> str:
-    """A path relative to the working folder if it is below it."""
+    """A path relative to the working folder if it is inside this folder."""
     path = Path(file).resolve()
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

@@ -1,4 +1,4 @@
-"""Bounds of fields, stated in the annotations of a dataclass and checked when an instance is made.
+"""Bounds of fields, which are stated in the annotations of a dataclass and checked when an instance is made.
 
 >>> from dataclasses import dataclass
 >>> from typing import Annotated, Literal
@@ -12,10 +12,10 @@
 Traceback (most recent call last):
 mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
 
-Three annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded` such as the
-interface of a component, alone or as ``Interface | None``. All others are documentation.
+Three annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded`. An example of such
+a subclass is the interface of a component, alone or as ``Interface | None``. Other annotations are documentation.
 
-A ``__post_init__`` for conditions on several fields is called after these checks.
+After these checks, a ``__post_init__`` is called for conditions on several fields.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mstfilter.errors import InputWarning, check_choice, check_component, check_
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. An int has `at_least` and `at_most` only."""
+    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. An int has only `at_least` and `at_most`."""
 
     above: float = -math.inf
     at_least: float = -math.inf

@@ -1,13 +1,13 @@
-"""Writing files and folders so that neither a kill, a power failure nor a second process damages them.
+"""Writing of files and folders such that a kill, a power failure or a second process cannot damage them.
 
 >>> with atomic_path(folder / "metrics.csv") as path:
 ...     path.write_text(text, encoding="utf-8")
 >>> with locked("runs/mine"), atomic_folder("runs/mine") as folder:
 ...     (folder / "run.json").write_text(text, encoding="utf-8")
 
-A file or folder is written under a temporary name beside the final one, synced with the disk, and renamed when it is
-complete. If the block raises, the temporary is removed and an earlier file is left as it was. What a killed process
-leaves is removed by the next `locked` of the same name.
+A file or folder is written under a temporary name in the same folder, synced with the disk, and renamed when it is
+complete. If the block raises an error, the temporary file is removed and an earlier file is left unchanged. The next
+`locked` of the same name removes the remains of a killed process.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>partial|replaced
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed to it at the end of the block; missing folders are made."""
+    """A temporary path beside `path`, renamed to `path` at the end of the block. Missing folders are made."""
     target = Path(path)
     _make_folders(target.parent)
     partial = _temporary(target, "partial")
@@ -57,10 +57,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep"] = "refuse") -> Iterator[Path]:
-    """An empty temporary folder beside `path`, renamed to it at the end of the block.
+    """An empty temporary folder beside `path`, which is renamed to `path` at the end of the block.
 
-    `existing` states what happens to a folder with content that is at `path` then: InputError, the new folder
-    replaces it, or it is kept and the new one is removed. An empty folder is always replaced.
+    `existing` determines what happens if `path` then has a folder with content: InputError is raised, the new folder
+    replaces it, or it is kept and the new folder is removed. An empty folder is always replaced.
     """
     target = Path(os.path.realpath(path))
     _make_folders(target.parent)
@@ -97,11 +97,10 @@ def _place(partial: Path, target: Path, existing: str) -> None:
 
 @contextmanager
 def locked(path: str | Path) -> Iterator[None]:
-    """Reserve a file or folder, which need not exist, for this block; remove what a killed process left of it.
+    """Reserve a file or folder, which need not exist, for this block. Removes the remains of a killed process.
 
     Raises InputError if another block of this or another process has reserved it. The lock is a file ``.NAME.lock``
-    beside `path`; the system releases it when the process ends. File systems without locks cannot exclude a second
-    process.
+    beside `path`. The system releases the lock when the process ends. File systems without locks do not prevent it.
     """
     target = Path(os.path.realpath(path))
     if _is_temporary(target.absolute()):  # no other process knows the name
@@ -128,7 +127,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def _reserve(file: Path, target: Path) -> int:
-    """Open and lock a lock file; InputError with the other process if it is locked."""
+    """Open and lock a lock file. If it is locked, raise InputError with the other process."""
     while True:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
         with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file
@@ -145,7 +144,7 @@ def _reserve(file: Path, target: Path) -> int:
 
 
 def _lock(path: Path, flags: int) -> int | None:
-    """Open and lock a file or folder; None if it is locked already. Systems without locks only open it."""
+    """Open and lock a file or folder; None if it is already locked. Systems without locks only open the file."""
     descriptor = os.open(path, flags, 0o666)
     try:
         import fcntl
@@ -160,10 +159,10 @@ def _lock(path: Path, flags: int) -> int | None:
 
 
 def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> None:
-    """Remove temporaries in a folder, of all names or of one, whose process has ended.
+    """Remove temporary files in a folder, of all names or of one, whose process has ended.
 
-    If a process was killed while a folder was replaced, the earlier folder gets its name back. Give a least age
-    unless the name is locked: another process may just have made a temporary.
+    If a process was killed while it replaced a folder, the earlier folder gets its name back. Give a minimum age
+    unless the name is locked, since another process may just have made a temporary file.
     """
     for path in folder.iterdir() if folder.is_dir() else ():
         match = _TEMPORARY.fullmatch(path.name)
@@ -176,7 +175,7 @@ def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> N
 
 
 def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
-    """Files below a folder whose paths in it do not fit `own`; temporaries and locks are left out."""
+    """Files below a folder whose relative paths do not match `own`, without temporary files and locks."""
     paths = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
     own = re.compile(rf"{own.pattern}|(.+/)?\.[^/]+\.lock")
     return sorted(p.as_posix() for p in paths if not own.fullmatch(p.as_posix()) and not _is_temporary(p))
@@ -195,12 +194,12 @@ def _temporary(target: Path, kind: str) -> Path:
 
 
 def _is_temporary(path: Path) -> bool:
-    """Whether a path is a temporary, or below one."""
+    """Whether a path is a temporary file, or inside a temporary folder."""
     return any(map(_TEMPORARY.fullmatch, path.parts))
 
 
 def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and those above it; returns those that were missing, the deepest first."""
+    """Make a folder and its parents. Returns the folders that were missing, with the deepest first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     _sync(folder, *(path.parent for path in missing))
@@ -208,9 +207,9 @@ def _make_folders(folder: Path) -> list[Path]:
 
 
 def _sync(target: Path, *paths: Path) -> None:
-    """Wait until files, and the names in folders, are on the disk.
+    """Wait until files, and the names in folders, are stored on the disk.
 
-    If `target`, which they are or will be, is in a temporary folder, they are synced when that folder is complete.
+    If `target`, where they are or will be, is in a temporary folder, they are synced when that folder is complete.
     """
     if os.name != "posix" or _is_temporary(target.absolute()):
         return
@@ -226,13 +225,13 @@ def _sync(target: Path, *paths: Path) -> None:
 
 
 def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
-    """Write SHA256SUMS, which ``sha256sum -c`` reads: the hashes of the named files, or of all below the folder."""
+    """Write SHA256SUMS for ``sha256sum -c``: the hashes of the named files, or of all files below the folder."""
     files = [folder / name for name in names] or sorted(path for path in folder.rglob("*") if path.is_file())
     write_text(folder / SUMS, "".join(f"{_digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in files))
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """What differs from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
+    """Differences from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
     lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -250,7 +249,7 @@ def _fault(file: Path, digest: str) -> str:
 
 @contextmanager
 def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
-    """Turn errors in a block that reads a file into InputError; `kind` is what is missing without the file."""
+    """Convert errors in a block that reads a file to InputError. `kind` is what is missing without the file."""
     try:
         with naming(str(path)):
             yield
@@ -271,7 +270,7 @@ _UNREADABLE = (
 
 @contextmanager
 def writing(what: str, *hints: str) -> Iterator[None]:
-    """Turn errors of the disk in a block that writes `what` into InputError."""
+    """Convert disk errors in a block that writes `what` to InputError."""
     try:
         yield
     except OSError as error:
@@ -282,7 +281,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
     An existing folder must be empty, unless `empty` is false. A file is made and removed for each name that does not
-    exist: permissions do not tell of read-only file systems, long names, or a full disk.
+    exist. Permissions alone do not show read-only file systems, long names, or a full disk.
     """
     if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
@@ -309,7 +308,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
 
 
 def _try_to_write(folder: Path, temporary: Path) -> None:
-    """Make a file in a folder and remove it, without a name where that is possible: a kill then leaves nothing."""
+    """Make a file in a folder and remove it. Where possible the file has no name, so that a kill leaves nothing."""
     if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:
@@ -333,10 +332,10 @@ def write_csv(
     columns: Iterable[str] | None = None,
     float_format: str = "",
 ) -> None:
-    """Write rows as CSV in one step; None and NaN are written as an empty cell.
+    """Write rows as CSV in one step. None and NaN are written as empty cells.
 
-    `columns` are written in this order; by default all in the order of first appearance. `float_format` is for
-    example ``.6g``; the default writes all digits.
+    `columns` are written in this order. The default is all columns in the order of first appearance. `float_format`
+    is for example ``.6g``. The default writes all digits.
     """
     rows = [{name: _cell(value, float_format) for name, value in row.items()} for row in rows]
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))

@@ -1,7 +1,7 @@
 """Scores of forecasts: Brier score, log loss, calibration, recalibration, energy score.
 
-A forecast of an event is a probability p; its outcome y is 0 or 1. Many forecasts are kept as a table of how often
-each value of p was given and how often the event then occurred, so that tables can be pooled.
+A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. The
+table has how often each value of p was given, and how often the event then occurred. Tables can be pooled.
 
 >>> import numpy as np
 >>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])
@@ -11,14 +11,14 @@ each value of p was given and how often the event then occurred, so that tables 
 >>> fit(np.array([0.2, 0.9])).tolist()
 [0.5, 0.999]
 
-A forecast of a vector, a segmentation, or any other object is a weighted set. Its energy score needs only distances:
+A forecast of a vector, a segmentation, or any other object is a weighted set. The energy score needs only distances:
 
 >>> distances = np.array([[0.0, 1.0], [1.0, 0.0]])  # between the two members of the set
 >>> energy_score([0.0, 1.0], distances, [0.5, 0.5])
 0.25
 
 A score is proper if no other forecast has a lower expected score than the true distribution. Brier score and log loss
-are proper; the energy score is proper if the distance is of negative type (`is_negative_type`).
+are proper. The energy score is proper if the distance is of negative type (`is_negative_type`).
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class ForecastTable:
     def reliability(self, n_bins: int = 10) -> Reliability:
         """The reliability diagram on bins of equal numbers of forecasts.
 
-        Equal forecasts stay in one bin, so bins differ in size where a forecast is frequent.
+        Equal forecasts stay in one bin, so the sizes of bins differ where a forecast is frequent.
         """
         middle = np.cumsum(self.count) - self.count / 2  # rank of each forecast
         which = np.minimum((n_bins * middle / max(self.n, 1e-300)).astype(np.int64), n_bins - 1)
@@ -131,7 +131,7 @@ class Reliability:
     forecast : (b,) float
         Mean forecast of each bin.
     frequency : (b,) float
-        Share of the forecasts of the bin whose event occurred.
+        Share of the forecasts in the bin whose event occurred.
     count : (b,) float
         Number of forecasts.
     """
@@ -157,9 +157,9 @@ class Recalibration:
     Parameters
     ----------
     p : (k,) float
-        Forecasts, ascending.
+        Forecasts in ascending order.
     probability : (k,) float
-        Non-decreasing.
+        Probabilities, non-decreasing.
     """
 
     p: np.ndarray
@@ -200,7 +200,7 @@ def energy_score(to_outcome: ArrayLike, between: ArrayLike, weights: ArrayLike |
     between : (n, n) float
         Distances d(x_i, x_j).
     weights : (n,) float, optional
-        Sum 1. Default: equal.
+        Sum 1. By default, weights are equal.
 
     Notes
     -----
@@ -220,13 +220,13 @@ def is_negative_type(distances: ArrayLike) -> bool:
     """Whether a distance is of negative type on n points.
 
     ``sum_ij c_i c_j d_ij <= 0`` for all c with ``sum_i c_i = 0`` (Schoenberg 1938). If this holds for all points, the
-    energy score with d is proper. If it fails, two distributions on these points exist for which the wrong forecast
-    has the lower expected score (Sejdinovic et al. 2013).
+    energy score with d is proper. If it fails, there are two distributions on these points for which the wrong
+    forecast has the lower expected score (Sejdinovic et al. 2013).
 
     Parameters
     ----------
     distances : (n, n) float
-        Symmetric, zero on the diagonal.
+        Symmetric matrix with zeros on the diagonal.
     """
     D = np.asarray(distances, dtype=np.float64)
     if D.ndim != 2 or D.shape[0] != D.shape[1]:

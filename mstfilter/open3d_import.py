@@ -4,7 +4,7 @@
 >>> o3d = import_open3d()                            # doctest: +SKIP
 >>> o3d.geometry.PointCloud()                        # doctest: +SKIP
 
-Components that need open3d call this function when they are used. No default component does.
+Components call this function when they need open3d. No default component needs open3d.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")
 def import_open3d() -> ModuleType:
     """Import open3d, limited to one thread.
 
-    With several threads the order of a parallel sum varies, and results differ in their last digits. Raises
+    With several threads the order of a parallel sum varies, so the last digits of results vary. Raises
     MissingLibraryError if the package or a system library that it needs is missing.
     """
     try:

@@ -4,9 +4,9 @@
 >>> mst = mstfilter.preset("mst")
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
-``mst`` is the default, ``paper`` the published algorithm, ``authors`` the program of its authors. A preset is a TOML
-file with the fields of `ParticleFilter`, one table for each component. It may extend another preset, or
-``models/base.toml``, which holds what `mst` and its baselines share:
+``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
+TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset, or
+``models/base.toml``, which has the common parts of `mst` and its baselines:
 
     base = "base"                           # fields that are not named here are those of the base
 
@@ -15,7 +15,7 @@ file with the fields of `ParticleFilter`, one table for each component. It may e
 
     wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
 
-``base`` itself has no update: it can be extended but is no preset.
+``base`` itself has no update. `base` can be extended but is not a preset.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
 
 
 def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The content of a preset's file, added to that of its base."""
+    """The content of a preset file, added to that of its base."""
     path = find_preset(name, to_extend=bool(parents))
     config = read_toml(path, "a preset")
     base, wraps = config.pop("base", ""), config.pop("wrap", {})

@@ -1,11 +1,11 @@
-"""Processes that this package starts, and the machine that they run on.
+"""Processes that this package starts, and the machine on which they run.
 
 >>> with environment(OMP_NUM_THREADS="1"):
 ...     pool = ProcessPoolExecutor(2)
 
-New interpreters put the working folder in front of the path of modules. In a folder with unknown files, a file
-``multiprocessing.py`` would run there. Processes that are started in the block do not search the working folder
-first. The modules of the caller are found, because `multiprocessing` and joblib pass the path of modules on.
+New interpreters put the working folder first in the path of modules. In a folder with unknown files, a file
+``multiprocessing.py`` would then be executed. Processes that are started in the block do not search the working
+folder first. The modules of the caller are found, because `multiprocessing` and joblib pass on the path of modules.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def environment(**variables: str) -> Iterator[None]:
 
 
 def check_main_guard(what: str) -> None:
-    """Raise InputError if new processes would repeat the call of `what` that a script makes.
+    """Raise InputError if new processes would repeat the call of `what` in a script.
 
-    `multiprocessing` imports the script in each new process, except for what is below ``if __name__ == "__main__":``.
+    `multiprocessing` imports the script in each new process, except the code below ``if __name__ == "__main__":``.
     """
     main = sys.modules["__main__"]
     path, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
@@ -66,13 +66,13 @@ def check_main_guard(what: str) -> None:
 
 @functools.cache
 def machine() -> dict[str, Any]:
-    """What the last bits of results depend on besides versions: model of the CPU and BLAS library of numpy."""
+    """Properties that affect the last bits of results besides versions: CPU model and BLAS library of numpy."""
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     return {"cpu": _cpu(), "system": platform.system(), "blas": f"{blas.get('name')} {blas.get('version')}"}
 
 
 def threads() -> int:
-    """Threads that libraries may use: OMP_NUM_THREADS, else the cores that this process may use."""
+    """Number of threads that libraries may use: OMP_NUM_THREADS, or else the number of available cores."""
     given = os.environ.get("OMP_NUM_THREADS", "")
     return int(given) if given.isdecimal() else available_cores()
 

@@ -3,9 +3,9 @@
 >>> info = read_json(folder / "info.json", "a run folder")
 >>> arrays = read_arrays(folder / "truth.npz", "true volumes")
 
-`open_regular`, which all readers use, opens regular files only: a pipe or a device could be read without an end. The
-size of a file is compared with a limit, and the size of what it unpacks to is taken from its headers, before memory
-is allocated. All errors are `InputError` with the name of the file.
+All readers use `open_regular`, which opens only regular files. Reading a pipe or a device might never end. The file
+size is compared with a limit. The unpacked size is read from headers before memory is allocated. All errors are
+`InputError` with the name of the file.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _Model = TypeVar("_Model", bound="BaseModel")
 
 @contextmanager
 def open_regular(path: str | Path, limit: int | None = None) -> Iterator[io.BufferedReader]:
-    """A regular file of at most `limit` bytes, opened for reading. Raises InputError if it is something else.
+    """A regular file of at most `limit` bytes, opened for reading. Raises InputError for other files.
 
     The default of all limits is `MAX_FILE`.
     """
@@ -86,9 +86,9 @@ def read_toml(path: Path, kind: str, *hints: str) -> dict[str, Any]:
 
 
 def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple[_Model, dict[str, Any]]:
-    """A JSON file checked by a pydantic model: the model, and the values as they are stored.
+    """A JSON file checked by a pydantic model. Returns the model, and the values as they are stored.
 
-    Other parameters and errors: `reading`. An error names the first entry that is wrong, and the value found.
+    Other parameters and errors: `reading`. An error names the first wrong entry and the value found.
     """
     from pydantic import ValidationError
 
@@ -104,7 +104,9 @@ def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple
 
 
 def read_arrays(path: Path, kind: str, *hints: str, limit: int | None = None) -> dict[str, np.ndarray]:
-    """All arrays of an .npz file that needs at most `limit` bytes of memory; that of an .npy file has the name "".
+    """All arrays of an .npz file that needs at most `limit` bytes of memory.
+
+    The array of an .npy file has the name "".
 
     Other parameters and errors: `reading`.
     """
@@ -142,7 +144,7 @@ def _check_array(file: IO[bytes], size: int) -> None:
 
 
 def check_private(folder: Path) -> None:
-    """Raise InputError if a folder exists that belongs to another user, or into which others may write."""
+    """Raise InputError if a folder belongs to another user, or can be written by others."""
     if not hasattr(os, "getuid") or not folder.exists():
         return
     status = folder.stat()

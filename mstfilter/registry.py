@@ -1,7 +1,7 @@
 """Components by name, and components from configuration.
 
 A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind to the class that components
-of this kind inherit, ``__components__`` maps the names of a kind to classes, or to ``/path/of/file.py:Class``::
+of this kind inherit. ``__components__`` maps the names of a kind to classes, or to ``/path/of/file.py:Class``::
 
     __interfaces__ = {"resampler": "Resampler"}
     __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
@@ -13,14 +13,14 @@ A `Registry` joins the declarations of several packages. `mstfilter.presets.REGI
 Systematic()
 >>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
-A configuration is a nested mapping. A component is its name, or a mapping with ``component`` and fields. The kind of
-a field follows from its annotation: a field of type ``Resampler`` or ``Resampler | None`` holds a resampler, one of
-type ``tuple[Evidence, ...]`` a list of evidence.
+A configuration is a nested mapping. A component in a configuration is a name, or a mapping with ``component`` and
+fields. The kind of a field follows from its annotation. A field of type ``Resampler`` or ``Resampler | None`` holds a
+resampler, and one of type ``tuple[Evidence, ...]`` a list of evidence.
 
-A component is imported when it is first built; looking up a name imports nothing. Users name their own class as
+A component is imported when it is first built. Looking up a name imports nothing. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add it by an entry point ``kind.name`` of the group
 ``mstfilter.components``. A relative path is relative to the working folder. A file is executed once per process, and
-again after its content has changed.
+again if its content has changed.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _ENTRY_POINTS = "mstfilter.components"
 
 @functools.cache
 def _installed_components() -> tuple[tuple[str, str], ...]:
-    """Name and location of each entry point. A search reads the metadata of all installed packages (15 ms)."""
+    """Name and location of each entry point. The search reads the metadata of all installed packages (15 ms)."""
     return tuple((entry.name, entry.value) for entry in entry_points(group=_ENTRY_POINTS))
 
 
@@ -74,7 +74,7 @@ class Registry:
         return tuple(self._components)
 
     def known(self, kind: str) -> dict[str, str]:
-        """Names of a kind -> locations ``package:Class``, entry points included."""
+        """Mapping from names of a kind to locations ``package:Class``, including entry points."""
         names = dict(self._components[kind])
         for full_name, location in _installed_components():
             entry_kind, _, name = full_name.partition(".")
@@ -98,7 +98,7 @@ class Registry:
     def check_names(self, cls: type, config: Mapping[str, Any], allow_files: bool = False) -> None:
         """Raise InputError if a field of `cls` names an unknown component; imports no component.
 
-        Names deeper in the configuration are checked by `make`, which imports what it builds.
+        `make` checks names deeper in the configuration, since it imports what it builds.
         """
         hints = typing.get_type_hints(cls)
         for field, value in config.items():
@@ -108,7 +108,7 @@ class Registry:
                 self._locate(kind, name, field, allow_files)
 
     def find_class(self, kind: str, name: str, where: str | None = None, allow_files: bool = False) -> type:
-        """The class of a component name; imports it."""
+        """The class of a component name, which is imported."""
         location = self._locate(kind, name, where or kind, allow_files)
         path, _, attribute = location.partition(":")
         if path.endswith(".py"):
@@ -172,7 +172,9 @@ class Registry:
     def make(
         self, cls: type, fields: Mapping[str, Any], where: str = "", allow_files: bool = False, base: Any = None
     ) -> Any:
-        """Build a dataclass from plain values and nested components. Other fields have the values of `base`.
+        """Build a dataclass from plain values and nested components.
+
+        Fields that are not given have the values of `base`.
 
         Raises InputError if a field or a component is unknown, or a value does not fit its field.
         """
@@ -212,7 +214,7 @@ class Registry:
             raise InputError(f"{prefix}{cls.__name__} cannot be made: {error}") from error
 
     def _value(self, hint: Any, value: Any, current: Any, path: str, allow_files: bool) -> Any:
-        """The value of a field with annotation `hint`; `current` is its default or its value in `base`."""
+        """The value of a field with annotation `hint`. `current` is its default or its value in `base`."""
         kind = self.kind_of(hint)
         default = current if dataclasses.is_dataclass(current) else None
         if kind is not None and typing.get_origin(hint) is tuple and isinstance(value, str):
@@ -260,7 +262,7 @@ def settings(overrides: Iterable[str], config: Mapping[str, Any] | None = None) 
 
 
 def merged(config: Mapping[str, Any], *changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with changes. Naming a component resets its fields; naming a field keeps the others."""
+    """A configuration with changes. Naming a component resets its fields. Naming a field keeps the other fields."""
     found = dict(config)
     for name, value in (item for change in changes for item in change.items()):
         before = found.get(name)
@@ -323,7 +325,7 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """``package:Class``, where classes of mstfilter count as classes of their top package, or ``file.py:Class``."""
+    """``package:Class``, where classes of mstfilter belong to their top package, or ``file.py:Class``."""
     if "__mst_file__" in vars(cls):
         return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
@@ -358,8 +360,8 @@ def _from_file(path: str, attribute: str) -> type:
 def load_file(path: str | Path) -> ModuleType:
     """The module of a Python file of the user.
 
-    A file is executed once per process, whatever the spelling of its path, and again after its content has changed.
-    Instances of its classes can be pickled: the process that reads them loads the file.
+    A file is executed once per process for any spelling of its path, and again if its content has changed. Instances
+    of its classes can be pickled, since the process that reads them loads the file.
 
     Raises InputError if the file cannot be read or executed.
     """
@@ -375,7 +377,7 @@ def load_file(path: str | Path) -> ModuleType:
 
 
 def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> ModuleType:
-    """A new module from the source of a file; its name is different for every path and content."""
+    """A new module from the source of a file. The name of the module is different for every path and content."""
     unique = hashlib.sha256(f"{resolved}\0{digest}".encode()).hexdigest()[:12]
     name = f"mstfilter_user_{resolved.stem}_{unique}"
     spec = importlib.util.spec_from_file_location(name, resolved)
@@ -428,7 +430,7 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:
-    """A plain value checked against a field's annotation; one value of a ``tuple[X, ...]`` needs no list."""
+    """A plain value checked against a field's annotation. A single value of a ``tuple[X, ...]`` needs no list."""
     from pydantic import TypeAdapter, ValidationError
 
     if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):

@@ -1,9 +1,9 @@
-"""Files that come with the package: presets, weights and their training (`models/`), example components.
+"""Files that are part of the package: presets, weights and their training (`models/`), example components.
 
 >>> models_folder() / "mst.toml"
 >>> examples_folder() / "resampler.py"
 
-A wheel holds both inside the package; in a checkout or an editable install they lie beside the package.
+In a wheel, both folders are inside the package. In a checkout or an editable install, they are beside the package.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def examples_folder() -> Path:
 
 
 def training_program(name: str) -> ModuleType:
-    """A module of `models/mst_training`, the programs that trained the weights.
+    """A module of `models/mst_training`, which contains the programs that trained the weights.
 
     The folder stays in `sys.path`, so that processes which a training starts find the module.
     """
@@ -50,12 +50,12 @@ def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
 
 
 def preset_names() -> list[str]:
-    """Presets that come with the package; `base`, which they extend, is none."""
+    """Presets of the package, without `base`, which they extend."""
     return sorted({path.stem for path in models_folder().glob("*.toml")} - {BASE})
 
 
 def find_preset(name: str, to_extend: bool = False) -> Path:
-    """The TOML file of a preset, by name or path; of `base` only if it is to be extended."""
+    """The TOML file of a preset, by name or path. `base` is found only if it is to be extended."""
     given = Path(name)
     if given.suffix == ".toml":
         if given.is_file():

@@ -1,7 +1,7 @@
-"""Checks of what the methods of components return.
+"""Checks of the results of components' methods.
 
-An interface states the check of a result beside the method. The check then applies to every class that defines the
-method, wherever it is called, and its error names the class, the file and the line of the method:
+An interface states the check of a result beside the method. The check applies to every class that defines the method.
+The error names the class, the file and the line of the method:
 
 >>> class Score(Checked):
 ...     @returns(lambda self, found, particles: check_array(found, (len(particles),)))
@@ -64,7 +64,7 @@ class Checked(Bounded):
 
 
 def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
-    """A method whose result is checked, unless it is called by that of a subclass, which is checked itself."""
+    """A method whose result is checked, unless the method of a subclass calls it, which is checked itself."""
 
     @functools.wraps(method)
     def call(self: Any, *arguments: Any, **named: Any) -> Any:
@@ -87,7 +87,7 @@ def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
 
 
 def warn_once(component: Any, method: str, message: str, *hints: str) -> None:
-    """Warn of a strange result of a method; each message appears once per class and process."""
+    """Warn of an unusual result of a method. Each message appears once per class and process."""
     key = type(component), method, message.split(":")[0]
     if key not in _WARNED:
         _WARNED.add(key)
@@ -164,9 +164,9 @@ def check_array(
     kinds : str
         Kinds of numbers, as in `numpy.dtype.kind`: "b" bool, "iu" integers, "f" floats.
     at_least, at_most : float
-        Range of the values. Values that leave it by a rounding error are clipped.
+        Range of the values. Values outside the range by a rounding error are clipped.
     finite : bool
-        Whether infinite values are errors, as NaN always is.
+        Whether infinite values are errors. NaN always is an error.
     """
     shape = tuple(shape)
     if not isinstance(found, np.ndarray) or isinstance(found, np.ma.MaskedArray):
@@ -216,7 +216,7 @@ def check_rigid(T: np.ndarray, name: str) -> None:
 
 
 def _conversion(found: Any) -> list[str]:
-    """How to make an array of another type."""
+    """How to convert an array to another type."""
     if found is None:
         return ["does every branch of the method return it?"]
     if hasattr(found, "detach"):
@@ -238,7 +238,7 @@ _BOUND = ("a score of -inf rules a hypothesis out: bound it from below",)
 
 
 def _scaling(low: float, high: float) -> list[str]:
-    """How to make probabilities of other numbers."""
+    """How to convert other numbers to probabilities."""
     if high <= _TOLERANCE:
         return ["of log probabilities: np.exp(values)"]
     if low < 0:

@@ -1,4 +1,4 @@
-"""Paired differences between arms, and the conclusions that they allow.
+"""Paired differences between methods (arms), and the conclusions that they allow.
 
 >>> difference = compare([0.9, 0.8, 0.8], [0.7, 0.7, 0.6])
 >>> round(difference.mean, 3), difference.n
@@ -7,13 +7,13 @@
 >>> [(arm, round(d.p_holm, 2)) for arm, d in compare_arms(table, reference="ours").items()]
 [('theirs', 0.5), ('floor', 0.5)]
 
-Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent, so values of
+Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent. So values of
 several filter seeds on one scene are averaged first. A difference has a t interval, a studentised bootstrap interval,
 and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume
-that the differences are symmetric about zero under the null hypothesis; squared errors are skewed, and their
-differences often are. A claim therefore needs both intervals to exclude 0 and a small `Difference.p_claim`, which
-takes the larger p value and multiplies it by 1 + abs(skewness). The p values of one table are adjusted by Holm's
-method. `experiments/comparison` has the error rates and the power of this rule.
+that the differences are symmetric about zero under the null hypothesis. Squared errors are skewed, and differences of
+them often are too. So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is small.
+`p_claim` is the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method.
+`experiments/comparison` has the error rates and the power of this rule.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Difference:
     n : int
         Number of units that both arms have.
     p_holm : float
-        `p_claim` adjusted for all comparisons of the table; equals `p_claim` for a single comparison.
+        `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
         Two-sided p value of the studentised bootstrap, see `studentised_bootstrap`; NaN for fewer than five units.
     skewness : float
@@ -71,14 +71,14 @@ class Difference:
     def p_claim(self) -> float:
         """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
-        The factor makes up for the tail that a small sample of skewed differences often lacks. It is not derived but
-        chosen by simulation, see `experiments/comparison`.
+        The factor accounts for the tail that a small sample of skewed differences often lacks. The factor was chosen
+        by simulation and is not derived; see `experiments/comparison`.
         """
         return float(np.minimum(1, np.fmax(self.p, self.p_bootstrap) * (1 + abs(self.skewness))))
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether both intervals exclude 0; the t interval alone if there is no bootstrap interval."""
+        """Whether both intervals exclude 0. Without a bootstrap interval, only the t interval is used."""
         low, high = np.fmin(self.low, self.low_bootstrap), np.fmax(self.high, self.high_bootstrap)
         return bool(low > 0 or high < 0)
 
@@ -93,8 +93,8 @@ def compare(first: Values, second: Values) -> Difference:
     Parameters
     ----------
     first, second : mapping, or (n,) array_like
-        Unit -> value, or values in the same order of units. Units without a finite value are left out, such as the
-        seeds of lost runs.
+        A mapping from units to values, or values in the same order of units. Units without a finite value, such as
+        the seeds of lost runs, are omitted.
 
     Raises
     ------
@@ -137,11 +137,11 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
     NaN for fewer than five values. The random generator is fixed, so the same values give the same result. A resample
-    of equal values has an infinite t ratio, so a limit is infinite if most values are equal.
+    of equal values has an infinite t ratio. So a limit is infinite if most values are equal.
 
-    The p value is the larger of two. The equal-tailed one follows the skew like the interval (Efron, Tibshirani 1993,
-    section 12.5). That of the absolute t ratio is larger for symmetric values with heavy tails (Hall 1992, section
-    3.6).
+    The p value is the larger of two. The equal-tailed p value follows the skewness like the interval (Efron,
+    Tibshirani 1993, section 12.5). The p value of the absolute t ratio is larger for symmetric values with heavy
+    tails (Hall 1992, section 3.6).
     """
     n, mean = len(values), float(values.mean())
     if n < 5:
@@ -159,7 +159,7 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
     """(mean of a resample - mean) / standard deviation of the resample.
 
-    The ratios of resamples of equal values are infinite, given as +-1e200 since quantiles interpolate.
+    The ratios of resamples of equal values are infinite. Infinite ratios are +-1e200, since quantiles interpolate.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]
@@ -221,12 +221,12 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
     table : mapping
         Arm -> values, as for `compare`.
     reference : str
-        The arm that the others are compared with.
+        The arm with which the others are compared.
 
     Returns
     -------
     dict
-        Arm -> Difference; the reference is left out.
+        Mapping from arms to `Difference`, without the reference.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")
@@ -241,7 +241,7 @@ def slope(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def conclusion(difference: Difference, first: str, second: str, where: str = "", unit: str = "scene") -> str:
-    """The conclusion that a difference allows, as a sentence; `unit` names what the values are paired by."""
+    """The conclusion from a difference, as a sentence. `unit` names the units that pair the values."""
     d, at = difference, f" on {where}" if where else ""
     if d.n == 0:
         return f"{first} and {second}{at}: no {unit} has both."

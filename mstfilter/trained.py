@@ -4,8 +4,8 @@
 >>> model.description["network"], model.tensors["head.bias"].shape
 >>> write_model(folder, {"architecture": "completion-unet", "network": {...}}, tensors)
 
-`model.toml` names the architecture and holds a SHA-256 hash of `weights.safetensors`; a folder whose files do not
-belong together is not opened. Weights are stored in half precision. Nothing is unpickled.
+`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder whose files do not match
+is refused. Weights are stored in half precision. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class TrainedModel:
 
 
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
-    """The model of the package with this name, or else the one in this folder.
+    """The model of the package with this name, or else the model in this folder.
 
-    Raises InputError if it is missing, damaged, or of another architecture.
+    Raises InputError if the model is missing, damaged, or of another architecture.
     """
     given, packaged = Path(name), models_folder() / name
     folder = packaged if (given.name == name and packaged.is_dir()) or not given.is_dir() else given
@@ -91,10 +91,10 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
 def calibrated_network(
     model: TrainedModel, channels: Sequence[str], build: Callable[[Mapping[str, Any]], Any]
 ) -> tuple[Any, float, float]:
-    """The torch network of a model, ready for use, and scale and shift of its logits.
+    """The torch network of a model, ready for use, and the scale and shift of its logits.
 
     ``build(values)`` makes the network from the table ``network`` of the description. Raises InputError if the
-    description lacks something, or was made for other input channels, or does not fit the weights.
+    description is incomplete, was made for other input channels, or does not match the weights.
     """
     import torch
 

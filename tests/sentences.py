@@ -24,26 +24,31 @@ _BLOCKS = (
     r"^\$\$.*?\$\$",  # formulas
     r"^[ ]*\|.*?$",  # tables
     r"^#.*?$",  # headings
-    r"^={3,}.*?^={3,}[ =]*$",  # tables of reStructuredText
+    r"^={3,}.*?^={3,}.*?^={3,}[ =]*$",  # tables of reStructuredText, with or without a head
+    r"^={3,}.*?^={3,}[ =]*$",
     r"^[ ]*(>>>|\.\.\.)[^\n]*\n(?:[^\n]+\n)*",  # examples and what they print
     r"^[ ]*\w[\w ]*\n[ ]*-{3,}$",  # sections of numpydoc
+    r"^(?![ ]*(?:[-*]|\d+\.) )([ ]*)\S[^\n]*$(?=\n\1[ ]{4}\S)",  # names and types above their description
+    r"^[^\n]+$(?=\n: )",  # terms of a glossary
     r"^\.\. .*?$",
     r"<!--.*?-->",
     r"<[^>\n]+>",
 )
-_ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : )", re.MULTILINE)
+_CODE = r"``[^`]+``|`[^`]+`|\$[^$]+\$"
+_ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : .*$)", re.MULTILINE)
 _END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*\[$]*[A-Z`])")
 
 
 def sentences(text: str) -> Iterator[str]:
     """Sentences of a page or a docstring. A colon before a capital letter also ends a sentence."""
+    text += "\n"  # a docstring may end with an example
     for pattern in _BLOCKS:
         text = re.sub(pattern, "\n\n", text, flags=re.MULTILINE | re.DOTALL if ".*?" in pattern else re.MULTILINE)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
     text = _ITEM.sub("\n\n", text)
     for paragraph in re.split(r"\n\s*\n", text):
         for sentence in _END.split(" ".join(paragraph.split())):
-            if len(re.findall(r"[A-Za-z]{2,}", sentence)) >= 3:
+            if len(re.findall(r"[A-Za-z]{2,}", re.sub(_CODE, "", sentence))) >= 3:
                 yield sentence.strip()
 
 
@@ -59,7 +64,7 @@ def texts() -> Iterator[tuple[str, str]]:
 
 def n_words(sentence: str) -> int:
     """Words of a sentence; an inline formula or piece of code counts as one."""
-    short = re.sub(r"``[^`]+``|`[^`]+`|\$[^$]+\$|\[[-+.\d, ]+\]", "x", sentence)
+    short = re.sub(_CODE + r"|\[[-+.\d, ]+\]", "x", sentence)
     return len(re.findall(r"[\w\].%]*[A-Za-z0-9][^\s]*", short))
 
 

@@ -1,9 +1,9 @@
-"""Baselines: filters that MST is compared with.
+"""Baselines: filters with which MST is compared.
 
 >>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
 
-`updates` has fusion without crossover (samples alone, tracking alone, their union), `proposals` the floors, and
-`object_fusion` a map of volumes in the manner of MID-Fusion. ``docs/baselines.md`` lists the presets.
+`updates` has fusion without crossover (samples alone, tracking alone, their union). `proposals` has the floors, and
+`object_fusion` a map of volumes in the style of MID-Fusion. ``docs/baselines.md`` lists the presets.
 """
 
 from mstfilter.lazy import attach

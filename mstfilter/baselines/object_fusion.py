@@ -1,18 +1,19 @@
-"""A baseline in the manner of MID-Fusion: one map of objects, each a tracked volume of signed distances.
+"""A baseline in the style of MID-Fusion: one map of objects, each a tracked volume of signed distances.
 
 >>> mstfilter.preset("object_fusion")
 
-This is a re-implementation of the idea of Xu et al. 2019 ("MID-Fusion: Octree-based Object-Level Multi-Instance
-Dynamic SLAM") within the interfaces of this package, not of their program. At every pause
+The baseline is a re-implementation of the idea of Xu et al. 2019 ("MID-Fusion: Octree-based Object-Level
+Multi-Instance Dynamic SLAM") within the interfaces of this package. The baseline is not a port of their program. At
+every pause these steps are performed:
 
-1. the objects of the map follow the clip by the tracker that all filters share (the transition of the filter);
-2. the masks of the single-frame segmentation are matched with the rendered map by their overlap;
-3. the volume of every object is averaged with the images of the clip, each from the pose that frame-by-frame
-   registration of depth and colour gives. Surface counts within the mask of the object, free space everywhere;
-4. masks without a match that do not show known objects become new objects, with the usual completion.
+1. The transition of the filter tracks the objects of the map through the clip.
+2. The masks of the single-frame segmentation are matched with the rendered map by overlap.
+3. The volume of every object is averaged with the images of the clip. The pose of each image comes from
+   frame-by-frame registration of depth and colour. Surface is used only within the object's mask.
+4. Masks without a match that do not show known objects become new objects, with the usual completion.
 
-There is one hypothesis: wrong masks are never revised, and two objects are never merged. Between pauses the map is
-stored as voxels, like every hypothesis; a volume starts with the signed distance of its voxels.
+There is one hypothesis. Wrong masks are never revised, and two objects are never merged. Between pauses the map is
+stored as voxels, like every hypothesis. A volume starts with the signed distance of its voxels.
 
 >>> volume = ObjectVolume.of(hypothesis.mask(3), grid, truncation=0.03, weight=2.0)
 >>> volume = volume.integrate(frame, grid, np.eye(4), mask, others)
@@ -71,7 +72,7 @@ class _Match(NamedTuple):
 
 @dataclass(frozen=True)
 class ObjectFusion(Update):
-    """Object-level volumetric fusion in the manner of MID-Fusion; `free_space` clears the tracked map first."""
+    """Object-level volumetric fusion in the style of MID-Fusion; `free_space` first clears the tracked map."""
 
     free_space: Projection = field(default_factory=FreeSpace)
 
@@ -81,7 +82,7 @@ class ObjectFusion(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The map, updated by the clip. At the first pause it is the proposed segmentation."""
+        """The map, updated by the clip. At the first pause the map is the proposed segmentation."""
         if predicted is None:
             return union(None, proposed)
         maps, notes = [], []
@@ -150,7 +151,7 @@ class ObjectFusion(Update):
     ) -> tuple[dict[int, ObjectVolume], int]:
         """Integrate the frames of the clip from last to first, as long as they agree with the object.
 
-        Objects with labels not in `moved` rested in the whole clip.
+        Objects with labels not in `moved` were at rest in the whole clip.
         """
         tracks = DenseFlow().track(clip)  # shared with the tracker; registration does not use it
         segments = segments_of(old, clip.after)
@@ -190,7 +191,7 @@ class ObjectFusion(Update):
     def _assemble(
         self, volumes: dict[int, ObjectVolume], records: dict[int, ObjectRecord], grid: VoxelGrid
     ) -> Hypothesis:
-        """One label grid: a voxel goes to the object with the largest share of masks, then to the deepest."""
+        """One label grid. A voxel goes to the object with the largest share of masks, then to the deepest one."""
         labels = np.zeros(grid.shape, np.uint16)
         share, depth = np.zeros(grid.shape), np.zeros(grid.shape)
         for label, volume in volumes.items():
@@ -250,7 +251,7 @@ class ObjectVolume:
 
     @property
     def occupied(self) -> np.ndarray:
-        """Voxels (a, b, c) bool inside the surface that more masks of this object than of others have shown."""
+        """Voxels (a, b, c) bool inside the surface that were shown by more masks of this object than of others."""
         return (self.distance < 0) & (self.hits > self.other_hits)
 
     def integrate(
@@ -259,8 +260,7 @@ class ObjectVolume:
         """The volume averaged with another image.
 
         `T` (4, 4) is the motion in world metres from the pose of the volume to the pose in the frame. `mask` and
-        `others` (H, W) bool are the pixels of this object and of others. Surface is integrated in `mask` only, free
-        space everywhere.
+        `others` (H, W) bool are the pixels of this object and of others. Surface is integrated only in `mask`.
         """
         index = np.stack(np.meshgrid(*(np.arange(n) for n in self.distance.shape), indexing="ij"), axis=-1)
         u, v, z, inside = frame.camera.pixels_of(move_points(T, grid.centre_of(index.reshape(-1, 3) + self.offset)))

@@ -5,8 +5,8 @@
 >>> OccupiedComponents()               # connected components of the occupied space
 >>> ImageComponents()                  # connected components of the image above the table
 
-The floors use the pixels above the table and the completer, but no segmentation. A method must score better than
-they do.
+The floors use the pixels above the table and the completer, but no segmentation. A useful method is better than the
+floors.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _MAX_STEP = 0.02  # metres between the depths of connected pixels
 
 @dataclass(frozen=True)
 class FirstPause(Proposal):
-    """The samples of another proposal at the first pause; afterwards hypotheses without objects.
+    """The samples of another proposal at the first pause, and later hypotheses without objects.
 
-    The inner proposal has the random stream that it would have without this wrapper.
+    The inner proposal keeps the random stream that it has without this wrapper.
     """
 
     proposal: Proposal = field(default_factory=TreeCutProposal)

@@ -1,6 +1,6 @@
 """Updates without crossover: samples alone, predictions alone, or the union of both.
 
-They replace the update of `mst` and leave all other parts of the filter, with their random streams, unchanged:
+The updates replace the update of `mst`, and leave all other parts of the filter and their random streams unchanged:
 
 >>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
 
@@ -21,7 +21,7 @@ from mstfilter.smc import Population, Update, union
 
 @dataclass(frozen=True)
 class SamplesOnly(Update):
-    """The proposed samples alone."""
+    """The result is the proposed samples."""
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
@@ -29,15 +29,15 @@ class SamplesOnly(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The proposed population; without a proposal, the predicted one."""
+        """The proposed population, or the predicted population without a proposal."""
         return union(predicted if proposed is None else None, proposed)
 
 
 @dataclass(frozen=True)
 class TrackingOnly(Update):
-    """The predicted hypotheses alone.
+    """The result is the predicted hypotheses.
 
-    `free_space` clears voxels that the latest image observes as free; ``none`` leaves predictions unchanged.
+    `free_space` clears voxels that the latest image observes as free. ``none`` leaves predictions unchanged.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
@@ -59,8 +59,8 @@ class TrackingOnly(Update):
 class Union(Update):
     """Predicted and proposed hypotheses together, with the weights of the crossover but without crossing them.
 
-    A prediction has log weight ``log w + lambda log Q``, a sample ``log w``; both populations are first scaled to
-    mean weight 1. `free_space` projects the predictions and yields Q; `quality_exponent` is lambda.
+    A prediction has log weight ``log w + lambda log Q``, and a sample ``log w``. Both populations are first scaled to
+    mean weight 1. `free_space` projects the predictions and returns Q. `quality_exponent` is lambda.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)

@@ -1,8 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
-An action has one outcome under each hypothesis. Its expected information is the mutual information between the
-hypothesis and the outcome. Since the hypothesis determines the outcome, this is the entropy of the weights summed
-over equal outcomes, which is at most the entropy of the weights.
+An action has one outcome under each hypothesis. The expected information of an action is the mutual information
+between the hypothesis and the outcome. The hypothesis determines the outcome. So this is the entropy of the weights
+summed over equal outcomes, which is at most the entropy of the weights.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -10,15 +10,15 @@ over equal outcomes, which is at most the entropy of the weights.
 >>> bool(np.isclose(outcome_information(weights, rows, hamming, sizes), np.log(2)))
 True
 
-**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. With a
-`tolerance` tau, the information is
+**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. With a `tolerance` tau,
+the information is
 
     I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ.
 
-Outcomes that differ in far fewer than tau cells count as one, and those that differ in far more count as two. I_0 is
-the information without noise; I_tau decreases to 0 as tau grows. Suppose that every cell is read with an independent
-error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual information
-with the reading. The bound is that of Kolchinsky, Tracey (2017), *Estimating mixture entropy with pairwise
+Outcomes that differ in far fewer than tau cells count as one. Outcomes that differ in far more cells count as two.
+I_0 is the information without noise. I_tau decreases to 0 as tau grows. Suppose that every cell is measured with an
+independent error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual
+information with the measurement. The bound is by Kolchinsky, Tracey (2017), *Estimating mixture entropy with pairwise
 distances*, with the Bhattacharyya distance.
 """
 
@@ -62,9 +62,9 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` gives (d, d) numbers of cells; called only if `tolerance` > 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. Called only if `tolerance` > 0.
     sizes : (k,) int
-        Cells in each group.
+        Number of cells in each group.
     tolerance : float
         tau in cells (see the module).
     """
@@ -84,16 +84,16 @@ def hamming(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def canonical_rows(rows: np.ndarray) -> np.ndarray:
-    """Partitions (n, k), 0 for free, with parts numbered by their first cell: equal rows are equal partitions."""
+    """Partitions (n, k) with parts numbered by their first cell and 0 for free. Equal rows are equal partitions."""
     return np.stack([canonical(row) for row in rows]) if rows.size else rows
 
 
 def partition_distance(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Least number (n, n) of cells that must change their object to make two partitions equal.
 
-    ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``, A and B the objects of i and j,
-    the maximum over one-to-one matchings m (Gusfield 2002, *Partition-distance*, with free space as a part that
-    matches free space only). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
+    ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``. A and B are the objects of i and
+    j, and the maximum is over one-to-one matchings m (Gusfield 2002, *Partition-distance*; free space matches free
+    space only). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
     """
     n, width = len(rows), int(rows.max(initial=0)) + 1
     distance = np.zeros((n, n))

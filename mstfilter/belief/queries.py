@@ -129,7 +129,7 @@ class Belief:
     # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that hold world points (..., 3) in metres. Raises InputError if a point is outside."""
+        """Voxels (..., 3) that contain world points (..., 3) in metres. Raises InputError if a point is outside."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
@@ -156,10 +156,10 @@ class Belief:
     def same_object(self, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two voxels belong to the same object.
 
-        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, with k_i the most probable object of a voxel in
-        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities: a
-        voxel is in it whenever a less probable one is. `a` and `b` (..., 3) are broadcast against each other. For a
-        = b the result is the occupancy, and for all voxels b it is the extent of the object at a.
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where k_i is the most probable object of a voxel in
+        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities, so
+        it contains a voxel whenever it contains a less probable one. `a` and `b` (..., 3) are broadcast against each
+        other. For a = b the result is the occupancy. For all voxels b the result is the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -189,7 +189,7 @@ class Belief:
     # Boundaries and entropy -----------------------------------------------------------------------------------
 
     def boundary_entropy(self) -> np.ndarray:
-        """Entropy (X, Y, Z) of the segmentation at a voxel: the largest of its six faces, at most log 2.
+        """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
         A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
         object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included:
@@ -203,7 +203,7 @@ class Belief:
         return largest
 
     def _entropy_of_faces(self, axis: int) -> np.ndarray:
-        """H(S | B) of the faces between voxels and the next ones along an axis, which comes first."""
+        """H(S | B) of the faces between voxels and the next ones along an axis. The chosen axis comes first."""
         cells = np.moveaxis(self._refined.cells, axis, 0)
         lower, upper = cells[:-1], cells[1:]
         differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
@@ -226,9 +226,9 @@ class Belief:
     # Expected information of actions --------------------------------------------------------------------------
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
-        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` is faster.
+        """Information of an image from a camera; `tolerance` in pixels. To save time, use ``camera.scaled(0.25)``.
 
-        The outcome is the depth image of the objects (rounded to a hundredth of a voxel, without the table).
+        The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
         """
         step = _DEPTH_STEP * self.grid.voxel_size
         check_component("camera", camera, Camera)
@@ -240,8 +240,8 @@ class Belief:
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``, all voxels of all objects with a voxel in the region.
-        Further objects that these objects push are left out.
+        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``. The moved voxels are all voxels of all objects with a
+        voxel in the region. Other objects that these objects would push are ignored.
         """
         cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
         moved = self._refined.objects_in(cells)[self._refined.objects]
@@ -264,9 +264,9 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information in nats, the first of equal ones.
+        """The action of largest expected information in nats; the first one if several are equal.
 
-        None if no action has `at_least` nats: the hypotheses agree on all outcomes, so none can be preferred.
+        None if no action has `at_least` nats. In this case the hypotheses agree on all outcomes.
         """
         values = [information(action) for action in actions]
         if np.isnan(values).any():
@@ -277,10 +277,10 @@ class Belief:
     # Functions of the user ------------------------------------------------------------------------------------
 
     def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
-        """Information of an action with an outcome that the hypothesis determines.
+        """Information of an action whose outcome is determined by the hypothesis.
 
-        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which differ
-        between hypotheses without a meaning.
+        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which are
+        arbitrary in each hypothesis.
         """
         outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
         try:

@@ -1,10 +1,10 @@
-"""Similarity of hypotheses: weighted coverage of all pairs, and equality up to renamed labels.
+"""Similarity of hypotheses: weighted coverage of all pairs, and equality up to renumbered labels.
 
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
-For the resamplers of `mstfilter.smc` that compare particles: ``Clusters(similarity=WeightedCoverage())``,
-``Coalesced(equivalence=SameSegmentation())``.
+The components are for the resamplers of `mstfilter.smc` that compare particles:
+``Clusters(similarity=WeightedCoverage())``, ``Coalesced(equivalence=SameSegmentation())``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mstfilter.smc import Equivalence, Similarity, first_seen
 
 @dataclass(frozen=True)
 class SameSegmentation(Equivalence):
-    """Hypotheses with the same regions are equal, also if their labels differ."""
+    """Hypotheses with the same regions are equal, even if their labels differ."""
 
     def classes(self, particles: Sequence[Hypothesis]) -> np.ndarray:
         distinct = {id(h.labels): h.labels for h in particles}
@@ -36,7 +36,7 @@ class SameSegmentation(Equivalence):
 class WeightedCoverage(Similarity):
     """Weighted coverage (form ``objects`` of `mstfilter.scoring.quality`) of all pairs of hypotheses.
 
-    `stride` is the step between the voxels that are used, along each axis. The time falls with stride^3.
+    `stride` is the step between the voxels that are used, along each axis. The time decreases with stride^3.
     """
 
     stride: PositiveInt = 1

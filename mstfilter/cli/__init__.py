@@ -1,7 +1,7 @@
-"""The command line: parses, calls, prints.
+"""The command line, which parses arguments, calls the package and prints results.
 
-``mstfilter demo`` makes a simulated recording, filters it and writes a report. ``mstfilter --help`` lists the rest.
-Each module holds one group of commands; importing it registers them with `mstfilter.cli.root.app`.
+``mstfilter demo`` makes a simulated recording, filters it and writes a report. ``mstfilter --help`` lists the other
+commands. Each module has one group of commands. The import registers them with `mstfilter.cli.root.app`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _report(error: Exception, given: list[str]) -> int:
-    """Print an error; returns the exit code, 2 if the user can mend it."""
+    """Print an error, and return the exit code, which is 2 if the user can correct the error."""
     place = place_in_user_file(error)
     if isinstance(error, ModuleNotFoundError) and place is None:
         error = missing_library(error, " ".join(["mstfilter", *given[:1]]))
@@ -68,7 +68,7 @@ def _report(error: Exception, given: list[str]) -> int:
 
 
 def _execute(given: list[str]) -> None:
-    """Execute a command. Without typer, `list` and help answer all the same."""
+    """Execute a command. `list` and help also work without typer."""
     try:
         from mstfilter.cli import running, studying, training, components  # noqa: F401, I001 (in the order of the help)
         from mstfilter.cli.root import app
@@ -112,7 +112,7 @@ def _print(kind: str, message: str, *hints: str) -> None:
 
 
 def _interrupted(given: list[str]) -> str:
-    """What an interrupted command leaves behind."""
+    """Message about what an interrupted command leaves behind."""
     if given[:1] in (["run"], ["study"]):
         return "interrupted: repeat the command to resume"
     return "interrupted: the command starts anew if it is repeated"

@@ -1,4 +1,4 @@
-"""What ``mstfilter list`` prints. It needs numpy and scipy only."""
+"""What ``mstfilter list`` prints. The command needs only numpy and scipy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The typer application that the commands register with, and what several commands share."""
+"""The typer application with which the commands register, and common functions of several commands."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def read_source(path: Path, format: str, options: list[str] | None, pauses: str)
 
 
 def print_summary(numbers: RunNumbers) -> None:
-    """Print what earlier images are worth, and one line per pause: hypotheses, objects, sample size, quality."""
+    """Print the gain by earlier images, and one line per pause: hypotheses, objects, sample size, quality."""
     for sentence in numbers.value_of_the_past:
         print(sentence)
     for t, step in enumerate(numbers.steps):

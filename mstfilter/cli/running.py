@@ -256,7 +256,7 @@ def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) 
 def _execute_all(
     recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int, replace: bool = False
 ) -> None:
-    """Run the filter without a name in `folder`, those that it is compared with in its folder ``compare``."""
+    """Run the filter without a name in `folder`, and the filters for comparison in its folder ``compare``."""
     from mstfilter.runs import filter_recording
 
     for name, config in configs.items():
@@ -273,5 +273,5 @@ def _execute_all(
 
 
 def _compared(folder: Path, name: str) -> Path:
-    """The folder of a run that the run in `folder` is compared with; `folder` itself for no name."""
+    """The folder of a comparison run of the run in `folder`; `folder` itself for the empty name."""
     return folder / "compare" / name.replace(" ", "-") if name else folder

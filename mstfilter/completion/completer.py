@@ -1,21 +1,21 @@
 """Completion: from the visible part of an object to the space that it fills (paper, section IV-B).
 
-A segment of a depth image is a shell. A `Completer` estimates the hidden part of the object, mask by mask. The result
-depends on the frame and on the mask alone, not on the rest of the segmentation, so hypotheses that share a segment
-share the work.
+A segment of a depth image shows only the front surface of an object. A `Completer` estimates the hidden part of the
+object, for one mask at a time. The result depends only on the frame and the mask, not on the rest of the
+segmentation. So hypotheses that share a segment share its completion.
 
 >>> completions = Extrude().complete(rng, frame, [mask_a, mask_b], grid)
 >>> labels = arbitrate(completions, grid)            # (X, Y, Z), 1 for mask_a, 2 for mask_b
 
-For a new method, subclass `Completer` and override `fill`: the argument is an `ObservedBox`, a small box of the grid,
+To add a method, inherit `Completer` and override `fill`. The argument is an `ObservedBox`, a small box of the grid,
 and the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps the
 visible surface. A method that is faster for many boxes together overrides `fill_many`. Results are checked
-(`mstfilter.results`): an array of another shape, or of numbers that are no probabilities, is an error.
+(`mstfilter.results`). An array of another shape, or of numbers that are not probabilities, is an error.
 
-`arbitrate` makes the label grid. If several completions contain a voxel:
+`arbitrate` makes the label grid. If several completions contain a voxel, these rules apply:
 
 1. A voxel with readings belongs to the object with most readings in it.
-2. Otherwise it belongs to the object with the largest probability, if that reaches the threshold.
+2. A voxel without readings belongs to the object with the largest probability, if this reaches the threshold.
 3. Ties go to the object with the nearest visible surface.
 
 The result does not depend on the order of the objects: renumbered completions give renumbered labels.
@@ -68,7 +68,7 @@ class Completion:
         return a, b, c
 
     def shifted(self, log_odds: float) -> Completion:
-        """The same with `log_odds` added where the probability is neither 0 nor 1."""
+        """The completion with `log_odds` added where the probability is neither 0 nor 1."""
         p = self.probability
         odds = np.exp(np.float32(np.clip(log_odds, -80, 80))) * p  # float32 overflows at 89
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
@@ -102,9 +102,9 @@ class Completer(Checked, ABC):
     ----------
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface and
-        less than `depth` behind it, along the optical axis. The test of the centre, and not of any reading in the
-        voxel, keeps objects from growing by half a voxel on all sides. On rendered boxes the volume is 1.13 of the
-        truth instead of 1.41, the quality .82 instead of .71. The two values were chosen on these boxes.
+        less than `depth` behind it, along the optical axis. The test uses the centre of the voxel, since a test of
+        any reading in the voxel enlarges objects by half a voxel on all sides. On rendered boxes the volume is 1.13
+        instead of 1.41 times the truth, and the quality .82 instead of .71. Both values were chosen on these boxes.
     free_margin : float
         A voxel is free if its centre is this far in front of the measured surface, in voxels ...
     free_sigmas : float
@@ -137,9 +137,9 @@ class Completer(Checked, ABC):
         return [self.fill(rng, one) for rng, one in zip(rngs, seen, strict=True)]
 
     def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
-        """`fill_many`, with a warning if it ignores what was seen.
+        """`fill_many`, with a warning if the result ignores the input.
 
-        Raises InputError if it draws random numbers although `stochastic` is False: results would be reused.
+        Raises InputError if a completer draws random numbers although `stochastic` is False (results are reused).
         """
         before = _states(rngs)
         filled = self.fill_many(rngs, seen)
@@ -153,21 +153,21 @@ class Completer(Checked, ABC):
         return filled
 
     def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the one after its last."""
+        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the voxel after its last."""
         # The surface may reach `depth` voxels behind the readings.
         return enclosing_box(voxels, grid, max(self.padding, int(np.ceil(self.depth))))
 
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid
     ) -> list[Completion]:
-        """Complete several masks of a frame; the pose of the frame places it in the grid.
+        """Complete several masks of a frame. The pose of a frame places the frame in the grid.
 
         Parameters
         ----------
         rng : Generator
-            Only stochastic completers draw from it; each mask has its own stream.
+            Only stochastic completers draw random numbers. Each mask has a separate stream.
         masks : sequence of (H, W) bool
-            Each one segment. Pixels without a reading, of the robot, or outside the grid are ignored.
+            Each mask is one segment. Pixels without a reading, on the robot, or outside the grid are ignored.
 
         Returns
         -------
@@ -190,8 +190,8 @@ class Completer(Checked, ABC):
         """`complete` with a given stream for each mask, and with earlier views of each object.
 
         The result of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views are
-        those of the object, moved to where it is now; `Completion.views` has those that were used. A completer that
-        uses no views returns completions without views.
+        those of the object, moved to its current pose. `Completion.views` has the views that were used. A completer
+        that does not use views returns completions without views.
         """
         masks = [np.asarray(mask, dtype=bool) for mask in masks]
         for mask in masks:
@@ -236,9 +236,10 @@ _FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing
 
 
 def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str | None:
-    """How the probabilities of boxes ignore what was seen in them; None if they do not.
+    """How the probabilities of boxes ignore the input; None if they do not.
 
-    Either all are one number, or less than 2 % of the visible surface in all boxes is occupied (0.5 or more).
+    The faults are: all probabilities are one number, or less than 2 % of the visible surface is occupied (0.5 or
+    more).
     """
     shown = [(p, one.surface) for p, one in zip(filled, seen, strict=True) if one.surface.any()]
     if sum(np.count_nonzero(surface) for _, surface in shown) < _FEW_VOXELS:
@@ -257,7 +258,7 @@ def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str |
 
 
 def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
-    """A completion after the veto of free space; a visible object keeps its surface if nothing of it is left."""
+    """A completion after the removal of free space. A visible object keeps its surface if nothing else is left."""
     p = np.array(filled, dtype=np.float32)
     p[seen.free] = 0
     if p.size and not (p >= 0.5).any():
@@ -275,7 +276,7 @@ class ClipCompleter(Completer):
 
 
 def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: float = 0.5) -> np.ndarray:
-    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis: 0 free, k + 1 the k-th completion.
+    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis; 0 is free and k + 1 the k-th completion.
 
     `threshold` is the least probability of an occupied voxel.
     """
@@ -304,9 +305,9 @@ def occupancy_of(
 ) -> Occupancy | None:
     """The probabilities of the completions of one hypothesis; None if all are 0 or 1.
 
-    A voxel is free or belongs to one of its candidate objects. The odds of an object against free space are those of
-    its completion. `labels` (X, Y, Z) are those of `arbitrate`. Objects with fewer readings in a voxel than the
-    labelled one are no candidates, nor are objects without a label. Probabilities below `least` count as 0.
+    A voxel is free or belongs to one of its candidate objects. The odds of an object against free space are the odds
+    of its completion. `labels` (X, Y, Z) are those of `arbitrate`. An object is not a candidate for a voxel if it has
+    fewer readings there than the labelled object, or if it has no label. Probabilities below `least` count as 0.
     """
     if all(((one.probability == 0) | (one.probability == 1)).all() for one in completions):
         return None
@@ -340,7 +341,7 @@ def _break_ties(
     completions: Sequence[Completion],
     threshold: float,
 ) -> None:
-    """Give tied voxels to the object with the nearest visible surface; at equal distance, to the smaller key."""
+    """Assign tied voxels to the object with the nearest visible surface; at equal distance, to the smaller key."""
     order = sorted(range(len(completions)), key=lambda k: completions[k].key)
     voxels, points, p = np.argwhere(tied), most[tied], best[tied]
     distances = [_distance_of_contender(completions[k], voxels, points, p, threshold) for k in order]
@@ -350,9 +351,9 @@ def _break_ties(
 def _distance_of_contender(
     one: Completion, voxels: np.ndarray, points: np.ndarray, p: np.ndarray, threshold: float
 ) -> np.ndarray:
-    """Distance (n,) of voxels (n, 3) from the surface of an object; infinite where it is not one of the best.
+    """Distance (n,) of voxels (n, 3) from the surface of an object; infinite where the object is not one of the best.
 
-    The best have as many readings as `points` (n,) and the probability `p` (n,).
+    The best objects have as many readings as `points` (n,) and the probability `p` (n,).
     """
     local = voxels - one.offset
     contends = ((local >= 0) & (local < one.probability.shape)).all(axis=1)

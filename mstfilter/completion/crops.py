@@ -1,4 +1,4 @@
-"""What the completion network sees of an object: a crop of the voxel lattice around its visible part.
+"""The input of the completion network: a crop of the voxel lattice around the visible part of an object.
 
 >>> low, high = crop_box(voxels, grid)                     # the limits of the crop
 >>> x = channels(bits, signed, height)                     # the input of the network
@@ -41,25 +41,27 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class Architecture(ABC):
-    """Builds a completion network of the user. Its weights are in the folder of a model (`mstfilter.trained`).
+    """Builds a completion network that the user trained.
 
-    ``model.toml`` of the folder has the name of the class as `architecture`.
+    The weights of the network are in the folder of a model (`mstfilter.trained`).
+
+    The file ``model.toml`` of the folder has the name of the class as `architecture`.
     """
 
     @abstractmethod
     def build(self) -> nn.Module:
-        """The network, with any weights.
+        """The network with arbitrary weights.
 
-        Its input is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. Its output are logits, (b, X, Y, Z) or
-        (b, 1, X, Y, Z).
+        The input of the network is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. The outputs of the
+        network are logits, (b, X, Y, Z) or (b, 1, X, Y, Z).
         """
 
 
 def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of the crop of an object with readings in `voxels` (k, 3): first voxel (3,), and the one after its last.
+    """First voxel (3,) of the crop of an object with readings in `voxels` (k, 3), and the voxel after its last.
 
-    The crop is centred on the 2 - 98 % range of the readings, and stands on the table. It is cut off where the grid
-    ends. That of an object which is larger than all crops of the network contains the object.
+    The crop is centred on the range of the readings (2 % to 98 %), and its bottom is on the table. The crop ends at
+    the border of the grid. If the object is larger than all crops of the network, the crop contains the whole object.
     """
     low, high = np.percentile(voxels, (2, 98), axis=0)
     table = max(0, int(np.floor(-grid.origin[2] / grid.voxel_size + 1e-6)))
@@ -93,6 +95,6 @@ def channels(bits: Any, signed: Any, height: Any) -> Any:
 
 
 def extruded(bits: Any) -> Any:
-    """What `Extrude` gives for packed crops (b, X, Y, Z), a torch tensor or an array; bool, free space cleared."""
+    """The result of `Extrude` for packed crops (b, X, Y, Z), a torch tensor or an array; bool, without free space."""
     filled = extruded_down(Seen.SURFACE.among(bits), Seen.OTHER_SURFACE.among(bits))
     return filled & ~Seen.FREE.among(bits)

@@ -17,7 +17,7 @@ from mstfilter.completion.observed import ObservedBox
 
 @dataclass(frozen=True)
 class SurfaceOnly(Completer):
-    """No completion: the visible surface alone."""
+    """No completion: the result is the visible surface."""
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return seen.surface.astype(np.float32)
@@ -27,7 +27,7 @@ class SurfaceOnly(Completer):
 class Extrude(Completer):
     """The visible surface, extruded down to the table or to the surface of another object.
 
-    Most objects on a table stand on it, so the space below a visible top or side belongs to the object.
+    Most objects stand on the table, so the space below a visible top or side belongs to the object.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Extrude(Completer):
 
 
 def extruded_down(surface: Any, other_surface: Any) -> Any:
-    """A surface (..., Z) bool and what is below it, down to another surface; an array or a torch tensor."""
+    """A surface (..., Z) bool and the voxels below it, down to another surface; an array or a torch tensor."""
     filled = surface | False  # a copy
     for k in range(surface.shape[-1] - 2, -1, -1):
         filled[..., k] |= filled[..., k + 1] & ~other_surface[..., k]

@@ -1,12 +1,12 @@
-"""Completion by a trained network: that of this package (`mstfilter.completion.unet`), or one of the user.
+"""Completion by a trained network, either that of this package (`mstfilter.completion.unet`) or one of the user.
 
 >>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the weights of the package
 >>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
 >>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
 The network works on a lattice of 1 cm. If the voxels of the workspace have another size, the object is completed on
-that lattice and the result is interpolated. Objects larger than 64 cm are extruded, as by `Extrude`: the network was
-trained on smaller ones.
+this lattice and the result is interpolated. Objects larger than 64 cm are extruded as by `Extrude`, since the network
+was trained on smaller objects.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class NetworkCompleter(Completer, UsesFiles):
     Parameters
     ----------
     weights : str
-        Name of a trained model of the package, or the folder of one (`mstfilter.trained`), or an ONNX file.
+        Name of a trained model of the package, the folder of a model (`mstfilter.trained`), or an ONNX file.
     architecture : Architecture, optional
-        The architecture of a folder. Default: that of this package.
+        The architecture of the model in the folder. By default the architecture is the architecture of this package.
     """
 
     weights: str = "completion"
@@ -45,7 +45,7 @@ class NetworkCompleter(Completer, UsesFiles):
 
     @property
     def network(self) -> TrainedNetwork:
-        """The network with its weights. Raises InputError if they are missing or cannot be used."""
+        """The network with its weights. Raises InputError if weights are missing or cannot be used."""
         try:
             from mstfilter.completion.unet import load_network
         except ImportError as error:
@@ -54,7 +54,7 @@ class NetworkCompleter(Completer, UsesFiles):
         return load_network(self.weights, self.architecture)
 
     def check_files(self, recording: Recording) -> None:
-        """Load the network."""
+        """Load the network, so that errors are raised before a run."""
         _ = self.network
 
     @property
@@ -84,7 +84,7 @@ class NetworkCompleter(Completer, UsesFiles):
     def _on_grid(
         self, one: Completion, frame: Frame, mask: np.ndarray, grid: VoxelGrid, lattice: VoxelGrid
     ) -> Completion:
-        """A completion of the lattice, interpolated at the voxels of the grid."""
+        """A completion on the lattice, interpolated at the voxels of the grid."""
         from scipy.ndimage import map_coordinates
 
         corners = np.array([one.offset, one.offset + one.probability.shape]) * LATTICE / grid.voxel_size

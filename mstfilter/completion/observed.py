@@ -1,12 +1,13 @@
-"""What frames show of an object, in a box of the grid around it: the input of completion.
+"""The input of completion: what frames show of an object, in a box of the grid around it.
 
 >>> offset, seen = observed_box(frame, mask, grid, completer)     # of one frame
 >>> bits, signed = encode_box(seen)                               # packed: the contents of an `ObjectView`
 >>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
 
-**Earlier frames.** The views of an object are moved with it, and read at the nearest voxel. Its surface, the space
-behind it and the space that was free around it remain evidence about its shape. Other objects and the space that they
-hid do not, since they may have moved. The latest frame decides where it measures the object's surface.
+**Earlier frames.** The views of an object are moved with it, and are read at the nearest voxel. The surface of an
+object, the space behind the surface and the free space around it remain evidence about its shape. Other objects, and
+the space that they hide, are not evidence, since they may have moved. The latest frame takes precedence where it
+measures the object's surface.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class ObservedBox:
 def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
     """The box of a mask: its offset (3,) in the grid, and what the frame shows of it.
 
-    `rule` says how large the box is, and what counts as visible surface and as free space.
+    `rule` defines the size of the box, and which voxels are visible surface and free space.
     """
     offset, seen, _, _ = observed_again(frame, mask, (), grid, rule)
     return offset, seen
@@ -131,7 +132,7 @@ def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.nda
 
 
 def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
-    """What a box shows: flags of `Seen` (a, b, c) uint8, and signed distances (a, b, c) int8 in `_REACH` / 127."""
+    """Packed box: flags of `Seen` (a, b, c) uint8, and signed distances (a, b, c) int8 in `_REACH` / 127."""
     bits = np.zeros(seen.surface.shape, np.uint8)
     shown = (seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)
     for flag, one in zip(Seen, shown, strict=True):
@@ -141,7 +142,7 @@ def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
 
 
 def decode_signed(signed: np.ndarray) -> np.ndarray:
-    """Signed distances in voxels, of `encode_box`."""
+    """Signed distances in voxels, from the values of `encode_box`."""
     return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
 
 
@@ -150,9 +151,9 @@ def observed_again(
 ) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:
     """The box of a mask, which may be empty, and of earlier views of the object.
 
-    Returns the offset (3,) of the box, what the frame shows of the object, what the frame and the views show together
-    (`recall`), and the views. Views that the frame contradicts are left out, unless `refute` is false. The box is
-    empty if nothing of the object lies inside the grid.
+    Returns the offset (3,) of the box, the evidence of the frame, the evidence of the frame and the views together
+    (`recall`), and the views. Views that the frame contradicts are omitted, unless `refute` is false. The box is
+    empty if no part of the object lies inside the grid.
     """
     if views and refute:
         voxels = _surface_voxels(frame, mask, views, grid)
@@ -165,7 +166,7 @@ def observed_again(
 
 
 def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """First voxel (3,) of a box around `voxels` (k, 3) down to the grid's floor, and the one after its last."""
+    """First voxel (3,) of a box around `voxels` (k, 3) down to the grid's floor, and the voxel after its last."""
     if not len(voxels):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)
@@ -176,8 +177,8 @@ def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.
 def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid) -> np.ndarray:
     """Voxels (k, 3) of the readings of a mask, and of the surfaces of views.
 
-    Each reading counts as in an image of 640 x 480 pixels: so crops do not depend on the size of the image. They
-    follow the latest frame, as those of the training.
+    Each reading has the weight that it has in an image of 640 x 480 pixels, so that crops do not depend on the image
+    size. The crops are centred on the latest frame, as in the training.
     """
     readings = mask_voxels(frame, mask, grid)
     if not views:
@@ -212,9 +213,9 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
 
 
 def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which centres (n, 3) lie in the box of a view (n,) bool, and what it shows there of the object.
+    """Which centres (n, 3) lie in the box of a view (n,) bool, and what the view shows of the object there.
 
-    That is flags of `Seen` (k,) and signed distances (k,) in voxels, NaN where it shows nothing.
+    The evidence consists of flags of `Seen` (k,) and signed distances (k,) in voxels, NaN where nothing is shown.
     """
     index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
     inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
@@ -229,8 +230,8 @@ def _confirmed(
 ) -> tuple[ObjectView, ...]:
     """The views that the latest frame does not contradict.
 
-    It does if their surface is seen free, or their free space is the surface now, or nothing of their surface is near
-    the surface seen now.
+    A view is contradicted if its surface is observed as free, its free space is now surface, or none of its surface
+    is near the current surface.
     """
     centres = grid.centre_of(np.indices(seen.surface.shape).reshape(3, -1).T + offset)
     now, near, n_now = seen.surface.ravel(), binary_dilation(seen.surface).ravel(), int(seen.surface.sum())
@@ -247,6 +248,6 @@ def _confirmed(
 
 
 def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:
-    """Voxels (k, 3), also outside the grid, that the surface of a view has moved to."""
+    """Voxels (k, 3), also outside the grid, to which the surface of a view has moved."""
     centres = grid.centre_of(np.argwhere(Seen.SURFACE.among(view.bits)) + view.offset)
     return grid.index_of(view.motion.apply(centres)) if len(centres) else np.zeros((0, 3), np.int64)

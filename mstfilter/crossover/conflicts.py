@@ -4,12 +4,12 @@
 >>> graph.edges, graph.components()
 >>> networkx.draw(graph.networkx(), with_labels=True)
 
-A vertex is an object of one of the two hypotheses; an edge joins a proposed and a predicted object that overlap. The
+A vertex is an object of one of the two hypotheses. An edge joins a proposed and a predicted object that overlap. The
 graph is bipartite, because objects of one hypothesis never overlap.
 
-For each connected component of the conflict graph a `Structure` draws a painting order, and directed edges from a
-child to its parent, which is painted later. `merge_probability` is the probability that a child with n1 voxels is
-merged into its parent with n2 voxels, if they have I voxels in common:
+For each connected component of the conflict graph, a `Structure` draws a painting order, and directed edges from a
+child to its parent. The parent is painted later. `merge_probability` is the probability that a child with n1 voxels
+is merged into its parent with n2 voxels, with I voxels in common:
 
 =============  =============================  ========================================================
 rule           probability                    source
@@ -53,8 +53,8 @@ class ConflictGraph:
 
     Notes
     -----
-    Vertices are numbered by their first voxel in a scan with x fastest, the proposed object first if two objects
-    begin at the same voxel: the authors' numbering.
+    Vertices are numbered by their first voxel in a scan with x fastest. If two objects begin at the same voxel, the
+    proposed object is first. The numbering is the authors' numbering.
     """
 
     side: np.ndarray  #: (n,) int 0 proposed, 1 predicted
@@ -67,9 +67,10 @@ class ConflictGraph:
         return len(self.label)
 
     def networkx(self) -> nx.Graph:
-        """The graph in networkx.
+        """The graph as a networkx graph.
 
-        Vertices carry ``side``, ``label`` and ``size``, edges carry ``intersection``, in voxels. Neighbours ascend.
+        Vertices have the attributes ``side``, ``label`` and ``size``. Edges have ``intersection``, in voxels.
+        Neighbours are in ascending order.
         """
         graph = nx.Graph()
         objects = zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)
@@ -107,7 +108,7 @@ class OccupiedVoxels:
 
     @classmethod
     def of(cls, proposed: np.ndarray, predicted: np.ndarray) -> OccupiedVoxels:
-        """Of two label grids (X, Y, Z) of one shape."""
+        """From two label grids (X, Y, Z) of one shape."""
         a, b = as_labels(proposed, "proposed label grid"), as_labels(predicted, "predicted label grid")
         if a.shape != b.shape:
             raise InputError(
@@ -134,7 +135,7 @@ class OccupiedVoxels:
         return present, sizes[present], first[present]
 
     def overlaps(self) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """Proposed and predicted labels (m,) of the overlapping pairs, ascending, and their common voxels (m,)."""
+        """Proposed and predicted labels (m,) of overlapping pairs, ascending, and numbers of common voxels (m,)."""
         proposed, predicted = self.labels
         both = (proposed != 0) & (predicted != 0)
         pair = proposed[both].astype(np.int64) * (MAX_LABEL + 1) + predicted[both]
@@ -192,7 +193,7 @@ def _check_structure(
 
 
 class Structure(Checked, ABC):
-    """Draws the order in which objects in conflict are painted, and the conflicts that may end in a merge."""
+    """Draws the painting order of objects in conflict, and the conflicts that may end in a merge."""
 
     @returns(_check_structure)
     @abstractmethod
@@ -202,22 +203,22 @@ class Structure(Checked, ABC):
         Parameters
         ----------
         graph : networkx.Graph
-            The conflict graph (`ConflictGraph.networkx`). The neighbours of a vertex, ``graph[v]``, ascend.
+            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` of a vertex ascend.
         component : sequence of int
             Vertices of one connected component, ascending.
 
         Returns
         -------
         order : list of int
-            All vertices of the component, first to last painted; later ones paint over earlier ones.
+            All vertices of the component in painting order. Later vertices are painted over earlier ones.
         edges : list of (child, parent)
-            Edges of the graph along which the child may be merged into the parent, which is painted after it.
+            Edges of the graph along which the child may be merged into the parent, which is painted after the child.
         """
 
 
 @dataclass(frozen=True)
 class RandomOrder(Structure):
-    """The paper's text: edges get a random acyclic orientation, vertices a topological order of it.
+    """The paper's text: edges get a random acyclic orientation, and vertices a topological order of it.
 
     A uniformly random order of the vertices gives both. Every conflict may end in a merge.
     """
@@ -232,7 +233,7 @@ class RandomOrder(Structure):
 class SpanningTree(Structure):
     """The authors' program: a uniform random spanning tree from a uniform random root.
 
-    Only edges of the tree may end in a merge. Children are painted before their parent, the root last.
+    Only edges of the tree may end in a merge. Children are painted before their parent, and the root is painted last.
     """
 
     def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
@@ -255,13 +256,13 @@ def random_spanning_tree(
 ) -> tuple[int, dict[int, int]]:
     """Draw a uniformly random spanning tree of a connected component by Wilson's algorithm (1996).
 
-    Loop-erased random walks run from each vertex to the tree so far. `networkx.random_spanning_tree` has the same
-    law, but computes a determinant for every edge.
+    Loop-erased random walks run from each vertex to the existing tree. `networkx.random_spanning_tree` has the same
+    distribution, but computes a determinant for every edge.
 
     Returns
     -------
     root : int
-        Uniformly random.
+        Uniformly random root.
     parent : dict
         Parent of every other vertex.
     """
@@ -287,8 +288,8 @@ def merge_probability(
 ) -> np.ndarray:
     """Probability that a child object is merged into its parent, elementwise.
 
-    The table of the module has the formulas. `intersection`, `child` and `parent` are the voxels in common, of the
-    child, and of the parent.
+    The table of the module has the formulas. `intersection`, `child` and `parent` are numbers of voxels: in common,
+    of the child, and of the parent.
     """
     common, n1, n2 = (np.asarray(a, dtype=np.float64) for a in (intersection, child, parent))
     match rule:
@@ -330,7 +331,7 @@ def resolve(
 def _merged(
     rng: np.random.Generator, graph: ConflictGraph, links: nx.Graph, rule: MergeRule, edges: list[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """The edges (child, parent) along which objects merge: each is drawn by its probability."""
+    """The edges (child, parent) along which objects merge. Each edge is drawn with its probability."""
     if not edges:
         return []
     child, parent = np.array(edges).T

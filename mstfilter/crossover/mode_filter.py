@@ -21,21 +21,21 @@ from mstfilter.scene import as_labels, occupied_box
 class ModeFilter(Bounded):
     """Majority filter over label grids.
 
-    An occupied voxel takes the most frequent other label in its window, if the count of this label exceeds that of
-    its own label by at least `margin`. Of equally frequent labels the larger one is used. Free cells are not counted
-    as a label, but an occupied voxel with more than `isolation` free cells in its window becomes free. All voxels of
-    a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects that are thinner than half a
-    window, for example a 2 cm book or a rod, are removed.
+    An occupied voxel takes the most frequent other label in its window, if the count of this label exceeds the count
+    of the voxel's label by at least `margin`. If several labels are equally frequent, the largest one is used. Free
+    cells are not counted as a label. But an occupied voxel with more than `isolation` free cells in its window
+    becomes free. All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects
+    thinner than half a window, for example a 2 cm book or a rod, are removed.
 
     Parameters
     ----------
     window : int
-        Edge of the cubic window in voxels, odd. 1 switches the filter off.
+        Edge of the cubic window in voxels, an odd number. With 1 the filter has no effect.
     margin : float
-        Least difference of the counts of the other label and the voxel's own label.
+        Least difference between the count of the other label and the count of the voxel's label.
     isolation : int
-        Largest number of free cells in the window of an occupied voxel; with more it becomes free. No effect if at
-        least ``window**3``.
+        Largest number of free cells in the window of an occupied voxel. With more, the voxel becomes free. A value of
+        at least ``window**3`` has no effect.
     max_sweeps : int
         Largest number of sweeps.
     """
@@ -74,12 +74,12 @@ class ModeFilter(Bounded):
         return out
 
     def _grown(self, box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-        """A box with the cells that have a cell of it in their window."""
+        """A box enlarged to the cells whose window contains a cell of the box."""
         half = self.window // 2
         return tuple(slice(max(s.start - half, 0), min(s.stop + half, n)) for s, n in zip(box, shape, strict=True))
 
     def _swept(self, labels: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Labels after one sweep; `cells` is the number of grid cells in the window of each voxel."""
+        """Labels after one sweep. `cells` is the number of grid cells in the window of each voxel."""
         own, best = np.zeros(labels.shape, np.int32), np.zeros(labels.shape, np.int32)
         winner = np.zeros_like(labels)
         for label, box in enumerate(ndimage.find_objects(labels), start=1):
@@ -97,7 +97,7 @@ class ModeFilter(Bounded):
         return out
 
     def _window_counts(self, hit: np.ndarray) -> np.ndarray:
-        """Number (X, Y, Z) int32 of True cells in the window of each cell; none lie beyond the array."""
+        """Number (X, Y, Z) int32 of True cells in the window of each cell. Cells beyond the array are False."""
         count = hit.astype(np.int32)
         for axis in range(3):
             count = _window_sums(count.swapaxes(0, axis), self.window).swapaxes(0, axis)

@@ -1,28 +1,28 @@
-"""The published measurement update: predicted and proposed hypotheses in, weighted candidates out.
+"""The published measurement update, which makes weighted candidates from predicted and proposed hypotheses.
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. The projection onto free space clears voxels of every predicted hypothesis j, which keeps a share Q_j of them.
+1. The projection onto free space clears voxels of every predicted hypothesis j. A hypothesis keeps a share Q_j.
 2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
 
        log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
 
-   depends on its parents only; w_i and w_j are their weights, lambda is `quality_exponent`. So candidates are
-   resampled first, and only those that are chosen are built.
+   depends only on its parents. w_i and w_j are the weights of the parents, and lambda is `quality_exponent`. So
+   resampling selects among unbuilt candidates, and only selected candidates are built.
 
 Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
-observation, hardly any prediction lies in it, so every particle is projected into it. This is the manifold filter of
-Koval, Pollard and Srinivasa (2015).
+observation, few predictions lie in it. So every particle is projected into this set. The method is the manifold
+filter of Koval, Pollard and Srinivasa (2015).
 
-One crossover (figure 5):
+One crossover has these steps (figure 5):
 
 >>> child = Crossover().cross(rng, proposed, predicted)
 
-1. `graph_of` builds the conflict graph: two objects that share voxels are in conflict.
-2. `resolve` draws, for each connected component of the graph, which objects are merged, and the order in which all
-   of them are painted. A later object covers an earlier one.
+1. `graph_of` builds the conflict graph, in which two objects that share voxels are in conflict.
+2. `resolve` draws, for each connected component of the graph, which objects are merged, and the painting order of all
+   objects. A later object covers an earlier one.
 3. `assign_labels` paints the objects. Objects without conflict are copied.
-4. `mstfilter.crossover.ModeFilter` removes the speckle that painting leaves.
+4. `mstfilter.crossover.ModeFilter` removes speckle from the painted labels.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Crossover(Bounded):
     Parameters
     ----------
     structure : Structure
-        Painting order and candidate merges.
+        Draws the painting order and the candidate merges.
     merge : {"share", "printed", "always", "never"}
         Probability of a merge along a directed edge (`mstfilter.crossover.conflicts`).
     mode_filter : ModeFilter
@@ -87,10 +87,10 @@ class Crossover(Bounded):
     drop_rule: bool = False
 
     def cross(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
-        """A hypothesis made of the objects of both parents.
+        """A hypothesis from the objects of both parents.
 
-        If one parent has no objects, the result is the other one. An object keeps the identity of the largest
-        predicted object in it, and its motion history if its voxels are exactly those predicted.
+        If one parent has no objects, the result is the other parent. An object keeps the identity of the largest
+        predicted object in it. An object keeps the motion history if its voxels are exactly those predicted.
         """
         check_grid("the proposed hypothesis", proposed, predicted.grid)
         if not predicted.objects:
@@ -126,11 +126,11 @@ class CrossoverUpdate(Update):
     free_space : Projection
         Projects the predicted hypotheses onto those that agree with the latest frame.
     crossover : Crossover
-        Makes one hypothesis of two.
+        Makes one hypothesis from two.
     eta : int
-        Candidates of each pair.
+        Number of candidates of each pair.
     quality_exponent : float
-        lambda: power of Q in the weight.
+        Exponent lambda of Q in the weight.
     """
 
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
@@ -143,9 +143,9 @@ class CrossoverUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Candidates of all pairs, not built.
+        """The candidates of all pairs, which are built on access.
 
-        Without a prediction the proposed samples pass unchanged; without a proposal the refined predictions do.
+        Without a prediction, the result is the proposed samples. Without a proposal, it is the refined predictions.
         """
         if predicted is None:
             return union(None, proposed)
@@ -174,11 +174,11 @@ class CrossoverUpdate(Update):
 
 
 def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample i and prediction j of each candidate, every pair `eta` times in a row.
+    """Sample i and prediction j of each candidate. Each pair occurs `eta` times in a row.
 
-    Each sample is paired with the predictions in cyclic order. The first prediction of each sample is drawn without
-    replacement. With the same first prediction for all samples, systematic resampling, which takes equal strides
-    through nearly equal weights, would choose the same prediction again and again.
+    Each sample is paired with the predictions in cyclic order. The first predictions of the samples are drawn without
+    replacement. Systematic resampling takes equal steps through nearly equal weights. If all samples had the same
+    first prediction, it would select this prediction again and again.
     """
     rounds = -(-n_proposed // n_predicted)
     first = np.concatenate([rng.permutation(n_predicted) for _ in range(rounds)])[:n_proposed]
@@ -198,7 +198,7 @@ def assign_labels(
 
 
 def _painted(graph: ConflictGraph, resolution: ConflictResolution, voxels: OccupiedVoxels) -> np.ndarray:
-    """Group + 1 of each occupied voxel (n,), 0 if its object was dropped. A later object covers an earlier one."""
+    """Group + 1 of each occupied voxel (n,); 0 if its object was dropped. A later object covers an earlier one."""
     rank = np.zeros(len(graph), np.int64)
     rank[resolution.order] = np.arange(1, len(resolution.order) + 1)
     groups, ranks = (
@@ -209,7 +209,7 @@ def _painted(graph: ConflictGraph, resolution: ConflictResolution, voxels: Occup
 
 
 def _renumbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The labels > 0 that occur, ascending, and the array with these labels renumbered to 1, 2, ..."""
+    """The labels > 0 that occur, in ascending order, and the array with these labels renumbered to 1, 2, ..."""
     present, index = np.unique(np.append(labels, 0), return_inverse=True)
     return present[1:], index[:-1]
 
@@ -225,7 +225,7 @@ class _Child:
     numbers: np.ndarray  #: (n,) object of each voxel, 1, 2, ...; 0 is free
 
     def hypothesis(self, parents: tuple[Hypothesis, Hypothesis]) -> Hypothesis:
-        """The child with records and occupancy of the parents."""
+        """The child, with records and occupancy from the parents."""
         labels = self.voxels.spread(self.numbers.astype(np.uint16))
         child = Hypothesis(labels, parents[0].grid, self._records(parents))
         if all(parent.occupancy is None for parent in parents):
@@ -233,7 +233,7 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The record of each object: that of its head. The motion history ends where the voxels are others."""
+        """The record of each object, taken from its head. The motion history ends if the voxels have changed."""
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)
@@ -242,7 +242,7 @@ class _Child:
         return tuple(r if same else r.changed() for r, same in zip(records, unchanged, strict=True))
 
     def _heads(self) -> np.ndarray:
-        """The head (objects,) of each group: its largest predicted vertex, else its largest proposed vertex."""
+        """The head (objects,) of each group: its largest predicted vertex, or else its largest proposed vertex."""
         side, size = self.graph.side.tolist(), self.graph.size.tolist()
         ranking = sorted(range(len(self.graph)), key=lambda v: (side[v], size[v], -v))
         head_of = {int(self.group[v]): v for v in ranking}  # the last one of a group counts
@@ -259,7 +259,7 @@ class _Child:
         return (size == kept) & (size == self.graph.size[heads])
 
     def _occupancy(self, labels: np.ndarray, parents: tuple[Hypothesis, Hypothesis]) -> Occupancy:
-        """The larger probability of the parents; at least one half where the child has a label, at most elsewhere."""
+        """The larger probability of the parents: at least .5 in labelled voxels, at most .5 elsewhere."""
         owner, p = labels.copy(), np.where(labels > 0, np.float16(0.5), np.float16(0))
         heir = np.searchsorted(self.groups, self.group) + 1
         heir[~np.isin(self.group, self.groups)] = 0

@@ -1,11 +1,11 @@
-"""Readers and writers of recordings: the recording folder of mstfilter, and a reader for each other layout.
+"""Readers and writers of recordings: the recording folder of mstfilter, and readers for other layouts.
 
 >>> from mstfilter.formats import Tum, open_recording, save_recording
 >>> recording = Tum(K=(525, 525, 319.5, 239.5)).open(path)  # doctest: +SKIP
 >>> save_recording(recording, "recordings/mine")  # doctest: +SKIP
 >>> recording = open_recording("recordings/mine")  # any format  # doctest: +SKIP
 
-A reader is a `RecordingFormat`, a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` divides a
+A reader is a `RecordingFormat`: a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` divides a
 long video into clips.
 """
 

@@ -2,15 +2,15 @@
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
-A topic must be named only if several topics fit. The camera matrix is read from the ``camera_info`` topic beside the
-colour topic (for rectified images, its P). A frame is a colour and a depth image of which each is nearest to the
-other by the time stamp of the header. The stamps differ by at most `tolerance_s`. Depth must be registered to colour:
-same size and same ``frame_id``. Transforms (tf) are not read: the camera is assumed to stand still, and its pose is
-found from the table.
+A topic must be named only if several topics are suitable. The camera matrix is read from the ``camera_info`` topic of
+the colour topic (for rectified images, its P). A frame consists of a colour and a depth image. By the time stamps of
+their headers, the two images are nearest to each other. The stamps differ by at most `tolerance_s`. Depth must be
+registered to colour, with the same size and the same ``frame_id``. Transforms (tf) are not read. The camera is
+assumed not to move, and its pose is computed from the table.
 
-Depth encodings: 16UC1 and mono16 are units of the depth scale (millimetres by convention, REP 118), 32FC1 is metres.
-Compressed depth is a PNG, or the ``compressedDepth`` transport: 12 bytes of header (quantisation A, B of 32FC1), then
-a PNG. The files are read with rosbags (extra ``bags``), without ROS.
+In depth images, 16UC1 and mono16 are units of the depth scale (millimetres by convention, REP 118), and 32FC1 is
+metres. Compressed depth is a PNG, or the ``compressedDepth`` transport: a header of 12 bytes (quantisation A, B of
+32FC1), then a PNG. The files are read with rosbags (extra ``bags``), without ROS.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_CHUNK = 2**28  #: Largest chunk of a bag when it is unpacked, in bytes
 
 @dataclass(frozen=True)
 class Entry:
-    """A message: stamp of its header (s), time when it was logged (ns), index among those logged at that time."""
+    """A message: stamp of its header (s), time when it was logged (ns), and index among those logged at that time."""
 
     stamp: float
     logged: int
@@ -75,7 +75,7 @@ class BagFile:
         self.is_ros2: bool = self._reader.is2
 
     def topics(self, *kinds: str) -> dict[str, int]:
-        """Number of messages of each topic of some message types; topics without messages are left out."""
+        """Number of messages of each topic of some message types. Topics without messages are omitted."""
         counts: Counter[str] = Counter()
         for connection in self._reader.connections:
             if connection.msgtype in kinds:
@@ -108,7 +108,7 @@ class BagFile:
         raise InputError(f"bag {self.path} lists messages of {topic} but holds none", "copy it again")
 
     def index(self, topic: str) -> list[Entry]:
-        """Every message of a topic with a header, in the order of the file. Reads all of them once."""
+        """Every message of a topic with a header, in the order of the file. All messages are read once."""
         entries: list[Entry] = []
         for logged, message in self._messages(topic):
             stamp = message.header.stamp
@@ -127,7 +127,7 @@ class BagFile:
 
 @functools.cache
 def _bound_decompressors() -> None:
-    """Let rosbags unpack chunks of at most `MAX_CHUNK` bytes: it unpacks them before it compares their size."""
+    """Limit rosbags to chunks of at most `MAX_CHUNK` bytes, since it unpacks chunks before it compares their size."""
     import bz2
 
     import lz4.frame
@@ -176,7 +176,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def image_encoding(message: Any, compressed: bool) -> str:
-    """The encoding of an image message; of a compressed one ``16UC1``, ``32FC1`` or ``compressed colour``."""
+    """The encoding of an image message; for a compressed one ``16UC1``, ``32FC1`` or ``compressed colour``."""
     if not compressed:
         return str(message.encoding)
     named = str(message.format)
@@ -222,7 +222,7 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
 
 
 def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.ndarray:
-    """Pixels (H, W, channels) of an uncompressed image; rows may be padded."""
+    """Pixels (H, W, channels) of an uncompressed image, whose rows may be padded."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     if min(height, width) < 1 or step < width * channels * kind.itemsize or data.size < height * step:
@@ -260,7 +260,7 @@ _INFO = "sensor_msgs/msg/CameraInfo"
 
 @dataclass(frozen=True)
 class _Stream:
-    """An image topic: name, number of messages, and properties of the first message."""
+    """An image topic with its name, number of messages, and properties of the first message."""
 
     name: str
     count: int
@@ -275,7 +275,7 @@ class _Stream:
 
     @property
     def info(self) -> str:
-        """Its CameraInfo topic, as image_transport names it."""
+        """The CameraInfo topic, as image_transport names it."""
         parts = self.name.split("/")
         if parts[-1] in ("compressed", "compressedDepth"):
             parts = parts[:-1]
@@ -284,18 +284,18 @@ class _Stream:
 
 @dataclass(frozen=True)
 class Bag(VideoFormat):
-    """ROS 1 bag, ROS 2 bag or MCAP: image, compressed image, depth and CameraInfo topics.
+    """Reader of ROS 1 bags, ROS 2 bags and MCAP: image, compressed image, depth and CameraInfo topics.
 
     Further parameters: `VideoFormat`. `K` replaces the CameraInfo.
 
     Parameters
     ----------
     colour : str
-        Colour topic. Default: the only one.
+        Colour topic. By default, the only colour topic.
     depth : str
         Depth topic. Default: the only one that is registered to colour.
     registered : bool
-        Treat depth as registered to colour although its frame_id or camera matrix differs.
+        Treat depth as registered to colour even if its frame_id or camera matrix differs.
     """
 
     colour: str = ""

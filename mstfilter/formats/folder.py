@@ -17,9 +17,9 @@ The layout::
     poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
     SHA256SUMS           hashes of these files
 
-Frames with role ``static`` are the pauses. If camera.json holds no pose, the world is found from the support plane of
-the first pause; without a workspace, a grid is placed around the objects on the table. A recording is written under
-a temporary name and renamed when it is complete: if writing fails, no file remains.
+Frames with role ``static`` are the pauses. If camera.json has no pose, the world is computed from the support plane
+of the first pause. If it has no workspace, a grid is placed around the objects on the table. A recording is written
+under a temporary name and renamed when it is complete. If writing fails, no file remains.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class _Workspace(BaseModel):
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or be empty, and no other process may be writing it. The camera has its pose if
-    that is known; `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further
+    The new folder must not exist, or must be empty. No other process may write the folder. The camera has a pose if
+    it is known, and `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Other
     entries of manifest.json, such as generator and seed, are given by name.
     """
 
@@ -127,10 +127,10 @@ class RecordingWriter:
     ) -> int:
         """Add a frame and return its index.
 
-        `rgb` is (H, W, 3) uint8, `depth` (H, W) float in metres, NaN for no reading, and `time_s` in seconds. The
-        role is "static" at a pause, else "action". `instance` (H, W) uint8 or uint16 is the true object of each
-        pixel, `robot_mask` (H, W) bool the pixels of the robot, `poses` the true 4x4 T_world_object by object number.
-        Further entries of the frame in the manifest are given by name.
+        `rgb` is (H, W, 3) uint8, `depth` (H, W) float in metres with NaN for no reading, and `time_s` is in seconds.
+        The role is "static" at a pause and else "action". `instance` (H, W) uint8 or uint16 is the true object of
+        each pixel. `robot_mask` (H, W) bool marks the pixels of the robot. `poses` has the true 4x4 T_world_object by
+        object number. Other entries of the frame in the manifest are given by name.
         """
         index = len(self._frames)
         units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
@@ -161,7 +161,7 @@ class RecordingWriter:
         return index
 
     def add_voxels(self, labels: np.ndarray) -> None:
-        """Add the true labels (X, Y, Z) at the frame that was added last."""
+        """Add the true labels (X, Y, Z) at the last added frame."""
         if self._grid is None or labels.shape != self._grid.shape:
             raise InputError(
                 f"true labels have shape {labels.shape}, the workspace is {self._grid and self._grid.shape}"
@@ -211,10 +211,10 @@ def save_recording(
     progress: Callable[[int, int], None] = lambda done, total: None,
     **manifest: Any,
 ) -> Path:
-    """Write a recording as a new recording folder; if the camera moves, every frame stores its pose.
+    """Write a recording as a new recording folder. If the camera moves, every frame stores its pose.
 
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
-    and the number of all frames. Further entries of manifest.json, such as the generator, are given by name.
+    and the number of all frames. Other entries of manifest.json, such as the generator, are given by name.
     """
     report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
@@ -265,14 +265,14 @@ class CameraFile(BaseModel):
 
     @classmethod
     def of(cls, camera: Camera, **more: Any) -> Self:
-        """The entries of a camera; `more` are those of a subclass."""
+        """The entries of a camera; `more` are additional entries of a subclass."""
         pose = None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist()
         size = {"width": camera.width, "height": camera.height}
         return cls(K=camera.K.tolist(), T_world_camera=pose, **size, **more)
 
     @property
     def camera(self) -> Camera:
-        """The camera. Raises InputError if its matrix or its pose cannot be used."""
+        """The camera. Raises InputError if the matrix or the pose cannot be used."""
         matrix = self.T_world_camera
         pose = None if matrix is None else rigid_from_matrix(matrix, "T_world_camera")
         return Camera(self.K, self.width, self.height, pose)
@@ -315,8 +315,8 @@ def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
 class RecordingFolder(RecordingFormat):
     """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/.
 
-    Images are read when they are used; everything else is checked when the folder is opened. A rule `pauses` replaces
-    the pauses that the manifest lists; true volumes are known at the listed ones only.
+    Images are read on access. Everything else is checked when the folder is opened. A rule `pauses` replaces the
+    pauses in the manifest. True volumes are known only at the pauses in the manifest.
     """
 
     pauses: PauseRule | None = None
@@ -396,7 +396,7 @@ class RecordingFolder(RecordingFormat):
 
 
 def _read_poses(path: Path) -> Any:
-    """The function `Recording.poses`; it reads the file when it is first called."""
+    """The function `Recording.poses`, which reads the file at its first call."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:

@@ -26,7 +26,7 @@ from mstfilter.scene import Frame, Recording, read_labels, table_residual
 
 @dataclass(frozen=True)
 class PairedImages(RecordingFormat):
-    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json; every frame is a pause.
+    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json. Every frame is a pause.
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
     depth images. There is no pose: the world is found from the support plane. Label images NAME_label.png (8 or 16
@@ -96,7 +96,7 @@ _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "ca
 class Redwood(VideoFormat):
     """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics: Redwood, Open3D, many recorders.
 
-    Intrinsics are read from a file beside the folders, or given as ``K``. ``intrinsics.json`` or ``camera.json``
+    Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix``, column by column. Images are paired by the last number in their names, or by time
     if these are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera
@@ -223,7 +223,7 @@ def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
-    """A number from 1 of the file of intrinsics."""
+    """A number from 1 from the file of intrinsics."""
     value = stored.get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
@@ -248,7 +248,7 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
 
 
 def _four(K: Any) -> tuple[float, ...]:
-    """fx, fy, cx, cy of these four numbers, or of the nine of a 3 x 3 matrix."""
+    """fx, fy, cx, cy from these four numbers, or from the nine of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:
         return tuple(values.ravel().tolist())
@@ -262,9 +262,9 @@ def _four(K: Any) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Tum(VideoFormat):
-    """TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt if the camera moves; K must be given.
+    """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. K must be given.
 
-    Lines of rgb.txt and depth.txt are ``timestamp filename``, those of groundtruth.txt
+    Lines of rgb.txt and depth.txt are ``timestamp filename``. Lines of groundtruth.txt are
     ``timestamp tx ty tz qx qy qz qw``. Depth is in units of 1/5000 m. Format: Sturm et al. 2012.
 
     Parameters: `VideoFormat`.
@@ -324,7 +324,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 
 
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
-    """Camera poses at given times: those of the nearest lines."""
+    """Camera poses at given times, taken from the nearest lines."""
     try:
         rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
         if not np.isfinite(rows).all():

@@ -1,10 +1,9 @@
-"""Pauses of a video: the rules that divide it into clips.
+"""Pauses of a video (times at which nothing moves), and the rules that find them.
 
 >>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
 
-A clip goes from one pause to the next. At a pause nothing moves, and neither the robot nor a hand should be in the
-image. Only the recording folder of mstfilter stores the pauses. For other layouts they are found by one of the rules
-below.
+A clip goes from one pause to the next. At a pause, neither the robot nor a hand should be in the image. Only the
+recording folder of mstfilter stores the pauses. For other layouts, one of the rules below finds them.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from mstfilter.scene import PauseRule, grey_blocks
 
 @dataclass(frozen=True)
 class Ends(PauseRule):
-    """First and last frame: one clip."""
+    """The first and the last frame are the pauses, so there is one clip."""
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         return tuple(sorted({0, len(times) - 1}))
@@ -32,7 +31,7 @@ class Ends(PauseRule):
 
 @dataclass(frozen=True)
 class EveryNth(PauseRule):
-    """Every n-th frame is a pause: single images of a scene that was changed in between."""
+    """Every n-th frame is a pause, for single images of a scene that was changed between them."""
 
     n: PositiveInt = 1
 
@@ -42,7 +41,7 @@ class EveryNth(PauseRule):
 
 @dataclass(frozen=True)
 class At(PauseRule):
-    """Frames by index from 0, negative ones from the end, or the frames nearest to seconds since the first."""
+    """Frames by index from 0 (negative from the end), or the frames nearest to times in seconds since the first."""
 
     frames: tuple[int, ...] = ()
     seconds: tuple[float, ...] = ()
@@ -86,33 +85,33 @@ _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if 
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(...) absolute change of each block from a to b minus the median change."""
+    """(...) absolute change of each block from a to b, minus the median change."""
     difference = b - a
     return np.abs(difference - np.median(difference))
 
 
 @dataclass(frozen=True)
 class Still(PauseRule):
-    """Middle frames of the intervals in which the image does not change, for a camera that stands still.
+    """Middle frames of the intervals in which the image does not change, for a camera that does not move.
 
-    Images are reduced to blocks of grey levels. There is motion between two images if more than a small share of the
-    blocks differ by more than their noise. A still interval is a run of frames in which none differs from the first,
-    so that slow motion adds up. Each interval of at least `hold_s` seconds gives one pause, its middle frame.
-    Changes that all blocks share (exposure, flicker) do not count. The noise of each block is measured in the video,
-    which must be at rest for a quarter of its time.
+    Images are reduced to blocks of grey levels. Two images differ by motion if more than a small share of the blocks
+    differ by more than their noise. A still interval is a run of frames that do not differ from its first frame. So
+    slow motion adds up. Each interval of at least `hold_s` seconds gives one pause, its middle frame. Changes that
+    all blocks share (exposure, flicker) are ignored. The noise of each block is measured in the video, which must be
+    at rest for a quarter of its time.
 
-    An interval in which a robot holds still in the image, or moves by less than a grey level, also gives a pause.
-    Check the pauses, and give them explicitly if they are wrong.
+    An interval in which a robot waits in the image, or moves by less than a grey level, also gives a pause. Check the
+    pauses, and give them explicitly if they are wrong.
 
     Parameters
     ----------
     hold_s : float
         Shortest interval, in seconds.
     levels : float
-        Change in grey levels (of 255) from which a block differs, or six times its noise if that is more.
+        A block differs if its grey level (of 255) changes by this value, or by six times its noise if that is more.
     region : tuple of 4 float
-        Part of the image that is used: left, top, right, bottom as shares of its width and height. It can exclude
-        people behind the table.
+        Part of the image that is used: left, top, right, bottom as shares of width and height. The selected part can
+        exclude people behind the table.
     """
 
     hold_s: NonNegativeFloat = 0.5
@@ -161,7 +160,7 @@ class Still(PauseRule):
         return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
 
     def _limit(self, images: list[np.ndarray]) -> np.ndarray:
-        """Change (h, w) in grey levels from which a block differs: a multiple of its noise at rest."""
+        """Change (h, w) in grey levels at which a block differs, a multiple of its noise at rest."""
         changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
         quarter = np.quantile(changes, 0.25, axis=0) / 0.3186  # the quartile of |x| for a standard normal x is 0.3186
         overall = 1.4826 * np.quantile(np.median(changes, axis=(1, 2)), 0.25)

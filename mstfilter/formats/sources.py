@@ -4,9 +4,9 @@
 >>> open_recording("session.mcap")
 >>> open_recording("rgbd_dataset", options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
-Options are fields of the format (``mstfilter list format`` shows them), as ``FIELD=VALUE``; commas make a list. The
-format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`, and a rule
-of ``formats/pauses.py`` decides where the pauses are.
+Options are fields of the format (``mstfilter list format`` shows them), given as ``FIELD=VALUE``. Commas make a list.
+The format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`. A rule
+of ``formats/pauses.py`` finds the pauses.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ def open_recording(
     path : str or Path
         File or folder.
     format : str
-        Name of a format, or ``./file.py:Class``. Empty: detected.
+        Name of a format, or ``./file.py:Class``. Empty means detected.
     options : sequence of str
         ``FIELD=VALUE`` of the format.
     pauses : str
-        Where a video is cut: see `mstfilter.formats.pauses.pauses_from_text`. Empty: the format's default.
+        Rule for the pauses: see `mstfilter.formats.pauses.pauses_from_text`. Empty means the format's default.
     allow_files : bool
-        Whether ``./file.py:Class`` is loaded.
+        Whether ``./file.py:Class`` may be loaded.
     """
     path = Path(path)
     fields = format_settings(options)

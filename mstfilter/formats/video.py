@@ -1,4 +1,4 @@
-"""Videos with depth: the interface of all readers, and what they share.
+"""Videos with depth: the interface of all readers, and common functions.
 
 A reader is a subclass of `RecordingFormat`. One of a video is a `VideoFormat`, which defines ``video(path)``:
 
@@ -6,16 +6,16 @@ A reader is a subclass of `RecordingFormat`. One of a video is a `VideoFormat`, 
 >>> if reader.detects(path):
 ...     recording = reader.open(path)
 
-To read another layout, define a subclass in a file: ``mstfilter convert IN OUT --format ./mine.py:Mine``. Its fields
-are options of the command line. It is best built with `Video`, which checks every frame when it is read; for arrays
-in memory use `Recording.from_arrays`.
+To read another layout, define a subclass in a file and pass it: ``mstfilter convert IN OUT --format ./mine.py:Mine``.
+The fields of the class are options of the command line. Build the reader's recording with `Video`, which checks every
+frame when it is read. For arrays in memory use `Recording.from_arrays`.
 
 >>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
 The camera pose is found from the support plane of the first pause unless it is given. A stored motion of the camera
-is used relative to the first pause only, because the world of a trajectory seldom has its table at z = 0. Cameras
-have no distortion: distorted images are undistorted when they are read.
+is used only relative to the first pause, because the table is seldom at z = 0 in the world of a trajectory. Cameras
+have no distortion, so distorted images are undistorted when they are read.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ from mstfilter.scene import (
 
 
 class RecordingFormat(ABC):
-    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses; fields hold what the files do not store."""
+    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses, with fields for what files do not store."""
 
     @classmethod
     @abstractmethod
     def detects(cls, path: Path) -> bool:
-        """Whether the names of files show that a path has this layout. Raises no error."""
+        """Whether the names of files show that a path has this layout. The method raises no error."""
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
-        """The recording; its images may be read when they are used. Raises InputError if the data are not valid."""
+        """The recording, whose images may be read on access. Raises InputError if the data are not valid."""
 
 
 _NEGLIGIBLE = 0.5  # pixels
@@ -87,7 +87,7 @@ def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarra
 
 
 def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0, smooth: bool = False) -> np.ndarray:
-    """The undistorted image; depth and labels must not be interpolated (`smooth`)."""
+    """The undistorted image. Depth and labels must not be interpolated (`smooth`)."""
     import cv2
 
     if source is None:
@@ -99,7 +99,7 @@ def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0,
 
 @dataclass(frozen=True)
 class KnownWorld:
-    """Camera pose and workspace, if they are known; what is empty is found from the first pause."""
+    """Camera pose and workspace, if they are known. Empty fields are computed from the first pause."""
 
     #: tuple of 16 float: pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
     T_world_camera: tuple[float, ...] = ()
@@ -166,7 +166,7 @@ class Video:
         return cls(name, times, rgb, depth, K, path, depth_scale, **more)
 
     def between(self, start_s: float, stop_s: float) -> Video:
-        """The frames from `start_s` to `stop_s` seconds after the first."""
+        """The frames from `start_s` to `stop_s` seconds after the first frame."""
         kept = [k for k, t in enumerate(self.times) if start_s <= t - self.times[0] <= stop_s]
         if len(kept) == len(self.times):
             return self
@@ -185,7 +185,7 @@ class Video:
         )
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording; pose and workspace are found now, images are read when they are used."""
+        """The recording. Pose and workspace are computed now, and images are read on access."""
         if not self.times:
             raise InputError(f"{self.path} has no pair of a colour and a depth image")
         if len(self.K) != 4:
@@ -256,7 +256,7 @@ class VideoFormat(RecordingFormat):
     Parameters
     ----------
     K : tuple of 4 float
-        fx, fy, cx, cy in pixels. Default: from the files.
+        fx, fy, cx, cy in pixels. By default, from the files.
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float
@@ -264,7 +264,7 @@ class VideoFormat(RecordingFormat):
     tolerance_s : float
         Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float
-        Part of the video that is used, in seconds after its first frame.
+        Part of the video to use, in seconds after its first frame.
     pauses : PauseRule
         The rule that finds the pauses.
     world : KnownWorld
@@ -290,7 +290,7 @@ class VideoFormat(RecordingFormat):
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:
-    """Instance image (H, W) uint16 in which no object has the number 255, which is that of the robot."""
+    """Instance image (H, W) uint16 in which no object has the number 255, which is the robot's."""
     free = np.setdiff1d(np.arange(256, 65536), labels)[0]
     return np.where(labels == 255, free, labels).astype(np.uint16)
 
@@ -298,7 +298,9 @@ def object_numbers(labels: np.ndarray) -> np.ndarray:
 def pair_stamps(
     colour: Sequence[float], depth: Sequence[float], tolerance_s: float, where: str
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs (colour index, depth index) in order of time: mutually nearest stamps, at most `tolerance_s` apart.
+    """Pairs (colour index, depth index) in order of time.
+
+    The stamps are mutually nearest and at most `tolerance_s` apart.
 
     Warns if more than a tenth of the colour images are in no pair. Raises InputError if there is no pair.
     """

@@ -1,4 +1,4 @@
-"""Front ends of others: segmentations and networks that users supply by path.
+"""Front ends from other programs: segmentations and networks that users supply by path.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
@@ -11,8 +11,8 @@
 `mask_trackers`     SAM 2 and EdgeTAM through their package
 ==================  ===================================================================
 
-The networks of the published system, COB and SiamMask, are files in ``models/published`` that the registry loads like
-components of users. No weights are part of the package, and none are downloaded.
+The networks of the published system, COB and SiamMask, are files in ``models/published``. The registry loads these
+files like components of users. No weights are part of the package, and none are downloaded.
 """
 
 from mstfilter.lazy import attach

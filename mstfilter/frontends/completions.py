@@ -1,8 +1,8 @@
-"""Completions of others: meshes, point clouds or voxel arrays of objects, made by another program.
+"""Completions from other programs: meshes, point clouds or voxel arrays of objects.
 
 >>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
-The layout; numbers are those of the pauses (`Clip.index`), from 0::
+In the layout, numbers are those of the pauses (`Clip.index`), from 0::
 
     shapes/000001/cup/mask.png         the mask of the object in the image of the pause, not 0
 
@@ -11,12 +11,13 @@ The layout; numbers are those of the pauses (`Clip.index`), from 0::
 
 A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world:
 
-* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a cloud (ply) if there are no triangles; open3d reads it.
-* ``.npz``: ``points`` (n, 3); or ``occupancy`` (A, B, C), the probability of voxels with edge ``voxel_size`` whose
-  first corner is ``origin`` (3,), along the axes of the frame.
+* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a cloud (ply) if there are no triangles. open3d reads it.
+* ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probability of voxels with edge ``voxel_size`` along
+  the axes of the frame. The first corner is ``origin`` (3,).
 
-A voxel is inside a mesh if its centre is, by the parity of crossings along three axes, of which two decide. So small
-holes do no harm. A voxel is occupied by a cloud if a point is in it; spaces enclosed by such voxels are filled.
+A voxel is inside a mesh if its centre is inside. Inside is decided by the parity of crossings along three axes, of
+which two must agree. So small holes have no effect. A voxel is occupied by a cloud if it contains a point. Spaces
+enclosed by occupied voxels are filled.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class ObjectShapes:
 
 @dataclass(frozen=True)
 class ExternalCompletion(ClipCompleter, UsesFiles):
-    """Shapes from a folder, in place of an estimate.
+    """Shapes from a folder instead of an estimate.
 
     The shapes of a mask are those of the stored mask with the highest IoU, at least 0.5. Of several, one is drawn for
     each hypothesis by its weight. Voxels observed as free are cleared, and the visible surface is occupied.
@@ -83,7 +84,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     axes : {"camera", "world"}
         The frame of the shapes.
     other : Completer, optional
-        For masks without a stored mask. Default: such a mask is an error.
+        Completer of masks without a stored mask. By default, a mask without a stored mask is an error.
     """
 
     folder: str = ""
@@ -106,7 +107,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return bound_to(self, _shapes=found, other=other)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """The visible surface; `complete_each` adds the shape of the mask."""
+        """The visible surface. `complete_each` adds the shape of the mask."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
@@ -152,14 +153,14 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return Completion(offset, p, seen.points, key.hex()[:16])
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
-        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once and kept."""
+        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once and stored."""
         data = read_bytes(path, "a shape")
         T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
         key = (content_key(path.suffix, data, T), grid.key)
         return memo("external_shape", key, lambda: place_shape(path, data, T, grid))
 
     def _reaching(self, shape: np.ndarray, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> ExternalCompletion:
-        """This completer with a padding that lets the box of the mask contain a shape (X, Y, Z)."""
+        """This completer with a padding such that the box of the mask contains a shape (X, Y, Z)."""
         occupied = occupied_box(shape > 0)
         readings = grid.index_of(frame.points[mask & frame.valid])
         readings = readings[grid.contains(readings)]
@@ -171,7 +172,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
 
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
-    """The objects of a pause; `shape` is that of the image, (H, W). Shapes are read when they are placed.
+    """The objects of a pause. `shape` is the shape of the image, (H, W). Shapes are read when they are placed.
 
     Raises InputError if the folder, a mask or a shape is missing, or a mask or weights.json cannot be used.
     """
@@ -246,7 +247,7 @@ def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
 
 
 def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """The value of the array's voxel that holds the centre of each voxel of the grid; 0 outside."""
+    """The value of the array's voxel that contains the centre of each voxel of the grid; 0 outside."""
     values = arrays["occupancy"]
     if values.ndim != 3 or values.dtype.kind not in "bfiu" or not values.size:
         raise InputError(f"{path}: occupancy has shape {values.shape} and type {values.dtype}, expected (A, B, C)")
@@ -289,7 +290,7 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh(points: np.ndarray, triangles: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Voxels whose centres are inside a mesh: an odd number of crossings along at least two of three directions."""
+    """Voxels whose centres are inside a mesh: odd numbers of crossings along at least two of three directions."""
     o3d = import_open3d()
     low = np.clip(grid.index_of(points.min(axis=0)) - 1, 0, grid.shape)
     high = np.clip(grid.index_of(points.max(axis=0)) + 2, 0, grid.shape)

@@ -1,11 +1,11 @@
-"""Folders of instance masks that another program made, several alternatives for each pause.
+"""Folders of instance masks from another program, with several alternatives for each pause.
 
 >>> write_masks("masks", 0, [labels_a, labels_b], weights=[0.7, 0.3])    # label images (H, W), 0 = no mask
 >>> masks = read_masks("masks", 0, (480, 640))
 >>> [len(region.weights) for region in masks.regions]
 [2]
 
-The layout; numbers are those of the pauses (`Clip.index`), from 0::
+In the layout, numbers are those of the pauses (`Clip.index`), from 0::
 
     masks/000000.png              one segmentation of the image at pause 0
     masks/000001/a.png, b.npz     several alternatives of the whole image
@@ -17,14 +17,14 @@ The layout; numbers are those of the pauses (`Clip.index`), from 0::
 
 A file is one set of masks of the size of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
 
-* ``.png``: label image, 8 or 16 bits, 0 = no mask.
+* ``.png``: label image, 8 or 16 bits, in which 0 means no mask.
 * ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), for labels in ascending
   order.
 * ``.json``: a list of COCO annotations, or ``{"masks": [...]}``. Each has ``segmentation: {size: [H, W], counts}``,
   run lengths as numbers or compressed, and optionally ``score`` or ``predicted_iou``, as SAM writes it.
 
-Scores are at least 0, and 1 where they are missing. Without weights.json, the weight of an alternative is the mean
-score of its largest masks. Weights of a region need not sum to 1.
+Scores are at least 0. Missing scores are 1. Without weights.json, the weight of an alternative is the mean score of
+its largest masks. Weights of a region need not sum to 1.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _KINDS = {"labels": (2, "iu", "integers (H, W)"), "masks": (3, "b", "bool (n, H,
 
 @dataclass(frozen=True, eq=False)
 class MaskRegion:
-    """Alternatives of a region of the image, of which one is true."""
+    """Alternatives of a region of the image, one of which is true."""
 
     name: str
     weights: np.ndarray  #: (k,) probabilities, their sum is 1
@@ -74,7 +74,9 @@ class PauseMasks:
 def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
     """Read the masks of a pause. `shape` is that of the image, (H, W).
 
-    Files are read at each call, and their content is parsed once. Raises InputError if the folder has no masks for
+    `shape` is the shape of the image, (H, W). `rgb` is compared with the key in npz files.
+
+    Files are read at each call, but their content is parsed once. Raises InputError if the folder has no masks for
     the pause, or a file cannot be used.
     """
     if not str(folder):
@@ -107,7 +109,7 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseM
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Entries of a folder by name; hidden ones are left out."""
+    """Entries of a folder by name, without hidden ones."""
     return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
 
 
@@ -294,9 +296,9 @@ _READERS = {".png": _read_png, ".npz": _read_npz, ".json": _read_json}
 
 
 def decode_rle(counts: Any, shape: tuple[int, int]) -> np.ndarray:
-    """The mask (H, W) bool of COCO run lengths: numbers, or the compressed text (cocoapi, maskApi.c, `rleFrString`).
+    """The mask (H, W) bool of COCO run lengths, as numbers or compressed text (cocoapi, maskApi.c, `rleFrString`).
 
-    Runs go down the columns and alternate, the first is of pixels outside the mask.
+    Runs go down the columns and alternate. The first run is outside the mask.
     """
     runs: list[int] = []
     if isinstance(counts, str):
@@ -331,19 +333,20 @@ def write_masks(
     weights: Sequence[float] | None = None,
     region: str = "",
 ) -> None:
-    """Write the alternatives of a pause, or of one of its regions, as npz files. Earlier ones are replaced.
+    """Write the alternatives of a pause, or of one of its regions, as npz files. Earlier masks are replaced.
 
-    Nothing is written if the masks cannot be read: see `mstfilter.frontends.mask_files`.
+    Nothing is written if the masks cannot be read; see `mstfilter.frontends.mask_files`.
 
     Parameters
     ----------
     folder : str or Path
     pause : int
-        `Clip.index` of the clip whose last frame the masks segment.
+        `Clip.index` of the clip whose last frame is segmented by the masks.
     alternatives : sequence
-        Each a label image (H, W), masks (n, H, W) bool that are disjoint or nested, or one of these with its scores.
+        Each alternative is a label image (H, W), masks (n, H, W) bool that are disjoint or nested, or one of these
+        with its scores.
     weights : sequence of float, optional
-        One weight for each alternative. Default: from the scores.
+        One weight for each alternative. By default, computed from the scores.
     region : str
         Name of the region; empty for the whole image.
     """

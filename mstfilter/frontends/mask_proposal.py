@@ -40,10 +40,11 @@ class MaskProposal(Proposal, UsesFiles):
     folder : str
         The folder of masks.
     sampler : CutSampler
-        Draws the level of nested masks. At temperature 1 it has the law of `mstfilter.frontends.mask_trees`.
+        Draws the level of nested masks. At temperature 1 the sampler has the distribution of
+        `mstfilter.frontends.mask_trees`.
     objects : ObjectRule
-        Decides which masks are objects. Other masks, such as that of the table, are background; if they contain
-        masks, their parts are always used.
+        Decides which masks are objects. Other masks, such as that of the table, are background. If background masks
+        contain masks, their parts are always used.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.
@@ -103,13 +104,13 @@ class MaskProposal(Proposal, UsesFiles):
 
 
 def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np.ndarray:
-    """Probabilities (N,) to stop, 0 at masks that contain masks and are no object, such as that of the table."""
+    """Probabilities (N,) to stop, which are 0 at masks that contain masks and are not objects, such as the table."""
     inner = np.arange(tree.n_nodes) >= tree.n_leaves
     return np.where(inner & ~is_object, 0.0, stop)
 
 
 def _number(content: bytes) -> int:
-    """A number of 62 bits that names a content in random streams."""
+    """A number of 62 bits that identifies a content in random streams."""
     return int.from_bytes(content_key(content)[:8], "big") >> 2
 
 
@@ -123,7 +124,7 @@ class MaskGenerator(Protocol):
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
     """Run a mask generator on the last frame of each clip, and write its masks as nested sets.
 
-    `share` is that of `nested_masks`.
+    `share` is the argument of `nested_masks`.
     """
     for clip in clips:
         found = generator.generate(clip.after.rgb.copy())

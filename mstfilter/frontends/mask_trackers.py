@@ -3,8 +3,8 @@
 >>> overrides = "transition.tracker=sam2", "transition.tracker.checkpoint=sam2.1_hiera_tiny.pt"
 >>> filter = mstfilter.preset("mst", *overrides)
 
-A tracker follows the masks of all distinct segments to the last frame of a clip. The motion rules then look for the
-object there, in place of where the optical flow leads (paper, section IV-C).
+A tracker follows the masks of all distinct segments to the last frame of a clip. The motion rules then search for the
+object in these masks instead of the end points of the optical flow (paper, section IV-C).
 
 SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package of
 the same name and interface. The user supplies package and checkpoint. The adapter was checked with a stand-in of the
@@ -33,7 +33,7 @@ _SAM2 = "https://github.com/facebookresearch/sam2"
 
 
 def thinned(clip: Clip, step: int) -> list[Frame]:
-    """Every `step`-th frame of a clip, and the last one."""
+    """Every `step`-th frame of a clip, and the last frame."""
     return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
 
 

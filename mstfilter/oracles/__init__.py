@@ -1,7 +1,7 @@
-"""Oracles: stages of a filter replaced by the truth of a recording.
+"""Oracles replace stages of a filter by the truth of a recording.
 
-A simulated recording holds its true voxels, instance images and poses. Components
-named ``true_...`` use them in place of an estimate, which shows how much each stage loses:
+A simulated recording contains its true voxels, instance images and poses. Components named ``true_...`` use this
+truth instead of an estimate. The gain shows how much quality each stage loses:
 
 >>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does

@@ -1,12 +1,12 @@
-"""The front end replaced by the truth: boundaries, masks and completion.
+"""Oracles of the front end: true boundaries, masks and completion.
 
 >>> boundary = TrueBoundary()                    # the boundary map, below an ordinary tree
 >>> proposal = TrueMasks()                       # every sample is the true segmentation of the image
 >>> completer = TrueCompletion()                 # the true voxels of what a mask shows
 
-A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general a
-true voxel belongs to the mask that holds its pixel. Of all pixels that show its object, this is the one nearest in
-the image to the projection of the voxel. So parts of an object get their part of it, and a mask over two objects gets
+A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general, a
+true voxel belongs to the mask that contains its pixel. Among all pixels that show the object of a voxel, this is the
+pixel nearest to the projection of the voxel. So a mask of a part of an object gets this part. A mask of two gets
 both.
 """
 
@@ -54,7 +54,7 @@ class TrueMasks(UsesTruth, Proposal):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def masks(self, frame: Frame, clip: Clip) -> np.ndarray:
-        """(H, W) int32 true objects of the clip's last frame with enough pixels, 0 elsewhere."""
+        """(H, W) int32 true objects of the clip's last frame that have enough pixels; 0 elsewhere."""
         image = self.truth.instance(clip.index)
         counts = np.bincount(image.ravel())
         enough = counts >= scaled_area(MIN_PIXELS, image.size)
@@ -104,10 +104,11 @@ _WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
 
 @dataclass(frozen=True)
 class TrueCompletion(UsesTruth, Completer):
-    """The true voxels of what a mask shows. A mask that shows no true object keeps its visible surface.
+    """The true voxels of the objects that a mask shows. A mask without true objects keeps its visible surface.
 
-    `objects` says which pixels can belong to an object; true voxels are assigned to these pixels. A mask with 75 % of
-    an object's pixels shows all of it. Objects with less than 10 % of a mask, and less than half in it, are ignored.
+    `objects` determines which pixels can belong to an object. True voxels are assigned to these pixels. A mask with
+    75 % of an object's pixels gets all voxels of the object. Objects with less than 10 % of a mask and less than half
+    in it are ignored.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
@@ -115,7 +116,7 @@ class TrueCompletion(UsesTruth, Completer):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """1 on the visible surface, for masks that show no true object."""
+        """1 on the visible surface, for masks without true objects."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
@@ -172,7 +173,7 @@ class TrueCompletion(UsesTruth, Completer):
         return Completion(read_only(low), read_only(probability), read_only(points), name.hex()[:16])
 
     def _pixels(self, frame: Frame, grid: VoxelGrid, t: int) -> tuple[np.ndarray, np.ndarray]:
-        """Voxels (n, 3) of all objects that the frame shows, and the flat pixel (n,) that each belongs to."""
+        """Voxels (n, 3) of all objects that the frame shows, and the flat pixel (n,) of each voxel."""
         from scipy.spatial import cKDTree
 
         labels, image = self.truth.labels(t), self.truth.instance(t)

@@ -1,4 +1,4 @@
-"""Tracking, free space, partition and selection replaced by the truth, and the overrides of all stages.
+"""Oracles of tracking, free space, partition and selection, and the overrides of all stages.
 
 >>> transition = TrueMotions()                                     # the rigid motion of each object
 >>> PartitionUpdate(free_space=TrueFreeSpace())                    # exactly the free space that is visible
@@ -6,11 +6,12 @@
 >>> PartitionUpdate(pairs=TruePairs())                             # the best of the partitions that it considers
 >>> filter = mstfilter.preset("mst", *STAGES["selection"])         # the n best of the candidates
 
-The time of an observation is the index of its clip. A resampler gets no clip, so for true selection the candidates
+The time of an observation is the index of its clip. A resampler gets no clip. So for true selection, the candidates
 are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best.
 
-Replacing one stage shows what a perfect one would add to the present filter. Replacing all but one shows what that
-stage costs a filter that is perfect elsewhere. The two differ because stages correct errors of each other.
+Replacing one stage shows what a perfect stage would add to the present filter. Replacing all stages but one shows
+what this stage costs a filter that is perfect elsewhere. The differences are not equal, since stages correct errors
+of each other.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ _NATS = 1e4  # log score of a true quality of 1
 class TrueMotions(UsesTruth, Transition):
     """Moves the objects of hypotheses by the true motions.
 
-    Only the motion is true: the object of the hypothesis is moved by the ordinary warp. An object that covers two
-    true objects moves as the one that it shares more voxels with.
+    Only the motion is true. The objects come from the hypothesis and are moved by the ordinary warp. An object that
+    covers two true objects moves like the one with which it shares more voxels.
     """
 
     warp: Warp = field(default_factory=Warp)
@@ -46,7 +47,7 @@ class TrueMotions(UsesTruth, Transition):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "poses")
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Clip | None) -> Population:
-        """Move all hypotheses; weights are unchanged. Objects that overlap no true object are not moved."""
+        """Move all hypotheses; the weights do not change. Objects that overlap no true object are not moved."""
         parents = {"previous": np.arange(len(population))}
         particles: tuple[Hypothesis, ...] = tuple(population.particles)
         counts = {"true": 0, "rest": 0, "no object": 0}
@@ -79,7 +80,7 @@ class TrueMotions(UsesTruth, Transition):
 
 @dataclass(frozen=True)
 class TrueFreeSpace(UsesTruth, Projection):
-    """Clears voxels that are truly free and that the camera sees."""
+    """Clears voxels that are truly free and visible to the camera."""
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> tuple[Hypothesis, float]:
         """The hypothesis without these voxels, and the fraction of occupied voxels that it keeps."""
@@ -98,7 +99,7 @@ class TrueFreeSpace(UsesTruth, Projection):
 
 @dataclass(frozen=True)
 class TrueQuality(UsesTruth, Evidence):
-    """Scores hypotheses by their true quality, so strongly that practically all weight is on the best candidate."""
+    """Scores hypotheses by their true quality, with nearly all weight on the best candidate."""
 
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
         labels = self.truth.labels(clip.index)
@@ -107,7 +108,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Practically certain odds of the truth, so that draws are as near to it as possible.
+    """Almost certain odds of the truth, so that draws are as near to the truth as possible.
 
     A cell belongs to the true object of most of its readings.
     """

@@ -1,14 +1,14 @@
-"""Components that use the ground truth of a recording, and how they get it.
+"""Components that use the ground truth of a recording.
 
-A component gets a clip, and a clip holds no truth. So a component that inherits `UsesTruth` is bound to a recording
-before a run. `bind_truth` binds all such components of a filter, also nested ones:
+A component gets a clip, which contains no truth. So a component that inherits `UsesTruth` is bound to a recording
+before a run. `bind_truth` binds all components that use the truth of a filter, including nested ones:
 
 >>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies bind automatically. The truth is not a field: the description of a component and its
-equality do not change when it is bound. Its `component_key` does change.
+``mstfilter run`` and studies bind these components automatically. The truth is not a field. So binding does not
+change the description of a component or its equality. Binding changes the `component_key` of a component.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ T = TypeVar("T")
 
 
 class RecordingTruth:
-    """The ground truth at the pauses of a recording; `check` what a component needs first."""
+    """The ground truth at the pauses of a recording. Call `check` first with what a component needs."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self._instance: dict[int, np.ndarray] = {}
 
     def check(self, needs: tuple[Need, ...], component: str) -> None:
-        """Raise InputError if something that a component needs is missing at any pause."""
+        """Raise InputError if data that a component needs are missing at any pause."""
         recording = self.recording
         get = {
             "voxels": recording.truth,
@@ -100,7 +100,7 @@ class RecordingTruth:
 
 
 class UsesTruth:
-    """A component that uses the truth. Inherit it together with the interface of the component."""
+    """A component that uses the truth. Inherit this class together with the interface of the component."""
 
     #: What the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
@@ -135,7 +135,7 @@ def uses_truth(component: Any) -> list[str]:
 def bind_truth(component: T, recording: Recording) -> T:
     """The same filter (or component) with all components that use the truth bound to a recording.
 
-    Raises InputError if the recording lacks something that a component needs, at any pause.
+    Raises InputError if the recording lacks data that a component needs, at any pause.
     """
     return _bind(component, RecordingTruth(recording)) if uses_truth(component) else component
 

@@ -4,25 +4,28 @@
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
-A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller one.
-Conflicts are the edges of the conflict graph (in the paper, section IV-D, edges join objects that share voxels). The
-*main object* of a segment is the one with which it shares most readings. An object that is the main object of no
-segment and has fewer than about 60 readings is in no conflict: these are readings of other objects near it.
+A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller of
+the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects that share
+voxels.) The *main object* of a segment is the predicted object with which it shares most readings. An object that is
+the main object of no segment and has fewer than about 60 readings is in no conflict. The readings come from objects
+nearby.
 
-In each connected component, a predicted object is continued by at most one segment. Two rules are tried in turn:
+In each connected component, at most one segment continues a predicted object. Two rules are applied in order:
 
-1. Only the segments count whose main object it is. It is continued by the one that has more than 80 % of the readings
-   that these segments share with it. So readings at which another object now occludes it do not count.
-2. All segments count. It is continued by the one that has more than 80 % of the readings that they share with it.
+1. The first rule uses only segments whose main object is the predicted object. The object is continued by the segment
+   with more than 80 % of the readings that these segments share with it. So readings at which another object now
+   occludes the predicted object are not counted.
+2. The second rule uses all segments. The object is continued by the segment with more than 80 % of the readings that
+   all segments share with it.
 
-If the component has one segment and one object, more than 50 % is enough. It follows:
+If the component has one segment and one object, more than 50 % is sufficient. Consequences of these rules:
 
-- An object that is *split* into segments of which none has this share is continued by none of them. Its track ends,
-  its views are forgotten, and the segments are new objects.
+- If an object is *split* and no segment has enough of its readings, no segment continues the object. The track of
+  this object ends, its views are deleted, and the segments are new objects.
 - If several objects are *merged* into one segment, the segment continues all of them.
 - A segment that continues no object is a new object.
 
-An object without conflict is *occluded*. Readings that belong to no segment do not count anywhere.
+An object without conflict is *occluded*. Readings that belong to no segment are never counted.
 """
 
 from __future__ import annotations
@@ -55,7 +58,7 @@ class Overlaps:
 
     @classmethod
     def of(cls, segments: np.ndarray, objects: np.ndarray, least: float) -> Overlaps:
-        """From the segment and the predicted object (m,) of each reading. Readings of no segment do not count."""
+        """Count the readings by their segment and predicted object (m,). Readings without a segment are ignored."""
         inside = segments > 0
         shared = np.zeros((int(segments.max(initial=0)) + 1, int(objects[inside].max(initial=0)) + 1), np.int64)
         np.add.at(shared, (segments[inside], objects[inside]), 1)
@@ -79,7 +82,7 @@ class Overlaps:
 
     @cached_property
     def visible(self) -> set[int]:
-        """The predicted objects that are in conflict with a segment. All others are occluded."""
+        """The predicted objects that are in conflict with a segment. All other predicted objects are occluded."""
         return set(np.flatnonzero(self.in_conflict.any(axis=0)).tolist())
 
     def components(self) -> list[ConflictComponent]:
@@ -94,7 +97,7 @@ class Overlaps:
         return sorted(found)
 
     def tracks(self, component: ConflictComponent) -> dict[int, list[int]]:
-        """The predicted objects that each segment of a component continues, that with most readings first."""
+        """The predicted objects that each segment of a component continues, the one with most readings first."""
         continued: dict[int, list[int]] = {segment: [] for segment in component.segments}
         for predicted in component.objects:
             segment = self.continued_by(predicted, component)
@@ -110,7 +113,7 @@ class Overlaps:
         return self._holder(predicted, mainly_it, share) or self._holder(predicted, np.ones_like(mainly_it), share)
 
     def _holder(self, predicted: int, segments: np.ndarray, share: float) -> int:
-        """The segment in conflict with an object that has more than a share of its readings in `segments`; 0 is none.
+        """The segment in conflict with an object that has more than a share of its readings in `segments`; 0 if none.
 
         `segments` (segments + 1,) bool selects segments.
         """

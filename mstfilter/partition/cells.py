@@ -5,23 +5,23 @@
 >>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object", for cells.pairs (e, 2)
 >>> labels = cells.draw(rng, log_odds, 20)                        # (20, K) object of each cell in each draw
 
-A sample partitions the readings by its segments, a prediction by the objects that lie at the readings. A cell is a
-set of readings that all these partitions treat alike: the cells are the common refinement of all partitions. Cells
-that some partition joins form a component.
+A sample groups the readings by its segments. A prediction groups the readings by the objects that lie at the
+readings. A cell is a set of readings that no sample and no prediction separates: the cells are the common refinement
+of all partitions. A component is a set of cells that are connected by joins in the partitions.
 
-For two cells, the samples of the image and the predictions say in how many of them both belong to one object: the
-shares f_image and f_prediction. The log odds of "one object" are
+For two cells, f_image is the share of the samples in which both belong to one object. f_prediction is the same share
+of the predictions. The log odds of "one object" are
 
     l = (1 - R) (image_only_constant + image_only logit(f_image))
         + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
 
-where R is the probability that a prediction holds, and W <= R the weight of the predictions that explain both cells.
-The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`; `experiments/partition_fit` fits
-them.
+where R is the probability that a prediction is valid, and W <= R the weight of the predictions that explain both
+cells. The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`. The coefficients were fitted
+in `experiments/partition_fit`.
 
 The alternatives of a component are the partitions that the samples and the predictions give it. If a prediction does
-not explain a cell, each sample in turn says which object of the prediction the cell joins. Every mixture of the
-alternatives gives each pair of cells a probability of "one object". The mixture is taken whose probabilities are
+not explain a cell, each sample in turn determines which predicted object the cell joins. Every mixture of the
+alternatives gives each pair of cells a probability of "one object". The selected mixture has the probabilities
 nearest to those of l (least cross entropy over the pairs of readings).
 """
 
@@ -59,12 +59,12 @@ class Readings:
 
     @classmethod
     def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
-        """Of a frame."""
+        """The readings of a frame."""
         return cls(*frame_points(frame, grid), frame.depth.shape)
 
     @property
     def smallest_region(self) -> float:
-        """Readings of the smallest region of this image that counts as one."""
+        """Number of readings of the smallest region that is used in an image of this size."""
         return scaled_area(_LEAST_READINGS, self.shape[0] * self.shape[1])
 
     def mask(self, chosen: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ class Readings:
         return mask
 
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
-        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 is none."""
+        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 if none."""
         occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
         _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
         found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
@@ -82,13 +82,13 @@ class Readings:
 
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
-        """The voxels (k, 3) with readings, and that of each reading (m,)."""
+        """The distinct voxels (k, 3) with readings, and the voxel of each reading (m,)."""
         voxels, of_reading = np.unique(self.voxels, axis=0, return_inverse=True)
         return voxels, of_reading.ravel()
 
 
 class Alternatives(NamedTuple):
-    """The partitions among which one is drawn for a component."""
+    """The partitions of a component, one of which is drawn."""
 
     cells: np.ndarray  #: (k,) cells of the component
     partitions: np.ndarray  #: (p, k) object of each cell in each partition, 1, 2, ...
@@ -105,9 +105,9 @@ class Cells:
 
     @classmethod
     def of(cls, readings: Readings, samples: Sequence[np.ndarray], predictions: Sequence[np.ndarray]) -> Cells:
-        """From labels (m,) of the readings in each sample and each prediction; 0 is no object.
+        """Cells from the labels (m,) of the readings in each sample and each prediction; 0 means no object.
 
-        Readings that most samples give to no object belong to no cell.
+        Readings that most samples assign to no object belong to no cell.
         """
         kept = np.mean([labels > 0 for labels in samples], axis=0) >= 0.5
         segments = [labels[kept] for labels in samples]
@@ -128,7 +128,7 @@ class Cells:
 
     @cached_property
     def component(self) -> np.ndarray:
-        """Component (K,) of each cell: cells that a sample or a prediction gives to one object have the same."""
+        """Component (K,) of each cell. Cells of one object in a sample or a prediction are in one component."""
         labels = np.concatenate([self.samples, self.predictions])
         same = (labels[:, :, None] == labels[:, None]) & (labels[:, :, None] > 0)
         return np.asarray(connected_components(same.any(axis=0), directed=False)[1])
@@ -139,7 +139,7 @@ class Cells:
         return np.argwhere(np.triu(self.component[:, None] == self.component, 1))
 
     def counts(self, image: np.ndarray) -> np.ndarray:
-        """Readings (K, m) of each cell with each label of an image (H, W) int."""
+        """Number of readings (K, m) of each cell with each label of an image (H, W) int."""
         inside = self.of_reading >= 0
         found = np.zeros((len(self.sizes), int(image.max()) + 1), np.int64)
         np.add.at(found, (self.of_reading[inside], image.ravel()[self.readings.pixels[inside]]), 1)
@@ -180,10 +180,10 @@ class Cells:
         return _fitted_mixture(joined, expit(log_odds[inside]), weights / weights.sum())
 
     def draw(self, rng: np.random.Generator, log_odds: np.ndarray, n: int) -> np.ndarray:
-        """n partitions (n, K). Components are independent.
+        """n partitions (n, K). The components are drawn independently.
 
-        In each, the alternatives are drawn by systematic selection: as often as their probabilities say, up to
-        rounding.
+        In each component, the alternatives are drawn by systematic selection. The number of draws of each equals its
+        probability up to rounding.
         """
         drawn = np.zeros((n, self.samples.shape[1]), np.int64)
         used = 0
@@ -195,15 +195,15 @@ class Cells:
         return drawn
 
     def to_readings(self, of_cells: np.ndarray) -> np.ndarray:
-        """Labels (..., m) of the readings, from labels (..., K) of the cells; 0 for readings of no cell."""
+        """Labels (..., m) of the readings, from labels (..., K) of the cells; 0 for readings without a cell."""
         padded = np.pad(of_cells, [(0, 0)] * (of_cells.ndim - 1) + [(0, 1)])  # the last column is no cell
         return np.asarray(padded[..., self.of_reading])
 
 
 def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Labels (m,) of a prediction, with the most frequent label of the cell (m,) where there is none.
+    """Labels (m,) of a prediction, filled with the most frequent label of the cell (m,) where there is none.
 
-    This holds for cells of which the prediction explains at least half.
+    Only cells of which the prediction explains at least half are filled.
     """
     table = np.zeros((int(cells.max(initial=-1)) + 1, int(labels.max(initial=0)) + 1), np.int64)
     np.add.at(table, (cells, labels), 1)
@@ -213,7 +213,7 @@ def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> np.ndarray:
-    """Cells of the kept readings, after those of small cells have joined the nearest large cell, if one is near."""
+    """Cells of the kept readings. Small cells are joined to the nearest large cell, if one is near."""
     pixels, least = readings.pixels[kept], readings.smallest_region
     large = np.bincount(cell, minlength=1)[cell] >= least
     if not large.any():
@@ -225,7 +225,7 @@ def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> 
 
 
 def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """A reading (K,) of each cell (m,), with the labels of the cell: not one of a sliver that has joined it."""
+    """A reading (K,) of each cell (m,) with the labels of the cell, not from a small cell that was joined."""
     own = np.flatnonzero(cell == exact)
     return own[np.unique(cell[own], return_index=True)[1]]
 
@@ -233,8 +233,8 @@ def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
 def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """A prediction (k,) of cells of these sizes (k,), with objects for the cells that it does not explain.
 
-    Such a cell joins the predicted object with most readings in its segment of the sample (k,). Without one, the
-    segment is an object.
+    An unexplained cell joins the predicted object with most readings in its segment of the sample (k,). If no
+    predicted object has readings there, the segment is an object.
     """
     filled = prediction.copy()
     for segment in np.unique(sample[prediction == 0]):
@@ -249,10 +249,10 @@ def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np
 def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The mixture (p,) of partitions that forecasts pairs best.
 
-    `same` (e,) are the probabilities that the cells of a pair belong to one object, `joined` (p, e) says which
-    partitions join the pair. The mixture has the least cross entropy between `same` and the total probability of the
-    partitions that join the pair; pairs count by `weights` (e,). The problem is convex; this is expectation
-    maximisation for the proportions of a mixture.
+    `same` (e,) are the probabilities that the cells of a pair belong to one object. `joined` (p, e) states which
+    partitions join the pair. The mixture minimises the cross entropy between `same` and the total probability of the
+    partitions that join the pair. `weights` (e,) weight the pairs. The problem is convex. The problem is solved by
+    expectation maximisation for the proportions of a mixture.
     """
     q = np.full(len(joined), 1 / len(joined))
     for _ in range(_STEPS):
@@ -269,7 +269,7 @@ def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -
 
 
 class PairOdds(Checked, ABC):
-    """How likely two cells of an image belong to one object."""
+    """The log odds that two cells of an image belong to one object."""
 
     @returns(lambda self, found, cells, weights, clip: check_array(found, (len(cells.pairs),), finite=False))
     @abstractmethod
@@ -281,15 +281,15 @@ class PairOdds(Checked, ABC):
         cells : Cells
             The common refinement of the samples and the predictions, with the label of every cell in each of them.
         weights : (n,) ndarray
-            Weight of each prediction times the probability that it holds. What their sum lacks of 1 is the
-            probability that no prediction holds.
+            Weight of each prediction times the probability that it is valid. One minus the sum is the probability
+            that no prediction is valid.
         clip : Clip
-            Its last frame is the image.
+            The last frame of the clip is the image.
         """
 
 
 class PairTerms(NamedTuple):
-    """What each field of `PairEvidence` is multiplied by: arrays (e,), one number for each pair of cells."""
+    """The factor of each field of `PairEvidence`: arrays (e,) with one number for each pair of cells."""
 
     image_only_constant: np.ndarray  #: probability that no prediction holds
     image_only: np.ndarray  #: the same, times the logit of the share of samples
@@ -301,7 +301,7 @@ class PairTerms(NamedTuple):
 
 @dataclass(frozen=True)
 class PairEvidence(PairOdds):
-    """Log odds by the shares of the samples and of the predictions in which two cells belong to one object."""
+    """Log odds from the shares of the samples and of the predictions in which two cells belong to one object."""
 
     image_only_constant: float = -0.78
     image_only: float = 0.64
@@ -333,12 +333,12 @@ class _PairLabels(NamedTuple):
 
 
 def _labels_of_pairs(labels: np.ndarray, pairs: np.ndarray) -> _PairLabels:
-    """Of labels (n, K) of the cells, 0 is no object."""
+    """From labels (n, K) of the cells, in which 0 means no object."""
     a, b = (labels[:, cell] for cell in pairs.T)
     both = (a > 0) & (b > 0)
     return _PairLabels(both, both & (a == b))
 
 
 def softened_logit(p: np.ndarray) -> np.ndarray:
-    """Log odds of shares, which are softened by 2 %."""
+    """Log odds of shares that are softened by 2 %."""
     return np.log((p + _SOFT) / (1 - p + _SOFT))

@@ -3,9 +3,9 @@
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # a candidate for each predicted hypothesis
 
-It takes the place of section IV-D of the paper. There, a sample of the image and a prediction are two sets of voxels,
-which are crossed. Here, both are partitions of the depth readings of the last frame, and the voxels of an object are
-estimated anew from all that was seen of it.
+The update replaces section IV-D of the paper. In the paper, a sample of the image and a prediction are two sets of
+voxels, which are crossed. In this update, both are partitions of the depth readings of the last frame. The voxels of
+an object are estimated again from everything that was observed of it.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. The visible surface is tested, too: A_j is the share of it that the frame shows at its place.
@@ -28,8 +28,8 @@ estimated anew from all that was seen of it.
    Evidence is remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on. The exception
    are occluded objects without views, which a completer without memory makes: they keep what free space leaves.
 
-At the first pause the candidates are the samples: every segment is a new object. An object that no frame has shown is
-in no hypothesis.
+At the first pause the candidates are the samples, so every segment is a new object. Hypotheses have no objects that
+no frame has shown.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ from mstfilter.smc import Population, Systematic, Update, child
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A predicted hypothesis and what the last frame says about it."""
+    """A predicted hypothesis and its evidence in the last frame."""
 
     hypothesis: Hypothesis
     refined: Hypothesis  #: without the voxels that the frame observes as free
@@ -80,7 +80,7 @@ class Prediction:
         return {label: left[label] / n for label, n in self.hypothesis.volumes().items()}
 
     def remaining(self, record: ObjectRecord, threshold: float) -> Completion:
-        """What free space leaves of an object. Its voxels have at least the probability `threshold`."""
+        """The voxels of an object outside free space, with at least the probability `threshold`."""
         crop, left = self.hypothesis.crop(record.label), self.refined.shares.probability
         p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
         p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
@@ -104,25 +104,25 @@ class PartitionUpdate(Update):
     Parameters
     ----------
     completer : Completer
-        Completes the objects. That of the proposal is then of no use, and may be `SurfaceOnly`.
+        Completes the objects. The completer of the proposal is then not used, and may be `SurfaceOnly`.
     free_space : Projection
-        Gives the share Q of a prediction that the frame does not observe as free, and the voxels that are left.
+        Computes the share Q of a prediction that the frame does not observe as free, and the remaining voxels.
     pairs : PairOdds
         The log odds that two cells belong to one object.
     occupied_log_odds : float
-        Added to the log odds of every voxel that the completer is not certain about, since the network is calibrated
-        for its own training scenes. It was fitted in `experiments/partition_fit`.
+        Added to the log odds of every uncertain voxel, since the network is calibrated for its training scenes. The
+        value was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
-        Terms whose sum is the log weight of a candidate. Without them all candidates have equal weights, as they are
-        drawn from what they approximate.
+        Terms whose sum is the log weight of a candidate. Without terms, all candidates have equal weights, since they
+        are drawn from the distribution that they approximate.
     quality_exponent : float
         lambda, of Q, A and q. With 0 every prediction holds, and every occluded object stays.
     n_candidates : int
-        Candidates after the first pause; 0 means one for each predicted hypothesis, or four if there is evidence.
+        Number of candidates after the first pause. 0 means one for each predicted hypothesis, or four with evidence.
     reach : float
-        Voxels between a reading and the predicted object that explains it, at most.
+        Largest distance in voxels between a reading and the predicted object that explains it.
     n_views : int
-        Views that an object keeps, at most: the latest ones.
+        Number of latest views that an object keeps.
     threshold : float
         Smallest probability of an occupied voxel.
     mend : bool
@@ -150,7 +150,7 @@ class PartitionUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Candidates. Without a proposal, the predictions after free-space projection."""
+        """Candidates. Without a proposal, the result is the predictions after free-space projection."""
         check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
         check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
         clip = self._mended(observation)
@@ -215,7 +215,7 @@ class PartitionUpdate(Update):
         clip: Clip,
         n: int,
     ) -> np.ndarray:
-        """n partitions of the readings: the segment (n, m) of each reading, 0 is none."""
+        """n partitions of the readings: the segment (n, m) of each reading, where 0 means none."""
         cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
         weights = np.array([one.weight * one.holds for one in predictions])
         return cells.to_readings(cells.draw(rng, self.pairs.log_odds(cells, weights, clip), n))
@@ -236,7 +236,7 @@ class PartitionUpdate(Update):
         return visible + self._occluded(rng, prediction, overlaps)
 
     def _occluded(self, rng: np.random.Generator, prediction: Prediction, overlaps: Overlaps) -> list[SceneObject]:
-        """The occluded objects of a prediction that stay, each with probability (Q q)^lambda."""
+        """The occluded objects of a prediction that are kept, each with probability (Q q)^lambda."""
         q = prediction.shares_left()
         no_readings = np.zeros(len(prediction.objects), bool)
         return [
@@ -259,9 +259,9 @@ class PartitionUpdate(Update):
     def _completions(
         self, rng: np.random.Generator, objects: Sequence[SceneObject], readings: Readings, clip: Clip
     ) -> list[Completion]:
-        """Each object, completed from its readings and from the views of its tracks.
+        """Each object, completed from its readings and the views of its tracks.
 
-        An object without readings and views keeps what is left of its predicted voxels.
+        An object without readings and views keeps its predicted voxels outside free space.
         """
         completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
         views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
@@ -276,7 +276,7 @@ class PartitionUpdate(Update):
     def _hypothesis(
         self, objects: Sequence[SceneObject], completions: Sequence[Completion], clip: Clip
     ) -> Hypothesis:
-        """A candidate. An object whose voxels all belong to other objects is dropped."""
+        """A candidate. An object is dropped if all its voxels belong to other objects."""
         labels = arbitrate(completions, clip.grid, self.threshold)
         present = set(np.unique(labels).tolist())
         records = [
@@ -287,14 +287,14 @@ class PartitionUpdate(Update):
         return Hypothesis(labels, clip.grid, tuple(records), occupancy_of(completions, labels, clip.grid))
 
     def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
-        """The record of an object: that of the first object that it continues, or a new one."""
+        """The record of an object: the record of the first object that it continues, or a new record."""
         key, views = completion.key, self._latest(completion.views)
         if not one.tracks:
             return ObjectRecord.born(label, birth, key, views)
         return replace(one.tracks[0].changed(), label=label, completion_key=key, views=views)
 
     def _latest(self, *histories: tuple[ObjectView, ...]) -> tuple[ObjectView, ...]:
-        """The latest views of several objects, each with its oldest view first."""
+        """The latest views of several objects. For each object, the oldest view is first."""
         newest = (view for level in zip_longest(*map(reversed, histories)) for view in level if view is not None)
         return tuple(islice(newest, self.n_views))[::-1]
 
@@ -318,15 +318,15 @@ class PartitionUpdate(Update):
 
 
 def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
-    """The segment (m,) of each reading in each sample, 0 is none.
+    """The segment (m,) of each reading in each sample, where 0 means none.
 
-    A reading belongs to the segment of its voxel, or of the nearest within a voxel: at the borders of objects,
-    pixels of one object have readings of another.
+    A reading belongs to the segment of its voxel, or to the nearest segment within a voxel. At borders, some pixels
+    of one object have readings of another.
     """
     found = {id(h): readings.labels(h.labels, 1.0) for h in {id(h): h for h in proposed.particles}.values()}
     return [found[id(h)] for h in proposed.particles]
 
 
 def _new_objects(segments: np.ndarray) -> list[SceneObject]:
-    """The segments (m,) of a partition as objects that continue none."""
+    """The segments (m,) of a partition as new objects."""
     return [SceneObject(segments == k) for k in np.unique(segments[segments > 0])]

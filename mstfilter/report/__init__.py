@@ -5,8 +5,8 @@
 >>> export_run("runs/demo", "out", "obj")                            # doctest: +SKIP
 >>> write_study_report("studies/first")                              # doctest: +SKIP
 
-`overlay` and `voxel_picture` draw a hypothesis; `assign_identities` gives an object the same colour in all pictures
-of a run. Reports are made from folders alone and load no code of the user.
+`overlay` and `voxel_picture` draw a hypothesis. `assign_identities` gives an object the same colour in all pictures
+of a run. Reports are made from folders alone and load no user code.
 """
 
 from mstfilter.lazy import attach

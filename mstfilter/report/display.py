@@ -1,12 +1,12 @@
-"""Objects of the package in a notebook: facts and pictures, plots, a scene that can be rotated.
+"""Display of the package's objects in a notebook: facts and pictures, plots, a scene that can be rotated.
 
 >>> recording.plot()                        # images, depth and the time line of the pauses
 >>> hypothesis.show()                       # voxels that can be rotated with the mouse, also outside a notebook
 >>> hypothesis.show().save("scene.html")
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
 
-The classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods with these names, which import
-this module when they are called (`mstfilter.lazy.late`). Pages are self-contained: nothing is loaded from a network.
+The classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods with these names. The methods
+import this module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MOST_PICTURES = 6
 
 
 class Drawing(Figure):
-    """A matplotlib figure that a notebook shows as a picture, whether or not pyplot is used."""
+    """A matplotlib figure that a notebook shows as a picture, with or without pyplot."""
 
     def _repr_png_(self) -> bytes:
         import io
@@ -56,7 +56,7 @@ def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
 
 @matplotlib.style.context("mstfilter.report.figures")
 def plot_recording(recording: Recording) -> Drawing:
-    """Colour and depth at the pauses (at most six), and a time line of all frames with the pauses marked."""
+    """Colour and depth at the pauses (at most six), and a time line of all frames with marked pauses."""
     chosen = _evenly(range(len(recording.pauses)), _MOST_PICTURES)
     n = len(chosen)
     figure = Drawing(figsize=(max(4.5, 2.3 * n), 4.6), layout="constrained")
@@ -83,7 +83,7 @@ def plot_recording(recording: Recording) -> Drawing:
 
 @matplotlib.style.context("mstfilter.report.figures")
 def plot_population(population: Population) -> Drawing:
-    """Hypotheses: the heaviest six with their weights. Numbers: weighted histograms of the first coordinates."""
+    """Hypotheses: the six heaviest with their weights. Numbers: weighted histograms of the first coordinates."""
     population = population.realised()
     if isinstance(population.best, Hypothesis):
         return _plot_hypotheses(population)
@@ -119,7 +119,7 @@ def _plot_hypotheses(population: Population) -> Drawing:
 
 
 def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
-    """Pictures of the heaviest hypotheses, equal ones once, from one viewpoint; and texts with weight and objects."""
+    """Pictures of the heaviest distinct hypotheses from one viewpoint, and texts with weight and objects."""
     particles, groups = population.particles, weigh_distinct(population.particles, population.weights.tolist())
     weights = [weight for _, weight in groups[:_MOST_PICTURES]]
     shown = [particles[members[0]] for members, _ in groups[:_MOST_PICTURES]]

@@ -42,7 +42,7 @@ _CORNERS = {
 
 
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, not empty, and all other voxels.
+    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, which is not empty, and all other voxels.
 
     Returns corners (v, 3) int in voxels from the lower corner of the grid, and triangles (f, 3) int,
     counter-clockwise seen from outside.
@@ -64,8 +64,8 @@ def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
     """Write the mesh of a hypothesis that has objects, in world metres; `path` ends in ply or obj.
 
-    The triangles are the faces of the voxels; the mesh of an object encloses exactly the volume of its voxels.
-    `colours` is ``{label: (r, g, b)}``; by default the palette in order of labels. Raises MissingLibraryError if
+    The triangles are the faces of the voxels. The mesh of an object encloses exactly the volume of its voxels.
+    `colours` is ``{label: (r, g, b)}``. The default is the palette in order of labels. Raises MissingLibraryError if
     open3d cannot be imported.
     """
     path, o3d, grid = Path(path), import_open3d(), hypothesis.grid
@@ -85,7 +85,7 @@ def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, 
 
 
 def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply") -> list[Path]:
-    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, as laid out above.
+    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, in the layout above.
 
     Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
     imported. `mesh_format` is "ply" or "obj".

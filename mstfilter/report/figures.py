@@ -3,8 +3,8 @@
 >>> svg = quality_figure(times, qualities, weights, {"without past": [...]}, {"one blob": [...]})
 >>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
 
-Each function returns the text of an ``<svg>`` element that uses the colours and fonts of its page, so it follows a
-light or a dark theme. The same values give the same text.
+Each function returns the text of an ``<svg>`` element. The figure uses the colours and fonts of its page, so it
+follows a light or a dark theme. The same values give the same text.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _WIDEST = 10.0  # inches
 
 @contextmanager
 def _style(name: str) -> Iterator[None]:
-    """The style of the project; `name` makes the ids of the elements of a figure unique in a page."""
+    """The style of the project. `name` makes the ids of the elements of a figure unique in a page."""
     import matplotlib.style
 
     style = matplotlib.style.context("mstfilter.report.figures", after_reset=True)  # without the user's matplotlibrc
@@ -93,7 +93,7 @@ def _svg_text(figure: Figure, title: str) -> str:
 
 
 def _merge_styles(match: re.Match[str]) -> str:
-    """Write the common style of the marks of a group once, and their positions to a tenth of a point."""
+    """Write the common style of a group's marks once, and their positions to a tenth of a point."""
     styles = set(re.findall(r'style="([^"]*)"', match[2]))
     marks = re.sub(r'([xy]="-?\d+\.\d)\d+"', r'\1"', match[2])
     if len(styles) > 1 or "style=" in match[1]:
@@ -121,10 +121,10 @@ def quality_figure(
     compared: Mapping[str, Sequence[float]],
     baselines: Mapping[str, Sequence[float]],
 ) -> str:
-    """Quality of every hypothesis (points, area by weight), their mean (line), other filters and baselines (dashed).
+    """Quality of every hypothesis (points, area by weight), their mean (line), and other methods (dashed).
 
-    `times` are the pauses with ground truth. `qualities` and `weights` have one value per hypothesis for each of
-    them, `compared` and `baselines` one value per pause for each name; NaN for none.
+    `times` are the pauses with ground truth. `qualities` and `weights` have one value per hypothesis for each pause.
+    `compared` and `baselines` have one value per pause for each name. NaN means no value.
     """
     with _style("quality"):
         figure, (axes,) = _new_figure(6.6, 3.3)
@@ -149,7 +149,7 @@ _MOST, _GROUP = len(SERIES), 8  # arms in a single figure, and in each of severa
 
 
 def _arm_colours(arms: Sequence[str]) -> dict[str, str]:
-    """Colour of each arm; colours repeat after twelve."""
+    """Colour of each arm. Colours repeat after twelve arms."""
     return {arm: SERIES[k % len(SERIES)] for k, arm in enumerate(arms)}
 
 
@@ -168,13 +168,13 @@ def time_figure(
     measure: str = "quality",
     every_arm: Sequence[str] = (),
 ) -> str:
-    """Quality of all hypotheses, or another measure of the runs, over time, one panel per family.
+    """Quality of all hypotheses, or another measure of the runs, over time, with one panel per family.
 
-    `values` is family -> arm -> pause -> values: one of each scene and seed, or of each hypothesis. `arms` gives the
-    order of the boxes (see `figure_groups` for many arms); arms without values are left out. An arm of a study has
-    the same colour in all figures with the same `every_arm`, for at most twelve arms. Boxes contain the middle half
-    of the values, the bar is their median, whiskers reach the 5th and 95th percentile; points are values, lines join
-    the means.
+    `values` is family -> arm -> pause -> values. There is one value for each scene and seed, or for each hypothesis.
+    `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are omitted. An arm
+    of a study has the same colour in all figures with the same `every_arm`, for at most twelve arms. Boxes contain
+    the middle half of the values, the bar is their median, and whiskers reach the 5th and 95th percentile. Points are
+    values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)
@@ -211,7 +211,7 @@ def time_figure(
 
 
 def _columns(names: Iterable[str]) -> int:
-    """Columns of a legend that fit the narrowest figure."""
+    """Number of columns of a legend that fit the narrowest figure."""
     return max(1, min(4, 84 // (8 + max(len(name) for name in names))))
 
 
@@ -240,14 +240,14 @@ def _boxes(
 
 
 def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] = ()) -> str:
-    """Reliability diagram: how often two voxels belong to one object, given the forecast that they do.
+    """Reliability diagram of the forecasts that two voxels belong to one object.
 
     Parameters
     ----------
     tables : mapping
-        Name of a method or of a family -> its forecasts.
+        Mapping from names of methods or families to their forecasts.
     arms : sequence of str
-        Sets the colours. Default: the names.
+        Determines the colours. The default is the names.
     """
     colours = _arm_colours(arms or list(tables))
     with _style("reliability"):
@@ -272,8 +272,8 @@ def differences_figure(
 ) -> str:
     """Differences of arms from the reference in a measure with their t intervals, by family.
 
-    `differences` are (family, arm, arm minus reference). `arms` sets the colours. `side` says where the reference is
-    better, "left" or "right".
+    `differences` are (family, arm, arm minus reference). `arms` determines the colours. `side` states where the
+    reference is better, "left" or "right".
     """
     colours = _arm_colours(arms)
     rows = [(family, arm, (d.mean, d.low, d.high), colours[arm]) for family, arm, d in differences]
@@ -296,7 +296,7 @@ def forest_height(rows: Sequence[ForestRow]) -> float:
 
 
 def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
-    """Draw differences with their intervals below each other, under the names of their groups, if these are given."""
+    """Draw differences with their intervals below each other, under the names of their groups if these are given."""
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x")
     axes.axvline(0, color=_MUTED, lw=1.0)

@@ -5,9 +5,9 @@
 >>> identities.colours(t, k)                        # {label: (r, g, b)}
 
 Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
-From pause to pause, an object is matched by its stable id if its hypothesis has a known parent, else by its overlap
-with the last pause. The ground truth, if there is one, is matched first; its labels persist. Identities are used for
-colours only and change no number.
+From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. An object without a
+known parent is matched by its overlap with the last pause. If there is a ground truth, it is matched first, and its
+labels persist. Identities are used only for colours and change no number.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def heaviest(run: RunFolder, t: int) -> Hypothesis:
 
 
 def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[dict[int, Colour]]:
-    """Colours of the objects of each hypothesis about one pause; objects that match have the same colour."""
+    """Colours of the objects of each hypothesis at one pause. Matching objects have the same colour."""
     assignment = _Assignment()
     assignment.add(0, hypotheses, weights, None, None)
     found = Identities(assignment.table)
@@ -168,12 +168,12 @@ def _overlaps(labels: np.ndarray, image: np.ndarray, objects: list[int], n: int)
 
 
 def order_by_weight(weights: Sequence[float]) -> list[int]:
-    """Indices from the heaviest to the lightest; ties keep their order."""
+    """Indices from the heaviest to the lightest; equal weights keep their order."""
     return sorted(range(len(weights)), key=lambda k: -weights[k])
 
 
 def names_of(indices: Sequence[int]) -> str:
-    """``#0`` or ``#0, #3``, for hypotheses that are equal; at most four are named."""
+    """``#0`` or ``#0, #3`` for equal hypotheses. At most four are named."""
     more = len(indices) - 4
     return ", ".join(f"#{k}" for k in indices[:4]) + (f" and {more} more" if more > 0 else "")
 

@@ -22,7 +22,7 @@ _LONGEST = 6  # lists up to this length are written in full
 
 
 def fill_template(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
-    """Text of a template of this package with the style sheet; a missing variable is an error."""
+    """Text of a template of this package with the style sheet. A missing variable is an error."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     folder = files("mstfilter.report") / "templates"
@@ -55,7 +55,7 @@ def seconds_text(value: float) -> str:
 
 
 def flatten(value: Any, path: str = "") -> dict[str, Any]:
-    """Nested mappings as one, with keys joined by dots; empty mappings are left out."""
+    """Nested mappings as one mapping, with keys joined by dots. Empty mappings are omitted."""
     if not isinstance(value, Mapping):
         return {path or "value": value}
     rows: dict[str, Any] = {}
@@ -65,7 +65,7 @@ def flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def short_text(value: Any) -> str:
-    """A value as short text: four digits, long lists by their range."""
+    """A value as short text: four digits, and long lists by their range."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -96,7 +96,7 @@ def _list_text(values: Sequence[Any]) -> str:
 
 
 def note_rows(notes: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
-    """One row per key and one column per pause; empty text for a key that a pause lacks."""
+    """One row per key and one column per pause, with empty text if a pause lacks the key."""
     flat = [flatten(n) if n else {} for n in notes]
     keys = list(dict.fromkeys(key for rows in flat for key in rows))
     return [(key, [short_text(rows[key]) if key in rows else "" for rows in flat]) for key in keys]

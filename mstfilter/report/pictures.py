@@ -1,4 +1,4 @@
-"""Pictures of hypotheses: colours, overlays on the camera's image, voxels seen from an oblique viewpoint.
+"""Pictures of hypotheses: colours, overlays on the camera's image, and voxels from an oblique viewpoint.
 
 >>> picture = overlay(rgb, project(hypothesis, camera), {1: (51, 111, 185)})        # (H, W, 3) uint8
 >>> view = viewpoint(hypotheses, camera)
@@ -6,9 +6,9 @@
 >>> colour(0), colour(1)                                                            # of identities
 ((51, 111, 185), (238, 145, 56))
 
-The first six colours of the palette were chosen by hand. Each further one is the colour that is farthest from all
-earlier ones. The distance is the smallest Oklab distance in three views: normal vision, protanopia and deuteranopia
-(Machado, Oliveira, Fernandes 2009, severity 1).
+The first six colours of the palette were chosen by hand. Each further colour is the one that is farthest from all
+earlier colours. The distance is the smallest Oklab distance in three kinds of vision: normal, protanopia and
+deuteranopia (Machado, Oliveira, Fernandes 2009, severity 1).
 
 Voxels are rendered by ray casting. The brightness of a face depends on its normal. Lines are drawn where objects or
 faces meet.
@@ -42,7 +42,7 @@ _RAYS = 2  # per pixel and axis of a voxel picture
 
 
 def colour(identity: int) -> Colour:
-    """Colour of an identity 0, 1, 2, ...; the palette repeats after twenty. Grey for negative ones."""
+    """Colour of an identity 0, 1, 2, ..., where the palette repeats after twenty. Negative identities are grey."""
     return UNASSIGNED_COLOUR if identity < 0 else PALETTE[identity % len(PALETTE)]
 
 
@@ -52,7 +52,7 @@ def hexadecimal(rgb: Colour) -> str:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """PNG file of an RGB (H, W, 3) or RGBA (H, W, 4) uint8 image; the same pixels give the same bytes."""
+    """PNG file of an RGB (H, W, 3) or RGBA (H, W, 4) uint8 image. The same pixels give the same bytes."""
     import cv2
 
     order = [2, 1, 0, 3][: image.shape[2]]
@@ -83,10 +83,10 @@ def _label_colours(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndar
 def overlay_layer(
     labels: np.ndarray, colours: Mapping[int, Colour], *, scale: int = 1, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """The overlay of a label image without the image below: translucent fill, opaque contours.
+    """The overlay of a label image without the image: translucent fill and opaque contours.
 
-    `fill` is the opacity inside, `line` the width of the contour in pixels of the result: (scale H, scale W, 4)
-    uint8, RGBA, not premultiplied. Label 0 is transparent.
+    `fill` is the opacity inside, and `line` is the width of the contour in pixels of the result. The result is (scale
+    H, scale W, 4) uint8, RGBA, not premultiplied. Label 0 is transparent.
     """
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
@@ -107,7 +107,7 @@ def overlay_layer(
 def overlay(
     rgb: np.ndarray, labels: np.ndarray, colours: Mapping[int, Colour], *, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """An image (H, W, 3) with a label image (H, W) over it: translucent fill and contours.
+    """An image (H, W, 3) with a label image (H, W) drawn over it: translucent fill and contours.
 
     Inside objects the image is grey (luma of ITU-R BT.601), so that an object has the hue of its colour.
     """
@@ -119,7 +119,7 @@ def overlay(
 
 
 def _occupied_points(volumes: Iterable[_Volume]) -> tuple[np.ndarray, VoxelGrid]:
-    """Centres (n, 3) of all voxels that are occupied in a volume, and the last grid."""
+    """Centres (n, 3) of all occupied voxels in a volume, and the last grid."""
     occupied: dict[bytes, tuple[np.ndarray, VoxelGrid]] = {}
     for item in volumes:
         labels, grid = (item.labels, item.grid) if isinstance(item, Hypothesis) else item
@@ -131,7 +131,7 @@ def _occupied_points(volumes: Iterable[_Volume]) -> tuple[np.ndarray, VoxelGrid]
 def close_up(volumes: Iterable[_Volume], camera: Camera) -> tuple[float, float, float, float]:
     """Part of the image that shows all occupied voxels, with a margin: x, y, width, height in pixels.
 
-    It has the proportions of the image; without occupied voxels it is the whole image.
+    The part has the proportions of the image. Without occupied voxels the part is the whole image.
     """
     size = np.array([camera.width, camera.height], float)
     uv = camera.project(_occupied_points(volumes)[0])[0]
@@ -154,7 +154,7 @@ def viewpoint(
     """A camera that looks down obliquely at the occupied voxels of all volumes and shows all of them.
 
     A volume is a hypothesis or (labels, grid). If no voxel is occupied, the view shows the middle of the workspace.
-    The view is from the side of `camera`, if given, turned by 35 degrees.
+    If `camera` is given, the view is from its side, turned by 35 degrees.
     """
     points, grid = _occupied_points(volumes)
     if len(points) == 0:
@@ -183,7 +183,7 @@ def viewpoint(
 
 
 def voxel_picture(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour]) -> np.ndarray:
-    """Render voxels on the table plane as RGBA (view.height, view.width, 4) uint8; `view` as from `viewpoint`."""
+    """Render voxels on the table plane as RGBA (view.height, view.width, 4) uint8, with a `view` from `viewpoint`."""
     camera = view.scaled(_RAYS)
     seen = render(labels, grid, camera)
     hit = seen.labels > 0
@@ -220,7 +220,7 @@ def _view_axes(camera: Camera) -> np.ndarray:
 
 
 def _normals(points: np.ndarray, rays: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Signed axis (+-1, +-2, +-3) of the face that each ray meets: the axis with the nearest lattice plane."""
+    """Signed axis (+-1, +-2, +-3) of the face that each ray hits, the axis with the nearest lattice plane."""
     u = (points - grid.origin) / grid.voxel_size
     axis = np.abs(u - np.rint(u)).argmin(axis=1)
     return np.where(rays[np.arange(len(rays)), axis] > 0, -1, 1) * (axis + 1)

@@ -36,7 +36,7 @@ def _bars() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
-    """A progress bar; yields ``advance(done, total)``, where `total` is None if it is not known."""
+    """A progress bar. Yields ``advance(done, total)``, where `total` is None if it is unknown."""
     with _bars() as bars:
         task = bars.add_task(what, total=None)
 

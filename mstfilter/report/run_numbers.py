@@ -3,7 +3,7 @@
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
 >>> numbers.value_of_the_past, numbers.steps[-1].mean
 
-They are read from the run folder alone, of a finished or an interrupted run.
+The numbers are read from the run folder alone. The run may be finished or interrupted.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class PauseNumbers:
 
     @property
     def distinct_text(self) -> str:
-        """How many hypotheses are distinct, in words."""
+        """Number of distinct hypotheses, in words."""
         if self.n_distinct == len(self.weights):
             return "all distinct"
         return "all the same" if self.n_distinct == 1 else f"{self.n_distinct} distinct"
@@ -110,7 +110,7 @@ class PauseNumbers:
         return self.info["parents"].get(kind)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
-        """Notes of a component, without those that it only passed on from an earlier one."""
+        """Notes of a component, without those that it only passed on from an earlier component."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
         earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
         return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
@@ -142,22 +142,22 @@ class RunNumbers:
 
     @property
     def with_truth(self) -> list[int]:
-        """Pauses whose quality is known."""
+        """Pauses with known quality."""
         return [t for t, step in enumerate(self.steps) if step.quality is not None]
 
     @property
     def with_images(self) -> list[int]:
-        """Pauses whose quality is known in the image only."""
+        """Pauses with known quality in the image only."""
         return [t for t, step in enumerate(self.steps) if step.image_score is not None]
 
     @property
     def compared(self) -> list[str]:
-        """Names of the compared runs whose quality is known."""
+        """Names of the compared runs with known quality."""
         return list(dict.fromkeys(name for step in self.steps for name in step.compared))
 
     @property
     def value_of_the_past(self) -> list[str]:
-        """What the filter gains over the latest image alone, in a sentence; empty without such a run or truth."""
+        """The gain of the filter over the latest image alone, in a sentence; empty without such a run or truth."""
         name = "single frame"
         known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
         if not known:
@@ -177,7 +177,7 @@ class RunNumbers:
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
-    """Numbers of a run folder; without `beliefs`, the log losses are left out, which take the most time."""
+    """Numbers of a run folder. Without `beliefs`, the log losses are omitted, since they take the most time."""
     description = run.description
     times = description["recording"]["times"]
     steps = []

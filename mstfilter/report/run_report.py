@@ -3,9 +3,9 @@
 >>> write_report("runs/demo")                     # runs/demo/report.html
 >>> write_report("runs/demo", "demo.html")
 
-The report is made from the run folder alone, of a finished or an interrupted run, and loads no code of the user.
-Pictures are embedded, figures are inline SVG, there are no links. The only script turns the three-dimensional view,
-in a frame that cannot reach the rest of the page. The same run gives the same bytes, except for the times of steps.
+The report is made from the folder of a finished or an interrupted run, and loads no user code. Pictures are embedded,
+figures are inline SVG, and there are no links. The only script rotates the three-dimensional view, in a frame that
+cannot access the rest of the page. The same run gives the same bytes, except for the times of steps.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from mstfilter.scoring import (
 def write_report(
     run: RunFolder | str | Path, out: str | Path | None = None, numbers: RunNumbers | None = None
 ) -> Path:
-    """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
+    """Write the report of a run, finished or not, as HTML. Default: By default, ``report.html`` in the run folder.
 
-    `numbers` are those of `read_numbers`, if they are known already.
-    Returns the file. Raises InputError if the folder is no run folder, or the file cannot be written.
+    `numbers` are those of `read_numbers`, if they are already known. Returns the file. Raises InputError if the
+    folder is not a run folder, or the file cannot be written.
     """
     from markupsafe import Markup
 
@@ -67,7 +67,7 @@ def write_report(
 
 
 def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
-    """Photo and cards of each pause."""
+    """Image and cards of each pause."""
     scenes = scenes_of_run(run) if numbers.steps else []
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None
@@ -108,7 +108,7 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
-    """Numbers at the widest place of each object that is large enough in the image, in pixels; large ones first."""
+    """Numbers at the widest place (in pixels) of each object that is large enough in the image, large ones first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
     min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]

@@ -4,7 +4,7 @@
 >>> view = scenes[-1].views[0]                        # the heaviest hypothesis of the last pause
 >>> view.name, view.weight, view.overlay(scenes[-1].camera, 1, 2)
 
-Each hypothesis comes with its name, its weight and quality, and the colours of its objects (`report.identities`).
+Each hypothesis has its name, its weight and quality, and the colours of its objects (`report.identities`).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class ShownHypothesis:
 
 @dataclass(frozen=True)
 class ShownPause:
-    """What is shown at a pause."""
+    """The content of a pause."""
 
     name: str
     views: Sequence[ShownHypothesis]
@@ -71,7 +71,7 @@ class ShownPause:
 
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
-    """The pauses of a run: distinct hypotheses from heavy to light (at most twelve), then the truth."""
+    """The pauses of a run: at most twelve distinct hypotheses from heavy to light, then the truth."""
     identities, times = assign_identities(run), run.description["recording"]["times"]
     scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}
@@ -110,7 +110,7 @@ def _others(run: RunFolder, t: int, identities: Identities) -> list[ShownHypothe
 
 
 def scenes_of_recording(recording: Recording) -> list[ShownPause]:
-    """The pauses of a recording with the truth; without it with the surface that the camera sees."""
+    """The pauses of a recording with the truth, or else with the surface that the camera sees."""
     scenes = []
     for t, clip in enumerate(recording.clips()):
         truth, frame = recording.truth(t), clip.after
@@ -124,7 +124,7 @@ def scenes_of_recording(recording: Recording) -> list[ShownPause]:
 
 
 def _surface(frame: Frame, grid: VoxelGrid) -> ShownHypothesis:
-    """Voxels that contain a measured point, in its colour, rounded to six levels a channel."""
+    """Voxels that contain a measured point, in the colour of this point, rounded to six levels per channel."""
     points, rgb = frame.points[frame.valid], frame.rgb[frame.valid]
     index = grid.index_of(points)
     inside = grid.contains(index)

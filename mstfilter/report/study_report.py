@@ -2,8 +2,8 @@
 
 >>> write_study_report("studies/first")                     # studies/first/report.html
 
-The report is made from the study folder alone, of a finished or an unfinished study, and runs no code of the user.
-Conclusions are sentences that state no more than the intervals show.
+The report is made from the folder of a finished or an unfinished study, and runs no user code. Conclusions are
+sentences that state no more than the intervals show.
 """
 
 from __future__ import annotations
@@ -59,9 +59,11 @@ _TABLES = {
 
 
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a study folder, finished or not, as HTML. Default: ``report.html`` in the study folder.
+    """Write the report of a study folder, finished or not, as HTML.
 
-    Returns the file. Raises InputError if the folder is no study folder, or the file cannot be written.
+    Default: By default, ``report.html`` in the study folder.
+
+    Returns the file. Raises InputError if the folder is not a study folder, or the file cannot be written.
     """
     study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
     path = study.path / "report.html" if out is None else Path(out)
@@ -112,7 +114,7 @@ def _page(study: StudyFolder) -> str:
 
 
 def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
-    """A reliability diagram of each family, of all arms that take part in comparisons."""
+    """A reliability diagram of each family, with all arms that take part in comparisons."""
     from markupsafe import Markup
 
     figures = []

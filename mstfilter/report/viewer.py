@@ -28,7 +28,7 @@ from mstfilter.scene import Hypothesis, Recording, occupied_box
 
 @dataclass(frozen=True)
 class ScenePage:
-    """A page with scenes that can be rotated; a notebook shows it in place."""
+    """A page with scenes that can be rotated. A notebook shows the page in place."""
 
     text: str  #: HTML, self-contained
     title: str
@@ -40,7 +40,7 @@ class ScenePage:
         return self.frame(460)
 
     def frame(self, height: int) -> str:
-        """The page as a frame of another page, `height` pixels high. Its script cannot reach that page."""
+        """The page as a frame of another page, `height` pixels high, whose script cannot access the other page."""
         style = f'width="100%" height="{height}" style="border:0" sandbox="allow-scripts"'
         return f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.text)}" {style}></iframe>'
 
@@ -60,7 +60,7 @@ def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
 
 
 def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
-    """All pauses of a run as a page; without `photos` voxels only, without `head` no title."""
+    """All pauses of a run as a page; without `photos` only voxels, without `head` no title."""
     run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     description = run.description
     title = str(description["recording"]["name"])
@@ -100,7 +100,7 @@ def _page(
 
 
 def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
-    """A pause for the script of the page. Labels are runs (label, length) of the occupied box, 16 bits each."""
+    """A pause for the script of the page. Labels are runs (label, length) of the occupied box, with 16 bits each."""
     views = []
     for view in scene.views:
         hypothesis = view.hypothesis
@@ -135,7 +135,7 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
 
 
 def encode_runs(labels: np.ndarray) -> np.ndarray:
-    """Runs of equal labels in C order as rows (label, length), 16 bits each; long runs are split."""
+    """Runs of equal labels in C order as rows (label, length), with 16 bits each. Long runs are split."""
     flat = labels.ravel()
     if not len(flat):
         return np.zeros((0, 2), "<u2")

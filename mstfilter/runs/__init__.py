@@ -1,4 +1,4 @@
-"""One run: a recording is opened, filtered, and kept in a folder.
+"""One run: a recording is opened, filtered, and stored in a folder.
 
 >>> from mstfilter.presets import load_config
 >>> from mstfilter.runs import filter_recording
@@ -8,8 +8,8 @@
 >>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
 >>> rows = score_pauses(run.estimates(), read_truth(recording))
 
-The same call resumes a run that was stopped, from ``pauses/NNN/state.npz`` of the last complete pause, with the
-result of an uninterrupted run. Modules: `run` (loop), `run_folder` (files).
+The same call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. The result of a
+resumed run is that of an uninterrupted run. Modules: The module `run` has the loop, and `run_folder` the files.
 """
 
 from mstfilter.lazy import attach

@@ -2,8 +2,8 @@
 
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
-All input is checked before the folder is made. A run that was stopped is resumed by the same call with the same
-configuration, seed and recording; its result equals that of an uninterrupted run.
+All input is checked before the folder is made. An interrupted run is resumed by the same call with the same
+configuration, seed and recording. The result equals that of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Configurations of the filters that a run is compared with. Their samples get the completer of the filter."""
+    """Configurations of the filters with which a run is compared. They keep the completer of the filter."""
     parts = (config.get(slot) or {} for slot in ("proposal", "update"))
     proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
     proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
@@ -60,13 +60,13 @@ def filter_recording(
     ----------
     recording : Recording
     config : mapping
-        A configuration as `mstfilter.presets.load_config` returns it.
+        A configuration from `mstfilter.presets.load_config`.
     path : Path
-        The run folder: new, empty, or of the same run that was stopped.
+        The run folder. The folder must be new, empty, or of the same interrupted run.
     seed : int
         Seed of all random streams.
     replace : bool
-        Whether an earlier run in the folder is removed, as soon as the first step has succeeded.
+        Whether to remove an earlier run in the folder, as soon as the first step has succeeded.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     progress : bool or callable
@@ -122,7 +122,7 @@ def filter_recording(
 
 
 def _describe(recording: Recording, config: Mapping[str, Any], filter: ParticleFilter, seed: int) -> dict[str, Any]:
-    """The content of run.json but for its format and status."""
+    """The content of run.json except its format and status."""
     description: dict[str, Any] = as_json(
         {
             "seed": seed,
@@ -146,7 +146,7 @@ def _describe(recording: Recording, config: Mapping[str, Any], filter: ParticleF
 
 
 def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> RunFolder | None:
-    """The folder of the same run, to be resumed; None if there is none yet, or another that can be replaced."""
+    """The folder of the same run, to be resumed; None if it does not exist yet, or can be replaced."""
     check_run_folder(path, replace)
     if replace or not (path / "run.json").is_file():
         return None
@@ -166,7 +166,7 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
 
 
 def _warn_of_another_machine(folder: RunFolder, now: dict[str, Any]) -> None:
-    """Warn if the run was begun on another kind of machine; the number of threads changes no result."""
+    """Warn if the run was started on another kind of machine. The number of threads changes no result."""
     found = {key: value for key, value in folder.description["machine"].items() if key != "threads"}
     wanted = {key: value for key, value in now.items() if key != "threads"}
     if found != wanted:
@@ -178,7 +178,7 @@ def _warn_of_another_machine(folder: RunFolder, now: dict[str, Any]) -> None:
 def check_run_folder(path: Path, replace: bool = False) -> None:
     """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there.
 
-    With `replace`, a run folder must not contain files that no run writes.
+    With `replace`, a run folder must not contain files that are not part of a run.
     """
     if not os.path.isfile(path / "run.json"):  # False for a name that is too long, where Path.is_file raises
         check_output(path, folder=True)
@@ -198,7 +198,7 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 
 def component_files(component: Any) -> dict[str, str]:
-    """Hashes of what a component and its parts read: source files of the user, trained weights, other files."""
+    """Hashes of files that a component and its parts read: source files of the user, weights, other files."""
     found: defaultdict[str, str] = defaultdict(str)
     for part in nested_components(component):
         name, source = type(part).__name__, type(part).__dict__
@@ -214,7 +214,7 @@ def component_files(component: Any) -> dict[str, str]:
 
 
 def library_versions() -> dict[str, str]:
-    """Versions of the libraries that results depend on."""
+    """Versions of the libraries on which results depend."""
     found = {"mstfilter": mstfilter.__version__, "python": platform.python_version()}
     for name in _LIBRARIES:
         try:
@@ -230,7 +230,7 @@ def code_version() -> str:
 
 
 def _hash_of(path: Path, pattern: str = "*") -> str:
-    """A hash of a file, or of the names and contents of the files below a folder that fit a pattern."""
+    """A hash of a file, or of the names and contents of the files below a folder that match a pattern."""
     digest = hashlib.sha256()
     for file in sorted(path.rglob(pattern)) if path.is_dir() else [path]:
         if file.is_file():

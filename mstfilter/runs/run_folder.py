@@ -1,4 +1,4 @@
-"""The folder of a run, written pause by pause. Reports read it, and a run that was stopped resumes from it.
+"""The folder of a run, written pause by pause. Reports read this folder, and an interrupted run resumes from it.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
@@ -105,7 +105,7 @@ class _RecordingEntry(BaseModel):
 
 
 class _RunFile(BaseModel):
-    """What readers use of run.json."""
+    """The parts of run.json that readers use."""
 
     format: Literal[2]
     status: str
@@ -119,7 +119,7 @@ class _RunFile(BaseModel):
 
 
 class _InfoFile(BaseModel):
-    """What readers use of info.json."""
+    """The parts of info.json that readers use."""
 
     t: int
     n: int
@@ -174,7 +174,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
-        """A new run folder that holds only its description."""
+        """A new run folder that contains only its description."""
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
@@ -187,7 +187,7 @@ class RunFolder:
         return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
 
     def check(self) -> RunFolder:
-        """Read every file of the run and of those that it is compared with, before work with them starts.
+        """Read every file of the run and of its comparison runs, before work with them starts.
 
         Raises InputError if a file is missing or damaged, or files of a pause do not belong together.
         """
@@ -254,7 +254,7 @@ class RunFolder:
         questions: Questions | None = None,
         instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, and of the pause, if known: true labels, questions, true label image.
+        """Write the results of a step, and of the pause if known: true labels, questions, true label image.
 
         An interrupted call writes nothing.
         """
@@ -282,7 +282,7 @@ class RunFolder:
             write_json(folder / "seconds.json", info.seconds)
 
     def check_replaceable(self) -> None:
-        """Raise InputError if the folder contains files that no run writes."""
+        """Raise InputError if the folder contains files that are not part of a run."""
         if others := other_files(self.path, RUN_FILES):
             raise InputError(
                 f"run folder {self.path} cannot be replaced: it holds {others[0]}, which is not of a run",
@@ -297,7 +297,7 @@ class RunFolder:
         return found
 
     def repair(self) -> None:
-        """Prepare the folder for resuming: remove what a killed process left, and damaged pauses with a warning.
+        """Prepare the folder for resuming. Remove remains of a killed process, and damaged pauses with a warning.
 
         All pauses after a damaged one are removed.
         """
@@ -323,7 +323,7 @@ class RunFolder:
         return self._read(self.pause(t) / "seconds.json", _SecondsFile)
 
     def instance(self, t: int) -> np.ndarray | None:
-        """True label image (H, W) at a pause, 255 for the robot; None if it is not known."""
+        """True label image (H, W) at a pause, with 255 for the robot; None if unknown."""
         path = self.pause(t) / "instance.png"
         return read_labels(path) if path.is_file() else None
 
@@ -367,7 +367,7 @@ class RunFolder:
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed.
 
-        It is kept in `scene_cache`: a report asks for it many times.
+        The state is kept in `scene_cache`, since a report uses it many times.
         """
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"):

@@ -17,14 +17,14 @@ import numpy as np
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
-    """A read-only view of an array (the data are shared, not copied)."""
+    """A read-only view of an array that shares its data."""
     view = array.view()
     view.flags.writeable = False
     return view
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array whose memory no other array can change: a copy, unless its memory is read-only already."""
+    """A read-only array whose memory no other array can change, copied if necessary."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
@@ -36,10 +36,10 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def component_key(component: object) -> bytes:
-    """Key of a component: its class, its file or code if it is the user's, and its fields, arrays included.
+    """Key of a component: its class, its fields including arrays, and, for a class of the user, its file or code.
 
-    If a component has a ``bound_key`` (the ground truth of a recording, for oracles), the key includes it. Torch
-    modules are known by their weights, other fields by their pickled content.
+    If a component has a ``bound_key`` (for oracles, the ground truth of a recording), the key includes it. Torch
+    modules are identified by their weights, other fields by their pickled content.
     """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)
@@ -61,7 +61,7 @@ def component_key(component: object) -> bytes:
 
 
 def _code(cls: type) -> str:
-    """The code of the methods of a class of the user, which can change while its name stays the same."""
+    """The code of the methods of a user's class, which can change under the same name."""
     own = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")]
     values = [value for base in own for value in vars(base).values()]
     inner = [getattr(v, "fget", None) or getattr(v, "func", None) or getattr(v, "__func__", v) for v in values]
@@ -70,7 +70,7 @@ def _code(cls: type) -> str:
 
 
 def _text(constant: Any) -> str:
-    """A constant of compiled code, or code itself without its place, as text."""
+    """A constant of compiled code, or code without its file and line, as text."""
     if isinstance(constant, CodeType):
         return repr((constant.co_code, constant.co_names)) + "".join(_text(part) for part in constant.co_consts)
     return repr(sorted(map(repr, constant)) if isinstance(constant, frozenset) else constant)

@@ -1,8 +1,8 @@
-"""Cache of intermediate results, found by the content of their input.
+"""Cache of intermediate results, identified by the content of their input.
 
-The boundary map of a frame, the flow between two frames or the pixel of every voxel depend on the data alone, not on
-the hypothesis that needs them. `memo` stores such results. All hypotheses of a step share them, and so does a
-repeated run on the same data in one process.
+Some results depend only on the data and not on the hypothesis. Examples are the boundary map of a frame and the flow
+between two frames. `memo` stores results of this kind. All hypotheses of a step share them. A second run on the same
+data in one process uses them too.
 
 >>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)
@@ -11,7 +11,7 @@ repeated run on the same data in one process.
 9
 >>> scene_cache.clear()
 
-`scene_cache` is the only global state of the package. It changes how long a run takes, never its results.
+`scene_cache` is the only global state of the package. The cache changes the duration of a run but never its results.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _Value = TypeVar("_Value")
 
 
 class Cache:
-    """Values in memory, found by name and key; safe to use from several threads.
+    """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    Beyond `limit_bytes` in total, the least recently used values are dropped. The counter `hits` has for each name
-    how often values were found, in memory or on disk.
+    If the total exceeds `limit_bytes`, the least recently used values are dropped. The counter `hits` counts by name
+    how often values were found in memory or on disk.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
@@ -50,13 +50,13 @@ class Cache:
     def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
         """The value of ``compute()``, computed if it is not in the cache.
 
-        `name` says what is computed, `key` has content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and every
-        parameter that matters. Together they determine the value completely, so `compute` draws no random numbers.
-        The value must not be changed afterwards.
+        `name` states what is computed. `key` contains content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and
+        every parameter that affects the value. Name and key together determine the value completely, so `compute`
+        must not draw random numbers. The value must not be changed afterwards.
 
-        `stored_as` is the type of a value that is also stored on disk (see `on_disk`). It is an array, a dataclass
-        whose fields are arrays, strings or None, or a tuple of these. Only for values that take much longer to
-        compute than to read.
+        If `stored_as` is a type, the value is also stored on disk (see `on_disk`). The type is an array, a dataclass
+        whose fields are arrays, strings or None, or a tuple of these. Use `stored_as` only for values that take much
+        longer to compute than to read.
         """
         return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
 
@@ -67,7 +67,7 @@ class Cache:
         compute: Callable[[Sequence[int]], Sequence[_Value]],
         stored_as: Any = None,
     ) -> list[_Value]:
-        """The values of several keys; ``compute(indices)`` gives those that are missing, together."""
+        """The values of several keys. ``compute(indices)`` computes all missing values together."""
         found: dict[Hashable, _Value] = {}
         missing: dict[Hashable, int] = {}
         disk = self._disk if stored_as is not None else None
@@ -108,7 +108,7 @@ class Cache:
                 self._n_bytes -= dropped
 
     def clear(self) -> None:
-        """Drop all values in memory and the counts of hits."""
+        """Drop all values in memory and reset the counts of hits."""
         with self._lock:
             self._entries.clear()
             self.hits.clear()
@@ -118,7 +118,7 @@ class Cache:
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
         """Also store values with `stored_as` in a folder that several processes share (see `DiskCache`).
 
-        `limit_bytes` is the largest size of the folder. Values of another `version` of the code are not found.
+        `limit_bytes` is the largest size of the folder. Values from another `version` of the code are not found.
         """
         from mstfilter.scene.disk_cache import DiskCache
 
@@ -141,12 +141,12 @@ def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any
 def memo_many(
     name: str, keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Sequence[_Value]], stored_as: Any = None
 ) -> list[_Value]:
-    """The values of several keys; ``compute(indices)`` gives those that are missing. See `Cache.get_many`."""
+    """The values of several keys; ``compute(indices)`` computes the missing values. See `Cache.get_many`."""
     return scene_cache.get_many(name, keys, compute, stored_as)
 
 
 def _size_of(value: Any) -> int:
-    """Bytes of the arrays inside a value; containers and dataclasses are followed."""
+    """Bytes of the arrays inside a value, including those in containers and dataclasses."""
     if isinstance(value, np.ndarray):
         return value.nbytes + 128
     if isinstance(value, dict):

@@ -6,8 +6,8 @@
 >>> camera.project(np.array([0.0, 0.0, 1.0]))[0]
 array([319.5, 239.5])
 
-Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) = (column, row) with (0, 0) at the centre of the
-first pixel. If a camera has no pose (`T_world_camera=None`), its own axes are the world axes.
+Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) = (column, row) with (0, 0) at the centre of the first
+pixel. If a camera has no pose (`T_world_camera=None`), the world axes are its axes.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Camera:
         return self._ray_grid
 
     def unproject(self, depth: np.ndarray) -> np.ndarray:
-        """World points (H, W, 3) in metres of a z-depth image (H, W) in metres; NaN where depth is NaN."""
+        """World points (H, W, 3) in metres from a z-depth image (H, W) in metres; NaN where depth is NaN."""
         if depth.shape != (self.height, self.width):
             raise InputError(
                 f"depth image is {depth.shape[1]} x {depth.shape[0]}, the camera is {self.width} x {self.height}"
@@ -137,7 +137,7 @@ class Camera:
         Returns
         -------
         uv : (..., 2) array
-            Pixels (column, row); NaN for points that are not in front of the camera.
+            Pixels (column, row), with NaN for points that are not in front of the camera.
         z : (...) array
             z-depth in metres.
         """
@@ -153,7 +153,7 @@ class Camera:
         return np.stack([u, v], axis=-1), z
 
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Column, row and z-depth (...) of world points (..., 3), and whether their pixels are in the image.
+        """Column, row and z-depth (...) of world points (..., 3), and whether each pixel is in the image.
 
         Column and row are int64, 0 outside the image.
         """
@@ -164,7 +164,7 @@ class Camera:
         return u, v, z, inside
 
     def scaled(self, factor: float) -> Camera:
-        """The camera of the same image resized by `factor` (pixel centres stay where they are)."""
+        """The camera of the same image resized by `factor` (pixel centres keep their positions)."""
         width, height = round(self.width * factor), round(self.height * factor)
         K = self.K.copy()
         K[:2, :2] *= factor
@@ -191,7 +191,7 @@ def scaled_area(pixels: float, n_pixels: int) -> float:
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
-    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), `up` at the image's top."""
+    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m); `up` is at the image's top."""
     position = np.asarray(position, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - position
     forward /= np.linalg.norm(forward)
@@ -206,7 +206,7 @@ def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, fl
 def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform:
     """A RigidTransform from a 4x4 matrix.
 
-    Raises InputError if the matrix has scale or shear; scipy would orthogonalise it without an error.
+    Raises InputError if the matrix has scale or shear, because scipy would orthogonalise it without an error.
     """
     try:
         matrix = np.asarray(matrix, dtype=np.float64)

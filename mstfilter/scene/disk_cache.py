@@ -3,9 +3,8 @@
 >>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
 ...     run()                                    # values with `stored_as` are stored, and found again
 
-`stored_as` is an argument of `mstfilter.scene.memo`. diskcache keeps the entries and removes the least recently used
-ones beyond the limit. An entry holds the bytes of an .npz file. Nothing is pickled, and nothing that the folder holds
-is unpickled.
+The argument `stored_as` of `mstfilter.scene.memo` selects these values. diskcache stores the entries and removes the
+least recently used ones beyond the limit. An entry is the bytes of an .npz file. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _FILE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{2}/[0-9a-f]{28}\.val".replace("/", re.
 
 
 class _BytesDisk(diskcache.Disk):
-    """Storage of bytes under bytes. diskcache's own class unpickles what it finds."""
+    """Storage of bytes under bytes. The class of diskcache itself would unpickle stored values."""
 
     def put(self, key: bytes) -> tuple[Any, bool]:
         return sqlite3.Binary(key), True
@@ -60,21 +59,21 @@ class _BytesDisk(diskcache.Disk):
             super().remove(file_path)
 
     def _check_file(self, name: Any) -> None:
-        """Raise ValueError unless a name of the data base is that of a file that diskcache makes in the folder."""
+        """Raise ValueError unless a name in the data base is that of a file that diskcache makes in the folder."""
         inside = Path(self._directory).resolve() / str(name)
         if not _FILE.fullmatch(str(name)) or inside.parent.resolve() != inside.parent:
             raise ValueError(f"entry has the file {name!r}")
 
 
 class DiskCache:
-    """Values in a folder, which is made if it does not exist. `version` is part of the key of every entry.
+    """Values in a folder, which is created if necessary. `version` is part of the key of every entry.
 
-    Several processes may use the folder at the same time. An entry that cannot be read counts as missing. If the
-    folder cannot be written, the disk is full or another process keeps the folder locked, nothing is stored and no
-    error is raised. A locked folder is reported by an InputWarning.
+    Several processes may use the folder at the same time. An entry that cannot be read is treated as missing. Nothing
+    is stored, and no error is raised, if the folder cannot be written, the disk is full, or another process locks the
+    folder. A locked folder is reported by an InputWarning.
 
-    A new folder is for this user only. Raises InputError if the folder belongs to somebody else or others may write
-    into it: its entries become results.
+    A new folder is accessible to this user only. Raises InputError if the folder belongs to another user or is
+    writable by others, since its entries are used as results.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int, version: str) -> None:
@@ -102,7 +101,7 @@ class DiskCache:
             self._entries = None
 
     def _can_lock(self) -> bool:
-        """Whether the data base can be written now; diskcache itself waits for a minute."""
+        """Whether the data base can be written now. diskcache itself would wait for a minute."""
         with contextlib.closing(sqlite3.connect(self.folder / "cache.db", timeout=_LOCK_S)) as probe:
             try:
                 probe.execute("BEGIN IMMEDIATE")
@@ -115,13 +114,13 @@ class DiskCache:
         return True
 
     def _give_up(self) -> None:
-        """Use the folder no longer: every further entry would wait again."""
+        """Stop using the folder, since every further entry would wait again."""
         self._entries = None
         message = f"the cache {self.folder} is locked by another process for more than {_LOCK_S} s"
         warnings.warn(InputWarning(message, "this process continues without it"), stacklevel=4)
 
     def find(self, name: str, key: Hashable, stored_as: Any) -> Any:
-        """The value of an entry, its arrays read-only; None if there is none that can be read."""
+        """The value of an entry with read-only arrays, or None if no readable entry exists."""
         if self._entries is None:
             return None
         try:
@@ -138,7 +137,7 @@ class DiskCache:
             return None
 
     def store(self, name: str, key: Hashable, value: Any) -> None:
-        """Write an entry, if that is possible."""
+        """Write an entry if possible."""
         if self._entries is None:
             return
         data = io.BytesIO()
@@ -162,7 +161,7 @@ class DiskCache:
 
 
 def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
-    """Arrays of a value by their path in it: ``0.labels`` is field `labels` of the first item of a tuple."""
+    """Arrays of a value, named by their path in it: ``0.labels`` is field `labels` of the first item of a tuple."""
     if value is None:
         return {}
     if isinstance(value, np.ndarray):
@@ -177,7 +176,7 @@ def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
 
 
 def _unpack(of: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
-    """The value of type `of` from the arrays of `_pack`."""
+    """The value of type `of`, rebuilt from the arrays of `_pack`."""
     if isinstance(of, tuple):
         return tuple(_unpack(part, arrays, _joined(path, str(k))) for k, part in enumerate(of))
     if is_dataclass(of):

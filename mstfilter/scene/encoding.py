@@ -19,13 +19,13 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     """Hypotheses on one grid as named arrays.
 
     The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and one row per object:
-    ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``.
-    The source crops are stored as ``has_source``, ``source_offset`` (3,),
-    ``source_shape`` (3,) and ``source_bits``, the packed bits of all crops in order.
+    ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``. The
+    crops of the sources are ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and ``source_bits``, the
+    packed bits of all crops in order.
 
-    If a hypothesis is not certain, ``voxel_owner`` and ``probability`` (n, X, Y, Z) are its occupancy, and
-    ``source_probability`` has the probabilities of all crops in order. Views of objects are one row each:
-    ``view_of`` (the row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4), ``view_key``;
+    For a hypothesis with probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
+    ``source_probability`` has the probabilities of all crops in order. Views of objects have one row each:
+    ``view_of`` (the row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4), ``view_key``.
     ``view_bits`` and ``view_signed`` have the values of all views in order.
     """
     grid = hypotheses[0].grid
@@ -85,7 +85,7 @@ def _joined(arrays: Sequence[np.ndarray], dtype: type) -> np.ndarray:
 
 
 class _Reader:
-    """Arrays one after the other from their joined values."""
+    """Splits joined values into consecutive arrays."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.values, self.at = values, 0
@@ -96,7 +96,7 @@ class _Reader:
 
 
 def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...]:
-    """Hypotheses from the arrays of `encode_hypotheses`."""
+    """Hypotheses, rebuilt from the arrays of `encode_hypotheses`."""
     labels = arrays["labels"]
     grid = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), labels.shape[1:])
     records: list[list[ObjectRecord]] = [[] for _ in labels]
@@ -134,7 +134,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
 
 
 def _decode_views(arrays: Mapping[str, np.ndarray]) -> dict[int, list[ObjectView]]:
-    """Row of an object -> its views."""
+    """The views of each object, by its row."""
     found: dict[int, list[ObjectView]] = {}
     if "view_of" in arrays:
         bits, signed = _Reader(arrays["view_bits"]), _Reader(arrays["view_signed"])

@@ -1,4 +1,4 @@
-"""What a frame says about hypotheses: the space that it observes as free, and scores.
+"""Evidence about hypotheses in one frame: the space that it observes as free, and scores.
 
 >>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
 >>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
@@ -6,7 +6,7 @@
 
 Free-space projection is the first step of the measurement update (paper, section IV-D). The quality of a prediction
 is Q = 1 - (occupied voxels that are cleared) / (occupied voxels). An update adds lambda log Q to its log weight;
-lambda is `quality_exponent`. So a prediction with objects in free space loses voxels and weight.
+lambda is `quality_exponent`. So a prediction with objects in free space loses voxels, and its weight decreases.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Projection(Checked, ABC):
 
     @returns(_check_refined)
     def refine(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-        """Project hypotheses about the end of a clip onto its last frame; also returns the shares of voxels (n,)."""
+        """Project hypotheses onto the last frame of a clip, and return the shares of voxels (n,) that they keep."""
         pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
@@ -77,22 +77,22 @@ class NoFreeSpace(Projection):
 class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
-    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. One is
-    for the extent of the voxel, the other for the noise of the sensor at that range (`mstfilter.scene.depth_sigma`).
-    Voxels without a measurement (no reading, the robot, outside the image, behind a surface) are unknown and stay. A
-    voxel with a measured point inside stays.
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The first
+    margin is for the extent of the voxel. The second margin is for the sensor noise at this range
+    (`mstfilter.scene.depth_sigma`). Voxels without a measurement (no reading, the robot, outside the image, behind a
+    surface) are unknown and are kept. A voxel with a measured point inside is kept.
 
-    With several cameras (`Frame.views`) a voxel is free if one of them observes it as free and none has a measured
-    point in it.
+    With several cameras (`Frame.views`), a voxel is free if at least one camera observes it as free and no camera has
+    a measured point in it.
 
     Parameters
     ----------
     margin_voxels : float
         Margin for the extent of a voxel, in voxels.
     margin_sigmas : float
-        Margin for the noise, in standard deviations of a depth reading at that range.
+        Margin for the noise, in standard deviations of a depth reading at this range.
     table_height : float
-        Voxels with centres below this height (metres above the table) are cleared as well, whatever was measured.
+        Voxels with centres below this height (metres above the table) are always cleared.
     """
 
     margin_voxels: NonNegativeFloat = 0.5
@@ -121,7 +121,7 @@ class FreeSpace(Projection):
         return free
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
-        """Clear voxels that the frame observes as free. A hypothesis without voxels has quality 1."""
+        """Clear the voxels that the frame observes as free. A hypothesis without voxels has quality 1."""
         free = self.known_free(frame, hypothesis.grid)
         occupied = hypothesis.labels != 0
         possible = occupied if hypothesis.occupancy is None else hypothesis.occupancy.probability > 0
@@ -132,7 +132,7 @@ class FreeSpace(Projection):
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:
-    """log max(Q, 1e-3) (n,) of qualities Q (n,), so that a prediction that loses all voxels has positive weight."""
+    """log max(Q, 1e-3) (n,) of qualities Q (n,). The bound keeps all weights positive."""
     return np.log(np.maximum(quality, _SMALLEST_QUALITY))
 
 
@@ -169,7 +169,7 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
 class Evidence(Checked, ABC):
     """One term of the score of a candidate.
 
-    The documentation of a term states which data it uses, so that users see which data are counted twice.
+    The documentation of a term states which data it uses, so that users can see which data are counted twice.
     """
 
     @returns(lambda self, found, hypotheses, clip: check_array(found, (len(hypotheses),)).astype(np.float64))

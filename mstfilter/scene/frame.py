@@ -1,12 +1,12 @@
-"""RGB-D images: frames, clips, image files, depth noise.
+"""RGB-D images: frames, clips, image files and depth noise.
 
 >>> frame = Frame(rgb, depth, camera)          # rgb (H, W, 3) uint8, depth (H, W) metres, NaN = no reading
 >>> frame.points                               # (H, W, 3) world points in metres
 >>> clip = Clip([frame, frame_2], grid, 1)     # the frames from pause 0 to pause 1
 >>> clip.before, clip.after                    # its first and its last frame
 
-If several cameras observe the scene, the images of one are segmented and tracked. The frames of the others at the
-same time are its `views`. Free space is computed from all of them:
+If several cameras observe the scene, the images of one camera are segmented and tracked. The simultaneous frames of
+the other cameras are its `views`. Free space is computed from all cameras:
 
 >>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """
@@ -36,11 +36,11 @@ MAX_PIXELS = 2**25  #: Largest image that is decoded; 8K video has fewer pixels
 
 
 def depth_sigma(z: ArrayLike) -> np.ndarray:
-    """Standard deviation (m) of a depth reading at z-depth `z` (m), of the shape of `z`.
+    """Standard deviation (m) of a depth reading at z-depth `z` (m), in the shape of `z`.
 
-    A structured-light or stereo sensor measures disparity, so the standard deviation grows with the square of depth:
-    sigma = 0.00185 m (z / m)^2. The factor was fitted to table patches of 45 Kinect v1 and Xtion frames (0.6 to
-    1.5 m); it fits them within 10 % up to 1.2 m.
+    The sensor measures disparity, so the standard deviation grows with the square of depth: sigma = 0.00185 m (z /
+    m)^2. The factor was fitted to table patches of 45 Kinect v1 and Xtion frames (0.6 to 1.5 m). The factor fits the
+    patches within 10 % up to 1.2 m.
     """
     z = np.asarray(z)
     return _SIGMA_AT_ONE_METRE * z * z
@@ -62,10 +62,10 @@ def _decode(path: Path, flags: int) -> np.ndarray:
 
 
 def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarray:
-    """The image that the bytes of a PNG, JPEG or TIFF file hold, decoded with the `flags` of ``cv2.imdecode``.
+    """The image in the bytes of a PNG, JPEG or TIFF file, decoded with the `flags` of ``cv2.imdecode``.
 
-    Raises InputError with the message `problem` if they hold none, or one of more than `MAX_PIXELS` pixels, which is
-    not decoded.
+    Raises InputError with the message `problem` if the bytes are not an image, or an image of more than `MAX_PIXELS`
+    pixels. An image above the limit is not decoded.
     """
     import cv2
 
@@ -84,7 +84,7 @@ def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarr
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of a PNG, JPEG or TIFF file; None if it is none of these."""
+    """Width and height in the header of a PNG, JPEG or TIFF file; None for other files."""
     if data.startswith(_PNG_START) and len(data) >= 24:
         return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
     with contextlib.suppress(struct.error):
@@ -133,7 +133,7 @@ def read_rgb(path: Path) -> np.ndarray:
 def read_depth(path: Path, scale: float) -> np.ndarray:
     """Depth image (H, W) float32 in metres, NaN where the file has 0.
 
-    Integers of 16 bits are multiplied by `scale`, metres per unit; float (.npy, .tif) is in metres.
+    Integers of 16 bits are multiplied by `scale`, in metres per unit. Floats (.npy, .tif) are in metres.
     """
     import cv2
 
@@ -180,7 +180,7 @@ _BLOCKS_ACROSS = 80
 
 
 def grey_blocks(rgb: np.ndarray) -> np.ndarray:
-    """Mean grey level of square blocks, about 80 across: (h, w) float32 of an image (H, W, 3)."""
+    """Mean grey level (h, w) float32 of square blocks, about 80 per row, of an image (H, W, 3)."""
     grey = np.asarray(rgb, dtype=np.float32).mean(axis=2)
     side = max(1, grey.shape[1] // _BLOCKS_ACROSS)
     h, w = grey.shape[0] // side, grey.shape[1] // side
@@ -196,13 +196,13 @@ class Frame:
     rgb : (H, W, 3) uint8
         Colour image.
     depth : (H, W) float
-        z-depth in metres; NaN (or any value that is not positive and finite) is no reading.
+        z-depth in metres. NaN, or any value that is not positive and finite, means no reading.
     camera : Camera
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
-        Pixels that show the robot. They are unknown: never background, never free space.
+        Pixels that show the robot. Robot pixels are unknown, neither background nor free space.
     views : tuple of Frame
-        Frames of further cameras at the same instant, without views. All cameras need a pose in the same world.
+        Frames of other cameras at the same time, without views. All cameras need a pose in the same world.
     """
 
     rgb: np.ndarray
@@ -285,19 +285,19 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Frames from one pause to the next, and the workspace: the observation of a step.
+    """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
-    `before` shows the scene at the previous pause, `after` at this pause; the frames between them show the action.
+    `before` shows the scene at the previous pause and `after` at this pause. The frames between both show the action.
     The first clip of a recording has one frame.
 
     Parameters
     ----------
     frames : sequence of Frame
-        In time order, first and last at rest. A lazy sequence stays lazy.
+        Frames in time order. The first and last show the scene at rest. A lazy sequence stays lazy.
     grid : VoxelGrid
         The workspace.
     index : int
-        Number of the pause that the clip ends at; 0 is the first.
+        Number of the pause at the end of the clip, starting from 0.
     times : tuple of float, optional
         Seconds, one per frame.
     """

@@ -7,7 +7,7 @@
 
 Disparity D = 8 f b / z (f focal length, b baseline, z depth) is affine in pixel coordinates on a plane, and its noise
 is the same everywhere. So the support plane is a least-squares fit of D by an affine function of the pixel (u, v).
-Disparity has the units of a Kinect (f = 525 pixels, b = 0.075 m, 1/8 pixel) for every image size, so that thresholds
+Disparity is in units of a Kinect (f = 525 pixels, b = 0.075 m, 1/8 pixel) for every image size, so that thresholds
 correspond to the same noise.
 """
 
@@ -65,7 +65,7 @@ def _frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 
 def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel and z-depth (single and double precision) of every voxel centre: the same for all frames of a camera."""
+    """Pixel and z-depth (single and double precision) of every voxel centre, for all frames of a camera."""
     u, v, z, inside = camera.pixels_of(grid.centres())
     pixel = np.where(inside & (z > 1e-6), v * camera.width + u, -1).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
@@ -89,7 +89,7 @@ class SupportPlane:
 
 
 def disparity(depth: np.ndarray) -> np.ndarray:
-    """Disparity (H, W) float64 in 1/8 pixel of a Kinect from depth in metres; NaN stays NaN."""
+    """Disparity (H, W) float64 in 1/8 pixel of a Kinect, from depth in metres. NaN stays NaN."""
     return 8.0 * _FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
 
 
@@ -148,7 +148,7 @@ def _fit(frame: Frame) -> SupportPlane:
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """Camera pose in the world with z up and the plane (a, b, c of its disparity) at z = 0."""
+    """Camera pose in a world with z up and the plane (a, b, c of its disparity) at z = 0."""
     scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K
@@ -171,8 +171,8 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
 def table_residual(frame: Frame) -> np.ndarray:
     """Measured minus table disparity in 1/8 pixels, (H, W) float32. Cached by content.
 
-    The table is at z = 0 of the camera's world. Positive is above the table, NaN is no reading, +inf is a reading
-    whose ray does not meet the table.
+    The table is at z = 0 of the camera's world. Positive values are above the table. NaN means no reading, and +inf a
+    reading whose ray does not meet the table.
     """
 
     def compute() -> np.ndarray:
@@ -196,7 +196,7 @@ def workspace(frame: Frame) -> VoxelGrid:
     """A grid of 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table, which is at z = 0.
 
     The grid is centred on the readings more than 1 cm above the table, or on the table if there are fewer than 200.
-    Readings beside the visible table, for example on a wall behind it, do not count.
+    Readings beside the visible table, for example on a wall behind it, are ignored.
     """
     voxel_size, shape = 0.01, (100, 100, 50)
     points = frame.points[frame.valid]

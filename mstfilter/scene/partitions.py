@@ -1,7 +1,7 @@
-"""Partitions of voxels or pixels: renumbered labels, and the common refinement of several.
+"""Partitions of voxels or pixels: renumbered labels, and the common refinement of several partitions.
 
-In the common refinement of several segmentations, a cell holds the voxels (or pixels) that belong to the same object
-in every segmentation. There are far fewer cells than voxels.
+A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation.
+There are far fewer cells than voxels.
 
 >>> both = common_refinement([np.array([0, 1, 1, 2]), np.array([0, 7, 7, 7])])
 >>> both.cells, both.sizes
@@ -31,7 +31,7 @@ def canonical(labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class CommonRefinement:
-    """Cells of several segmentations, and the objects that they belong to."""
+    """The cells of several segmentations, and the object of each cell in each segmentation."""
 
     #: Int array of the segmentations' shape: the cell of every position. Cell 0 is free in all segmentations and
     #: may be empty.
@@ -47,14 +47,14 @@ class CommonRefinement:
         return int(self.first[-1])
 
     def objects_in(self, cells: np.ndarray) -> np.ndarray:
-        """Whether each object (n_objects + 1,) has one of these cells; False for 0, free."""
+        """Whether each object (n_objects + 1,) contains one of these cells; False for 0, free."""
         present = np.zeros(self.n_objects + 1, bool)
         present[self.objects[:, cells]] = True
         present[0] = False
         return present
 
     def overlaps(self) -> np.ndarray:
-        """Positions (n_objects + 1, n_objects + 1) that two objects share; row and column 0 (free) are 0."""
+        """Number (n_objects + 1, n_objects + 1) of positions that two objects share; row and column 0 are 0."""
         total = self.n_objects + 1
         shared = np.zeros((total, total))
         sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
@@ -66,7 +66,7 @@ class CommonRefinement:
 
 
 def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
-    """The common refinement of n label arrays of one shape, 0 is free."""
+    """The common refinement of n label arrays of one shape, in which 0 is free."""
     occupied = np.logical_or.reduce([labels != 0 for labels in segmentations])
     count = int(occupied.sum())
     cell = np.zeros(count, np.int64)
@@ -89,6 +89,6 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
 
 
 def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
-    """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays."""
+    """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays 0."""
     present, index = np.unique(np.append(codes, 0), return_inverse=True)
     return len(present) - 1, index[:-1]

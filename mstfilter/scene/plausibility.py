@@ -1,12 +1,12 @@
-"""One examination of a recording before time is spent on it, and one of the first hypotheses.
+"""Examination of a recording before a run, and of the first hypotheses.
 
 >>> for finding in examine(recording.frames, recording.pauses, recording.grid):
 ...     print(finding.stop, finding.message, finding.hints)
 
-Wrong units, a camera matrix of another image size, a moved camera, or depth that is not registered to colour give
-confident hypotheses of the wrong objects, and no error. `examine` compares the frames at the pauses with what a
-camera over a table gives. Where the result cannot be correct, the finding stops the run; the others are warnings. The
-limits are chosen from the correct and wrong recordings of ``experiments/plausibility``.
+Some faults give confident wrong hypotheses and no error: wrong units, a camera matrix of another image size, a moved
+camera, or unregistered depth. `examine` compares the frames at the pauses with what a camera over a table can
+observe. If the result cannot be correct, the finding stops the run. Other findings are warnings. The limits were
+chosen from the correct and wrong recordings of ``experiments/plausibility``.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _SHIFTS = 16  # pixels of an image of 320 columns
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about the input that is probably not what was meant."""
+    """A property of the input that probably was not intended."""
 
     stop: bool  #: whether the result cannot be right
     message: str
@@ -72,9 +72,11 @@ _GIVE_WORKSPACE = "give a workspace around the objects, or none: it is then plac
 
 
 def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
-    """Findings about the frames of a recording at its pauses, and their workspace; those that stop a run first.
+    """Findings about the frames of a recording at its pauses, and about their workspace.
 
-    The frames are read one by one; images of 160 and 320 columns are kept, and corners of images of 640.
+    Findings that stop a run are first.
+
+    The frames are read one by one. Images of 160 and 320 columns are kept in memory, and corners from images of 640.
     """
     found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
     if not any(finding.stop for finding in found):
@@ -111,7 +113,7 @@ def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[F
 
 
 class Look:
-    """What the checks measure in the frame at a pause."""
+    """Measurements of the checks in the frame at a pause."""
 
     def __init__(self, frame: Frame, grid: VoxelGrid, index: int = 0) -> None:
         self.index, self.grid = index, grid
@@ -136,7 +138,7 @@ class Look:
 
     @cached_property
     def distance(self) -> float:
-        """Median depth of the readings on the table in metres; of all readings if they are few."""
+        """Median depth in metres of the readings on the table, or of all readings if they are few."""
         depth = self.frame.depth[self.frame.valid]
         return float(np.median(depth[self.on_table] if self.on_table.mean() > _MIN_ON_TABLE else depth))
 
@@ -184,7 +186,7 @@ _Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
-    """A finding if a value is outside of its usual limits; it stops the run if the value is not possible."""
+    """A finding if a value is outside its usual limits. The finding stops the run if the value is impossible."""
     if not usual[0] <= value <= usual[1]:
         yield Finding(not possible[0] <= value <= possible[1], text, hints)
 
@@ -216,7 +218,7 @@ def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
-    """Images that show nothing; `which` names the frame."""
+    """Images without content; `which` names the frame."""
     depth = frame.depth[np.isfinite(frame.depth)]
     masked = 0.0 if frame.robot_mask is None else frame.robot_mask.mean()
     if masked > 0.95 or not frame.valid.any():
@@ -251,11 +253,11 @@ def _support(first: Look) -> Iterator[Finding]:
 
 
 def _other_support(first: Look) -> Iterator[Finding]:
-    """A wall or the floor at z = 0: a large plane in front of it is the table.
+    """A wall or the floor at z = 0, in front of which a large plane is the table.
 
-    A table is parallel to the floor and higher above it than objects above a table. A table in front of a wall meets
-    it at a right angle and reaches far from it. The normal of a table points to the top of the image, that of a wall
-    does not.
+    A table is parallel to the floor, and higher above the floor than objects are above a table. A table in front of a
+    wall meets the wall at a right angle and extends far from it. The normal of a table points to the top of the
+    image. The normal of a wall does not point there.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
@@ -275,7 +277,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
 
 def _scale(first: Look) -> Iterator[Finding]:
-    """Distances that are not those of a camera over a table."""
+    """Distances that are unusual for a camera over a table."""
     z, size = first.distance, first.grid.voxel_size
     possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
     text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
@@ -309,7 +311,7 @@ def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 class _Corners:
-    """Corners of the image (ORB) on the table and outside the workspace: what stands still."""
+    """Corners of the image (ORB) on the table and outside the workspace, where nothing moves."""
 
     def __init__(self, frame: Frame, grid: VoxelGrid) -> None:
         import cv2
@@ -325,8 +327,7 @@ class _Corners:
         self.points, self.camera = points[row, column], frame.camera
 
     def moved(self, other: _Corners) -> tuple[int, int, float]:
-        """How many corners are where the poses of two cameras put them, how many agree on another camera, and by how
-        many metres these are displaced."""
+        """Corners that agree with the poses of two cameras, corners that agree on another camera, its shift (m)."""
         import cv2
 
         if self.features is None or other.features is None:
@@ -346,10 +347,10 @@ class _Corners:
 
 
 def drift(first: Look, look: Look) -> tuple[float, float, float]:
-    """Tilt (degrees), height (m) and shift (m) of the camera against its pose, from the first pause to another.
+    """Tilt (degrees), height (m) and shift (m) of the camera relative to its pose, from the first pause to another.
 
-    Tilt and height are those of the table, where few readings are left at z = 0. The shift is that of corners of the
-    image on the table and outside the workspace.
+    If few readings are left at z = 0, tilt and height are those of the plane of the table. The shift is measured at
+    corners of the image on the table and outside the workspace.
     """
     tilt = height = shift = 0.0
     left = look.on_table.mean() / max(first.on_table.mean(), 1e-9)
@@ -363,7 +364,7 @@ def drift(first: Look, look: Look) -> tuple[float, float, float]:
 
 
 def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A camera that is not where its pose says; the first such pause."""
+    """The first pause at which the camera is not where its pose states."""
     for look in looks[1:]:
         found = drift(looks[0], look)
         size = max(value / limit for value, limit in zip(found, _DRIFT, strict=True))
@@ -411,11 +412,11 @@ _BOX = np.ones((3, 3), np.uint8)
 
 
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
-    """How well edges of depth and colour agree at all pauses.
+    """Agreement of the edges of depth and colour at all pauses.
 
     Returns the best agreement minus the median over shifts, and the share of it that is lost without a shift. The
-    third value is the best shift (rows, columns) of colour in pixels of an image of 320 columns. The fourth is by how
-    much the agreement rises if depth belongs to other pauses (in reverse, or one earlier or later).
+    third value is the best shift (rows, columns) of colour in pixels of an image of 320 columns. The fourth value is
+    the increase of the agreement if depth belongs to other pauses (in reverse, or one earlier or later).
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -463,7 +464,7 @@ def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
-    """A video of a change with one pause: earlier images are not used."""
+    """A video with a change but only one pause, so that earlier images are not used."""
     if len(pauses) > 1 or len(frames) == 1:
         return
     change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))

@@ -1,4 +1,4 @@
-"""Recordings: RGB-D videos with pauses, from arrays in memory or from files.
+"""Recordings: RGB-D videos with pauses (times at which nothing moves), from arrays or from files.
 
 >>> recording = Recording.from_arrays(rgb, depth, K)         # depth in metres
 >>> recording = mstfilter.open_recording("recordings/table-7")
@@ -52,7 +52,7 @@ _rule_of_text = late("mstfilter.formats.sources:pause_rule", "The rule of a text
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames ``read(index)``, read when they are used; the last 40 are kept in memory."""
+    """Frames ``read(index)``, which are read on access. The last 40 are kept in memory."""
 
     def __init__(self, read: Callable[[int], Frame], n: int) -> None:
         self._read = lru_cache(maxsize=40)(read)
@@ -80,7 +80,7 @@ class Recording:
     Parameters
     ----------
     frames : sequence of Frame
-        In time order; they may be read when they are used.
+        Frames in time order, which may be read on access.
     grid : VoxelGrid
         Workspace.
     pauses : tuple of int
@@ -88,20 +88,19 @@ class Recording:
     times : tuple of float
         Seconds, one per frame.
     name : str
-        For messages and reports.
+        Name for messages and reports.
     path : Path, optional
-        The folder or file that it was read from.
+        The folder or file from which the recording was read.
     depth_scale : float
         Metres per unit of the stored depth images, used when the recording is saved.
     manifest : dict
         Content of manifest.json, for recordings read from a folder.
     truth : callable
-        ``truth(t)`` gives the true labels (X, Y, Z) uint16 at pause `t`, on `grid`; None if they are not known.
+        ``truth(t)`` returns the true labels (X, Y, Z) uint16 at pause `t`, on `grid`; None if unknown.
     instance : callable
-        ``instance(index)`` gives the true label image (H, W) of a frame; None if it is not known.
+        ``instance(index)`` returns the true label image (H, W) of a frame; None if unknown.
     poses : callable
-        ``poses(index)`` gives the true T_world_object (4, 4) of each object of a frame, by label; None if they are
-        not known.
+        ``poses(index)`` returns the true T_world_object (4, 4) of each object of a frame, by label; None if unknown.
     """
 
     frames: Sequence[Frame]
@@ -161,23 +160,24 @@ class Recording:
         rgb : (H, W, 3) or (T, H, W, 3) uint8
             One image or a video.
         depth : (H, W) or (T, H, W) float
-            Metres; NaN or 0 is no reading.
+            Depth in metres; NaN or 0 means no reading.
         K : (3, 3) array
             Intrinsics in pixels.
         pauses : sequence of int, str or PauseRule, optional
-            Frames at which nothing moves; a hypothesis is estimated at each. A rule or its text finds them: "still",
-            "ends", "every", or "0s,4.2s". Default: "still" if `times` are given, as on the command line; else "ends".
+            Frames at which nothing moves. The filter estimates hypotheses at each of them. A rule or its text finds
+            the pauses: "still", "ends", "every", or "0s,4.2s". The default is "still" if `times` are given, as on the
+            command line, and else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
-            Pose of the camera, or its pose in every frame if it moves. The table must be at z = 0. Default: from the
-            support plane of the first pause.
+            Pose of the camera, or its pose in every frame if the camera moves. The table must be at z = 0. The
+            default is computed from the support plane of the first pause.
         grid : VoxelGrid, optional
-            Workspace. Default: 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
+            Workspace. The default is 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
         robot_masks : (T, H, W) bool, optional
             Pixels that show the robot.
         times : sequence of float, optional
             Seconds. Default: 0, 1, 2, ...
         name : str
-            For messages and reports.
+            Name for messages and reports.
 
         Raises
         ------
@@ -260,10 +260,12 @@ class Recording:
         return len(self.frames)
 
     def clips(self) -> tuple[Clip, ...]:
-        """One clip per pause: the first pause alone, then from each pause to the next.
+        """One clip per pause.
 
-        Warns if the input is not plausible, and raises InputError if no hypothesis can be correct
-        (`mstfilter.scene.examine`), unless it was done before.
+        The first clip is the first pause alone, and each other clip goes from one pause to the next.
+
+        The first call warns if the input is not plausible. The first call raises InputError if no hypothesis can be
+        correct (`mstfilter.scene.examine`).
         """
         self._examined  # noqa: B018
         clips = []
@@ -273,11 +275,11 @@ class Recording:
         return tuple(clips)
 
     def in_world_of(self, other: Recording) -> Recording:
-        """This recording with the workspace of another, and its camera pose at the first pause; without true volumes.
+        """This recording with the workspace and the first camera pose of another recording, without true volumes.
 
-        For parts of one session with a camera that stands still, or that is at the same place at both first pauses:
-        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Hypotheses of one part can then be moved
-        on by the clips of the next.
+        Use this method for parts of one session whose camera has the same pose at both first pauses:
+        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Clips of one part then update hypotheses
+        of the other.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()
@@ -290,30 +292,30 @@ class Recording:
         return replace(self, frames=frames, grid=other.grid, truth=lambda t: None, poses=lambda index: None)
 
     def check(self) -> None:
-        """Read every image, so that an unreadable one raises InputError before a run, and examine the recording."""
+        """Read every image and examine the recording, so that faults raise InputError before a run."""
         _ = self.key
         self.__dict__.pop("_examined", None)
         self._examined  # noqa: B018
 
     @cached_property
     def _examined(self) -> None:
-        """Evaluated once: warnings and errors about the frames at the pauses."""
+        """Warnings and errors about the frames at the pauses, evaluated once."""
         report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
 class UsesFiles(ABC):
-    """A component that reads files of the user, for example one for each pause. Inherit it with its interface."""
+    """A component that reads files of the user. Inherit `UsesFiles` in addition to the interface."""
 
     #: Fields with paths of files or folders. A run whose files have changed is another run.
     path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")
 
     @abstractmethod
     def check_files(self, recording: Recording) -> None:
-        """Raise InputError if a file is missing or cannot be used for a recording; called before a run."""
+        """Raise InputError before a run if a file is missing or cannot be used for a recording."""
 
 
 def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
-    """The camera of each of `n` frames: of one pose, of none, or of one for each frame."""
+    """The camera of each of `n` frames, from one pose, no pose, or one pose for each frame."""
     if poses is None:
         return [camera] * n
     listed = list(poses) if np.ndim(poses) in (1, 3) else [poses]
@@ -339,7 +341,7 @@ def _stacked(images: Any, what: str) -> np.ndarray:
 
 
 def check_depth(depth: np.ndarray, where: str) -> None:
-    """Raise InputError if a depth image (H, W) has no reading, or its median cannot be that of a table in metres."""
+    """Raise InputError if a depth image (H, W) is empty, or its median cannot be a distance of a table in metres."""
     with np.errstate(invalid="ignore"):
         metres = depth[np.isfinite(depth) & (depth > 0)]
     if metres.size == 0:
@@ -356,7 +358,7 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """Camera with a pose, and a workspace; what is not given is found from the frame of the first pause."""
+    """Camera with a pose, and a workspace. What is not given is computed from the frame of the first pause."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:

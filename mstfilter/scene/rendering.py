@@ -1,13 +1,13 @@
-"""Rendering of label grids: exact ray casting through voxels.
+"""Rendering of label grids by exact ray casting through voxels.
 
 >>> image = project(hypothesis, camera)            # label image (H, W): PROJECT in section IV-C of the paper
 >>> labels, depth = render_hypothesis(hypothesis, camera)
 >>> labels, depth = render(label_grid, grid, camera)
 
-The ray of each pixel is followed from voxel to voxel. In free space it jumps. If the nearest occupied voxel is at
-chessboard distance D, the cube of half-width D - 1 around the current voxel is empty. The ray continues where it
-leaves that cube. With D = 1 this is the voxel traversal of Amanatides and Woo (1987). The jumps save steps and do not
-change the result.
+The ray of each pixel is followed from voxel to voxel. The ray jumps in free space. If the nearest occupied voxel has
+the chessboard distance D, the cube of half-width D - 1 around the current voxel is empty. The ray continues at the
+face where it leaves this cube. With D = 1 this is the voxel traversal of Amanatides and Woo (1987). The jumps save
+steps and do not change the result.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mstfilter.scene.voxels import Hypothesis, VoxelGrid, labels_on, occupied_bo
 
 
 class Rendering(NamedTuple):
-    """Label image (H, W) uint16, 0 without a hit, and z-depth (H, W) float32 in metres, NaN without a hit."""
+    """Label image (H, W) uint16 with 0 without a hit, and z-depth (H, W) float32 in metres with NaN without a hit."""
 
     labels: np.ndarray
     depth: np.ndarray
@@ -45,7 +45,7 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
 
 
 def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
-    """Cast one ray per pixel, through the pixel centre, into a label grid (X, Y, Z); label 0 is free."""
+    """Cast one ray through each pixel centre into a label grid (X, Y, Z), in which 0 is free."""
     labels = labels_on(grid, labels)
     image = np.zeros((camera.height, camera.width), np.uint16)
     depth = np.full(image.shape, np.nan, np.float32)
@@ -76,7 +76,7 @@ def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
 def _window(
     start: np.ndarray, shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: Camera
 ) -> tuple[slice, slice]:
-    """Image rows and columns that can show the box; all if a corner is not in front of the camera."""
+    """Image rows and columns that can show the box, or all of them if a corner is not in front of the camera."""
     corners = np.array(np.meshgrid(*[(0, n) for n in shape], indexing="ij")).reshape(3, -1).T
     uv, z = camera.project(grid.origin + (corners + lower) * grid.voxel_size)
     if (z < 1e-3).any():
@@ -90,7 +90,7 @@ def _window(
 def _traverse(
     box: np.ndarray, start: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Follow the rays (n, 3) from `start`; ray number, flat voxel index and t of those that hit a voxel."""
+    """Follow rays (n, 3) from `start`. Returns ray number, flat voxel index and t of rays that hit a voxel."""
     from scipy.ndimage import distance_transform_cdt
 
     distance = distance_transform_cdt(box == 0, metric="chessboard").astype(np.int32).ravel()

@@ -1,7 +1,7 @@
 """Voxel grids and hypotheses.
 
-A `Hypothesis` is the particle of MST: an object label for every voxel, 0 for free space. World z is up, the table is
-at z = 0.
+A `Hypothesis` is the particle of MST. A hypothesis has an object label for every voxel, with 0 for free space. The z
+axis of the world points up, and the table is at z = 0.
 
 >>> import numpy as np
 >>> from mstfilter.scene import Hypothesis, VoxelGrid
@@ -42,9 +42,9 @@ class VoxelGrid:
     origin : (3,) metres
         Minimum corner of the first voxel.
     voxel_size : float
-        Edge in metres.
+        Edge of a voxel in metres.
     shape : (3,) int
-        Voxels along x, y, z.
+        Number of voxels along x, y, z.
     """
 
     origin: np.ndarray
@@ -120,7 +120,7 @@ class VoxelGrid:
         return self.origin + (np.asarray(index) + 0.5) * self.voxel_size
 
     def index_of(self, points: np.ndarray) -> np.ndarray:
-        """Voxel indices (..., 3) int64 of world points, also outside the grid. NaN gives -1."""
+        """Voxel indices (..., 3) int64 of world points, which may be outside the grid. NaN gives -1."""
         index = np.floor((np.asarray(points) - self.origin) / self.voxel_size)
         return np.where(np.isfinite(index), index, -1).astype(np.int64)
 
@@ -169,7 +169,7 @@ class Crop:
 
     @classmethod
     def of(cls, mask: np.ndarray, probability: np.ndarray | None = None) -> Crop:
-        """The tight crop of a boolean grid, and of a grid of probabilities; an empty mask gives an empty crop."""
+        """The tight crop of a boolean grid and of a grid of probabilities. An empty mask gives an empty crop."""
         box = occupied_box(mask if probability is None else mask | (probability > 0))
         if box is None:
             return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
@@ -184,7 +184,7 @@ class Crop:
 
 
 class Seen(IntFlag):
-    """What a frame shows of a voxel, for one object: the bits of `ObjectView.bits`."""
+    """What a frame shows of a voxel with respect to one object: the bits of `ObjectView.bits`."""
 
     SURFACE = 1  #: visible surface of the object
     OTHER_SURFACE = 2  #: visible surface of something else
@@ -193,13 +193,13 @@ class Seen(IntFlag):
     HIDDEN = 16  #: behind the surface of something else
 
     def among(self, bits: Any) -> Any:
-        """Where at least one of these bits is set: bool, for an array or a torch tensor of uint8."""
+        """Whether at least one of these bits is set, as bool, for an array or a torch tensor of uint8."""
         return (bits & int(self)) > 0
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectView:
-    """What one frame showed of an object, in a box of the grid, and where the object moved since then."""
+    """What one frame showed of an object, in a box of the grid, and the motion of the object since then."""
 
     offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
     bits: np.ndarray  #: (a, b, c) uint8, flags of `Seen`
@@ -209,12 +209,12 @@ class ObjectView:
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
 
     def moved(self, T: RigidTransform) -> ObjectView:
-        """The view after the object moved by T."""
+        """The view after the object has moved by T."""
         return replace(self, motion=T * self.motion)
 
     @cached_property
     def name(self) -> tuple[str, bytes]:
-        """Key of the contents and of the motion."""
+        """Key of the contents and the motion."""
         return self.key, self.motion.as_matrix().tobytes()
 
 
@@ -240,16 +240,16 @@ class ObjectRecord:
     def born(
         cls, label: int, birth: int, completion_key: str | None = None, views: tuple[ObjectView, ...] = ()
     ) -> ObjectRecord:
-        """The record of a new object, with id ``65536 * birth + label``, which differs for different births."""
+        """The record of a new object. The id ``65536 * birth + label`` is different for different births."""
         return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key, views=views)
 
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
-        """The record after a motion T of the object, of which `source` are the voxels before all motions."""
+        """The record after a motion T of the object. `source` are the voxels before all motions."""
         total = T if self.source is None else T * self.motion
         return replace(self, source=source, motion=total, views=tuple(view.moved(T) for view in self.views))
 
     def changed(self) -> ObjectRecord:
-        """The record after the voxels changed other than by a rigid motion."""
+        """The record after a change of the voxels other than a rigid motion."""
         return replace(self, source=None, motion=_NO_MOTION)
 
 
@@ -280,7 +280,7 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
-    """How sure a hypothesis is of each voxel, given which objects there are and where."""
+    """The probabilities of a hypothesis for each voxel, given its objects and their positions."""
 
     #: (X, Y, Z) uint16, the most probable object, also where free space is more probable. Equal to the label where
     #: there is one.
@@ -297,7 +297,7 @@ class Occupancy:
         return content_key("occupancy", self.owner, self.probability)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
-        """After a change of labels (X, Y, Z): certain where they change; objects that are not `known` are gone."""
+        """The occupancy after a change of labels (X, Y, Z): changed voxels are certain, unknown objects removed."""
         changed = before != after
         owner = np.where(changed | (after > 0), after, self.owner)
         p = np.where(changed, after > 0, self.probability)
@@ -316,13 +316,13 @@ class Hypothesis:
     Parameters
     ----------
     labels : (X, Y, Z) uint16
-        0 is free or unknown, k >= 1 is an object. Labels need not be consecutive.
+        Label 0 is free or unknown, and k >= 1 is an object. Labels need not be consecutive.
     grid : VoxelGrid
-        Where the voxels are.
+        Positions of the voxels.
     objects : tuple of ObjectRecord
-        One for each label that occurs, in ascending order of labels. `Hypothesis.from_labels` makes them.
+        One record for each label, in ascending order of labels. `Hypothesis.from_labels` makes the records.
     occupancy : Occupancy, optional
-        How sure the hypothesis is of each voxel. Default: certain.
+        Probabilities of the voxels. By default, all voxels are certain.
     """
 
     labels: np.ndarray
@@ -377,7 +377,7 @@ class Hypothesis:
         return self.relabelled(labels, tuple(record for record in records if present[record.label]))
 
     def relabelled(self, labels: np.ndarray, objects: tuple[ObjectRecord, ...]) -> Hypothesis:
-        """Other labels and records. Voxels whose label changes are certain, the others keep their probability."""
+        """The hypothesis with other labels and records. Voxels with a changed label become certain."""
         occupancy = self.occupancy
         if occupancy is not None:
             known = np.array([0, *(record.label for record in objects)])
@@ -385,18 +385,18 @@ class Hypothesis:
         return Hypothesis(labels, self.grid, objects, occupancy)
 
     def without(self, voxels: np.ndarray) -> Hypothesis:
-        """The same objects without some voxels (X, Y, Z) bool, which are certainly free; see `with_labels`."""
+        """The same objects without some voxels (X, Y, Z) bool, which become certainly free; see `with_labels`."""
         found = self.with_labels(np.where(voxels, 0, self.labels).astype(np.uint16))
         occupancy = found.occupancy
         return found if occupancy is None else replace(found, occupancy=occupancy.without(voxels))
 
     @property
     def shares(self) -> Occupancy:
-        """The occupancy, also of a hypothesis that is certain."""
+        """The occupancy, which is also defined for a hypothesis without probabilities."""
         return self.occupancy or Occupancy(self.labels, (self.labels > 0).astype(np.float16))
 
     def crop(self, label: int) -> Crop:
-        """The voxels of an object, with their probabilities if the hypothesis has some."""
+        """The voxels of an object, with their probabilities if the hypothesis has them."""
         mask = self.labels == label
         if self.occupancy is None:
             return Crop.of(mask)
@@ -404,7 +404,7 @@ class Hypothesis:
 
     @cached_property
     def key(self) -> bytes:
-        """Content key of the labels; the occupancy has a key of its own."""
+        """Content key of the labels. The occupancy has a separate key."""
         return content_key("hypothesis", self.labels, self.grid.key)
 
     @cached_property
@@ -447,6 +447,6 @@ def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
 
 
 def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
-    """Raise InputError if one of several hypotheses of a side, such as "predicted", has another grid."""
+    """Raise InputError if one of several hypotheses has another grid. The message names their role."""
     for k, hypothesis in enumerate(hypotheses):
         check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)

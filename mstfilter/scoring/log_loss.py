@@ -1,17 +1,17 @@
-"""What a weighted set of hypotheses knows: scores of its answers to `questions`.
+"""Scores of the probabilities of a weighted set of hypotheses: scores of its answers to `questions`.
 
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t))
 >>> belief.row["brier"], belief.row["energy"]                  # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses of labels alone have no
-uncertainty of shape, so noise at their borders makes forecasts less sure where they are often wrong. Recalibration
-removes this. Forecasts are recalibrated by isotonic regression, fitted to other scenes, and the score is the mean log
-loss in nats; lower is better. Noise at the border is added where the other scenes say that it helps. So a forecaster
-that adds such noise itself gains nothing (`experiments/information` shows it for all methods), and forecasters are
-compared by what they distinguish. Noise of another kind, or more of it than the largest rate, can still help a
-little.
+**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses that consist only of labels
+have no uncertainty of shape. Noise at the borders of objects makes forecasts less certain where forecasts are often
+wrong. Recalibration removes this effect. Forecasts are recalibrated by isotonic regression, fitted to other scenes.
+The score is the mean log loss in nats; lower is better. Noise at the border is added if it lowers the loss on the
+other scenes. So a forecaster that adds noise at borders gains nothing (`experiments/information` shows this for all
+methods). Forecasters are compared by the questions that their forecasts distinguish. Noise of another kind, or at a
+higher rate than the largest one, can still give a small gain.
 
 **Energy score.** With d the root of the share of questions that are answered differently,
 
@@ -59,7 +59,7 @@ class BeliefScore(NamedTuple):
 
     @property
     def base_rate_loss(self) -> float:
-        """Log loss, in nats, of the forecast that gives all questions the share of those that are true."""
+        """Log loss, in nats, of a constant forecast that equals the share of true questions."""
         table = forecast_table(self.counts[0].astype(np.int64))
         if not table.n:
             return float("nan")
@@ -133,7 +133,7 @@ def forecast_table(counts: np.ndarray) -> ForecastTable:
 
 @dataclass(frozen=True, eq=False)
 class FittedForecasts:
-    """How to read the forecasts of a method: with noise at the border, and recalibrated.
+    """A fitted transformation of the forecasts of a method: noise at the border, and recalibration.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ class FittedForecasts:
 def leave_one_out(counts: Mapping[Any, np.ndarray]) -> dict[Any, FittedForecasts]:
     """For each scene, what is fitted to all others; `counts` maps a scene to counts (r, 1001, 2).
 
-    Scenes without questions in the others are left out.
+    Scenes are omitted if the other scenes have no questions.
     """
     total = sum((one.astype(np.int64) for one in counts.values()), np.zeros(1, np.int64))
     return {scene: FittedForecasts.fit(rest) for scene, one in counts.items() if (rest := total - one).any()}

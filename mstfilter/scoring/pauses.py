@@ -3,15 +3,15 @@
 >>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(Path("recordings/mine/voxels.npz")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). It has the mean over the
-hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of the one of least
-expected loss. It also has two floors: the occupied voxels of the same hypotheses as one blob, and as connected
-components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in the image;
-pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the weighted set:
-Brier score, log loss and that of the base rate, calibration error and energy score (`score_belief`), the same for all
-forms.
+There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). The row has the mean over
+the hypotheses, the weighted mean, the maximum, and the values of two hypotheses: that of largest weight and that of
+least expected loss. The row also has two floors: the occupied voxels of the same hypotheses as one blob, and as
+connected components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in
+the image. Pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the
+weighted set: Brier score, log loss, log loss of the base rate, calibration error and energy score (`score_belief`),
+which are the same for all forms.
 
-`measure_pause` gives all metrics of a pause, for the tables of a study.
+`measure_pause` computes all metrics of a pause, for the tables of a study.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class PauseEstimate:
     Parameters
     ----------
     hypotheses : sequence of Hypothesis or of (X, Y, Z) arrays
-        A `Hypothesis` also says how sure it is of each voxel.
+        A `Hypothesis` also has probabilities of its voxels.
     weights : (n,) array
-        Their sum is 1.
+        The sum of the weights is 1.
     frame : int, optional
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
@@ -64,12 +64,12 @@ class PauseEstimate:
 
 @dataclass(frozen=True, eq=False)
 class PauseTruth:
-    """True labels at one pause: volumes, or an image with its camera.
+    """True labels at one pause, as volumes or as an image with its camera.
 
     Parameters
     ----------
     labels : (X, Y, Z) array, or (H, W) if `camera` is given
-        0: no object.
+        Label 0 is no object.
     frame : int, optional
         Frame of the recording.
     grid : VoxelGrid, optional
@@ -110,13 +110,13 @@ class PauseScore:
 
 
 def read_estimates(path: Path) -> list[PauseEstimate]:
-    """Label volumes of a file as estimates: .npz with ``labels`` as voxels.npz has them, or .npy."""
+    """Estimates from the label volumes of a file: .npz with ``labels`` as in voxels.npz, or .npy."""
     volumes, frames, grid = _read_volumes(path, "label volumes")
     return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
 
 
 def read_truth(source: Path | Recording) -> list[PauseTruth]:
-    """Ground truth of a recording (its volumes, else its instance images), or of a .npz or .npy file of volumes."""
+    """Ground truth of a recording (volumes, or else instance images), or of a .npz or .npy file of volumes."""
     if isinstance(source, Path):
         volumes, frames, grid = _read_volumes(source, "true volumes")
         return [PauseTruth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
@@ -173,7 +173,7 @@ def measure_pause(
     weights : (n,) float
         Sum 1.
     questions : Questions, optional
-        Those of the pause, if they are known already.
+        Questions of the pause, if they are already known.
 
     Returns
     -------
@@ -197,7 +197,7 @@ def measure_pause(
 
 
 def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
-    """Scores of all pauses that have both; pauses are matched by frame if both have frames, else by order."""
+    """Scores of all pauses that have both. Pauses are matched by frame if both have frames, and else by order."""
     by_frame = {t.frame: t for t in truths}
     named = None not in by_frame and all(e.frame is not None for e in estimates)
     if not named and len(estimates) != len(truths):
@@ -241,7 +241,7 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
 def _comparable(
     pause: int, estimate: PauseEstimate, truth: PauseTruth
 ) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
-    """What of a label volume is compared with the truth, as a function, and the truth in the same form."""
+    """A function that converts a label volume for comparison with the truth, and the truth in the same form."""
     grid, camera = estimate.grid, truth.camera
     if camera is None:
         if grid is not None and truth.grid is not None and not _same_grid(grid, truth.grid):

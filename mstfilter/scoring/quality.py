@@ -1,21 +1,21 @@
 """Quality of a segmentation, trivial baselines, and the visibility of objects.
 
-Weighted coverage: for every region of one segmentation take the region of the other that overlaps it best (Jaccard
-index J), and average by size:
+Weighted coverage takes, for every region of one segmentation, the region of the other that overlaps it best (Jaccard
+index J). Weighted coverage averages J by size:
 
     side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
 
-Three forms, by name:
+There are three forms, by name:
 
 ``objects`` (default)
-    Objects only (label 0 is no region); ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2`` with V the volume of
-    all objects of that segmentation. Symmetric; missing, invented, split and merged objects all reduce it.
+    Objects only (label 0 is not a region). ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V is the volume
+    of all objects of that segmentation. The form is symmetric. Missing, invented, split and merged objects reduce it.
 ``paper``
-    The published text taken literally (Price et al. 2021, section V). Every label is a region, free space too, and
-    both sides are divided by the size of the grid. Nearly 1 for any input, because free space dominates.
+    The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
+    Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.
 ``authors``
-    The authors' program: objects only, but both sides are divided by the volume of the FIRST argument. Not
-    symmetric; it is too high if the first argument is too small.
+    The authors' program. Objects only, but both sides are divided by the volume of the FIRST argument. The form is
+    not symmetric, and too high if the first argument is too small.
 
 >>> import numpy as np
 >>> a = np.array([1, 1, 2, 2, 0]); b = np.array([1, 1, 1, 1, 0])
@@ -23,14 +23,14 @@ Three forms, by name:
 0.5
 
 `one_blob` and `connected_components` are trivial baselines that are shown beside every quality. Both keep the
-occupied voxels of a hypothesis and change only which object they belong to. A filter that is not better than these
-has found occupied space, but not objects.
+occupied voxels of a hypothesis and change only the objects to which they belong. A filter that is not better than
+these detects occupied space but not objects.
 
 >>> object_status(recording, 2)  # doctest: +SKIP
 {1: 'visible', 2: 'hidden', 3: 'unseen'}
 
-Figures of quality are split by the status of objects: no method can know an object that it never saw, and hidden
-objects show what tracking contributes.
+Quality is also split by the status of objects. No method can represent an object that was never seen, and hidden
+objects show the contribution of tracking.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ FORMS: tuple[Form, ...] = get_args(Form)
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Sizes of two segmentations' regions and of their intersections, label 0 included where it occurs.
+    """Sizes of the regions of two segmentations and of their intersections, including label 0 where it occurs.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def weighted_coverage(a: np.ndarray, b: np.ndarray, form: Form = "objects") -> f
     a, b : integer arrays of the same shape
         Labels, 0 is background or free.
     form : {"objects", "paper", "authors"}
-        See the module. The quality is 1 if neither segmentation has objects and 0 if only one has.
+        The module describes the forms. The quality is 1 if neither segmentation has objects and 0 if only one has.
     """
     return quality_of(overlap(a, b), form)
 
@@ -159,22 +159,22 @@ MIN_PIXELS = 100  # of a 640 x 480 image: 2.3 cm^2 at 0.8 m
 def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[int, Status]:
     """Status of every object that has true voxels at pause `t`, by its label, ascending.
 
-    *visible*: the instance image of the pause shows it; *hidden*: only that of an earlier pause does; *unseen*: none
-    does. Frames between pauses do not count.
+    *visible*: the instance image of the pause shows it. *hidden*: only an earlier image shows it. *unseen*: no image
+    shows it. Frames between pauses are not used.
 
     Parameters
     ----------
     recording : Recording
-        With true voxels and instance images at the pauses.
+        A recording with true voxels and instance images at the pauses.
     t : int
         Number of the pause.
     min_pixels : float
-        Number of pixels from which an image shows an object, for 640 x 480 pixels; scales with the area.
+        Number of pixels from which an image shows an object, for 640 x 480 pixels. The number scales with the area.
 
     Raises
     ------
     InputError
-        If the recording has no true voxels at pause `t`, or no instance image at a pause up to it.
+        If the recording has no true voxels at pause `t`, or no instance image at this or an earlier pause.
     """
     if not 0 <= t < len(recording.pauses):
         raise InputError(f"recording {recording.name} has no pause {t}, it has {len(recording.pauses)}")
@@ -186,7 +186,7 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
 
 
 def status_of(labels: np.ndarray, visible: Set[int], earlier: Set[int]) -> dict[int, Status]:
-    """Status of the objects of true `labels`, of which the image shows `visible`, and earlier ones `earlier`."""
+    """Status of objects of true `labels`, given the objects `visible` in the image, and in `earlier` images."""
     present = np.unique(labels[labels > 0]).tolist()
     return {k: "visible" if k in visible else "hidden" if k in earlier else "unseen" for k in present}
 

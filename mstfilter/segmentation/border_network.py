@@ -1,14 +1,16 @@
-"""The border network: a small 2-D U-Net that sees where objects end, and where their centres are. Imports torch.
+"""The border network, a small 2-D U-Net that estimates the borders and the centres of objects.
+
+This module imports torch.
 
 >>> network = load_border_network("border")
 >>> seen = network.look(frame)                     # maps of the frame's size
 >>> seen.border[row, column], seen.foreground[row, column], seen.centre[row, column]
 
-The network works on images of 320 pixels per row (`encode_image`); a frame is reduced to that size, and the maps are
-interpolated. Its blocks work at a half, a quarter and an eighth of this resolution; 2 x 2 pixels enter and leave as
-channels. The outputs are the log odds that a pixel is at the border of an object and that it belongs to an object. A
-further output is the offset to the object's centre in the image (after D. Neven, B. De Brabandere, M. Proesmans, L.
-Van Gool, "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+The network works on images of 320 pixels per row (`encode_image`). A frame is reduced to this size, and the resulting
+maps are interpolated. The blocks have a half, a quarter and an eighth of this resolution. At the input and the
+output, 2 x 2 pixels are packed as channels. The outputs are the log odds that a pixel is at the border of an object
+and that it belongs to an object. Another output is the offset to the object's centre in the image (after Neven et
+al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarra
 
 
 def near_objects(x: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) of an input with something above the table within eight pixels."""
+    """Pixels (H, W) of an input that have a point above the table within eight pixels."""
     raised = (x[0] > np.arcsinh(TABLE_TOLERANCE / _HEIGHT_UNIT) / 3) & (x[5] > 0)
     raised = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return np.asarray(cv2.dilate(raised, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (17, 17))) > 0)
@@ -95,7 +97,7 @@ class _Block(nn.Module):
 
 
 class BorderNet(nn.Module):
-    """See the module. `width` features at half the resolution, a multiple of 8; two and four times as many below."""
+    """U-Net of three levels with `width` (a multiple of 8), 2 `width` and 4 `width` features."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -117,7 +119,7 @@ class BorderNet(nn.Module):
         self.head.bias = nn.Parameter(torch.tensor([-2.0, -1.0, 0.0, 0.0]).repeat_interleave(4))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(b, 9, H, W) -> (b, 4, H, W): logits of border and foreground, offset in `CENTRE_UNIT` (right, down).
+        """(b, 9, H, W) -> (b, 4, H, W): logits of border and foreground, and offset in `CENTRE_UNIT` (right, down).
 
         H and W are multiples of 8.
         """
@@ -132,7 +134,7 @@ class BorderNet(nn.Module):
 
 
 class BorderNetwork:
-    """A border network that is ready for use."""
+    """A border network with loaded weights."""
 
     def __init__(self, model: TrainedModel) -> None:
         self.net, self.scale, self.shift = calibrated_network(
@@ -144,7 +146,7 @@ class BorderNetwork:
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:
-        """The maps of a frame of any size. Without a camera pose, the table is fitted (`fit_support_plane`)."""
+        """The maps of a frame of any size. Without a camera pose, the table plane is fitted (`fit_support_plane`)."""
         h, w = frame.depth.shape
         small = reduced(frame)
         x = encode_image(small)
@@ -160,7 +162,7 @@ class BorderNetwork:
 
 
 def reduced(frame: Frame) -> Frame:
-    """The frame with `RASTER` pixels per row and a camera pose; depth is that of the nearest pixel."""
+    """The frame with `RASTER` pixels per row and a camera pose. Depth is taken from the nearest pixel."""
     camera = posed_camera(frame)
     w = camera.width
     if w == RASTER:

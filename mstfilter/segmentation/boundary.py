@@ -2,11 +2,11 @@
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 
-Objects are mostly convex. So depth has a concave crease or a step where two objects meet and where an object meets
+Most objects are convex. So depth has a concave crease or a step where two objects touch, and where an object touches
 the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
 length, b baseline, z depth) is affine on every plane, and its noise does not depend on the range. So the largest
-eigenvalue of its Hessian responds to creases and steps only. Colour adds boundaries that depth does not show. Its
-weight is lower, because print on a box is not a boundary.
+eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not visible
+in depth. The weight of colour is lower, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model of the clip's last frame. Its `component_key` includes the content that it uses."""
+        """The model for the clip's last frame. The `component_key` of the model includes the content that it uses."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,15 @@ class ColourDepthBoundary(BoundaryModel):
     colour_weight : float
         Weight of the colour edges; 0 disables them.
     quiet_table : float
-        Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table, so that
-        print, grain and shadows on the table do not enter the tree. Negative values disable the rule.
+        Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table. So print,
+        grain and shadows on the table are ignored. A negative value disables the rule.
     """
 
     colour_weight: float = 0.4
     quiet_table: float = 12.0
 
     def boundary(self, frame: Frame) -> np.ndarray:
-        """Boundary strength (H, W). Robot pixels are 1 at their rim and 0 inside, so that they separate regions."""
+        """Boundary strength (H, W). The robot has 1 at its rim and 0 inside, so that it separates regions."""
         resize = scaled_length(1, frame.camera.width)
         edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
@@ -96,7 +96,7 @@ class ColourDepthBoundary(BoundaryModel):
 
 
 def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
-    """e / (1 + e) with e the strength of the Lab structure tensor, averaged over three scales."""
+    """e / (1 + e), where e is the strength of the Lab structure tensor, averaged over three scales."""
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab /= np.array([_LIGHTNESS_UNIT, _CHROMA_UNIT, _CHROMA_UNIT], np.float32)
     xx = np.zeros(rgb.shape[:2], np.float32)
@@ -116,7 +116,7 @@ def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
 
 
 def filled_disparity(frame: Frame) -> np.ndarray:
-    """Disparity (H, W) float32 in sensor units; missing readings take the nearest one."""
+    """Disparity (H, W) float32 in sensor units. Missing readings take the nearest value."""
     return (8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)).astype(np.float32)
 
 

@@ -1,15 +1,15 @@
 """Cuts of a segmentation tree: node values, the optimal cut, and exact samples.
 
-A `CutValue` gives every node a value w; the value of a cut is the sum over its nodes, v(c) = sum w. `optimal_cut`
-maximises it, a `CutSampler` draws cuts at random.
+A `CutValue` gives every node a value w. The value of a cut is the sum over its nodes, v(c) = sum w. `optimal_cut`
+maximises this value, and a `CutSampler` draws cuts at random.
 
 >>> w = MergeLogOdds().values(tree, frame)                     # (N,), higher is better
 >>> best = optimal_cut(tree, w)                                # ascending nodes
 >>> sample = ExactCuts().sample(np.random.default_rng(0), tree, w, 10)
 
-Under a Gibbs law with inverse temperature b, a cut has probability proportional to exp(b v(c)). One pass up the tree
-gives the probability ``stop[n]`` that a cut which reaches node n contains n itself. A walk down from the root with
-these probabilities draws a cut exactly.
+In a Gibbs distribution with inverse temperature b, a cut has probability proportional to exp(b v(c)). One pass up the
+tree computes ``stop[n]``, the probability that a cut which reaches node n contains n itself. A walk down from the
+root with these probabilities draws a cut exactly.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ class CutValue(Checked, ABC):
 class SceneCutObjectness(CutValue):
     """SceneCut's objectness: regions that form early and end late (Pham et al. 2018, eq. 4-5).
 
-    ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)``, ``w = ln(s) area^0.95``; a region smaller than 1000
-    or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of planes
-    the size of furniture, is omitted: on a tabletop the support plane is found directly and removed as background.
+    ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)`` and ``w = ln(s) area^0.95``. A region smaller than
+    1000 or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of
+    planes with the size of furniture, is omitted. Here the support plane is removed directly as background.
 
     Parameters
     ----------
     background_weight : float
-        Area of a pixel that is not above the table; 1 in SceneCut. With 1 the table contributes most of v*. The width
-        of the sampled law is relative to v*, so a larger table gives more random samples. With 0 cuts of the
-        table have no cost, and chains spend their steps on them.
+        Area of a pixel that is not above the table. In SceneCut the area is 1. With 1, the table contributes most of
+        v*. The width of the sampled distribution is relative to v*, so a larger table gives more random samples. With
+        weight 0, cuts of the table have no cost, and chains spend their steps on these cuts.
     """
 
     background_weight: float = 0.003
@@ -84,10 +84,10 @@ class SceneCutObjectness(CutValue):
 class MergeLogOdds(CutValue):
     """Log likelihood of independent merge decisions.
 
-    ``w(n) = -sum of logit P(boundary) over the merges inside n``: exp(v(c)) is, up to a constant, the
-    probability that exactly the merges above the cut join different objects. The values are log probabilities, so
-    cuts are sampled at a temperature, without a scale sigma. The odds of the tree are used if it has any
-    (`LearnedTree`); else `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
+    ``w(n) = -sum of logit P(boundary) over the merges inside n``. So exp(v(c)) is proportional to the probability
+    that exactly the merges above the cut join different objects. The values are log probabilities, so cuts are
+    sampled at a temperature, without a scale sigma. If the tree has odds (`LearnedTree`), they are used. Without
+    odds, `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
@@ -145,9 +145,9 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
-    """Ascending nodes (n,) of the cut of largest value, for node values `w` (N,), by one pass up the tree.
+    """Nodes (n,) in ascending order of the cut of largest value, for node values `w` (N,), by one pass up the tree.
 
-    If parent and children tie, the parent is kept.
+    If a parent and its children have equal values, the parent is kept.
     """
     best = check_values(tree, w).tolist()
     keep = [True] * tree.n_nodes
@@ -168,7 +168,7 @@ def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OptimalCut(CutSampler):
-    """The optimal cut, `n` times, without randomness. The single-frame baseline (SceneCut)."""
+    """Returns the optimal cut `n` times, without randomness. `OptimalCut` is the single-frame baseline (SceneCut)."""
 
     def sample(self, rng: np.random.Generator, tree: Tree, w: np.ndarray, n: int) -> CutSample:
         cut = optimal_cut(tree, w)
@@ -177,7 +177,7 @@ class OptimalCut(CutSampler):
 
 @dataclass(frozen=True, eq=False)
 class Gibbs:
-    """A Gibbs law over the cuts of a tree and of its subtrees; lists have one entry per node."""
+    """A Gibbs distribution over the cuts of a tree and of its subtrees. Lists have one entry per node."""
 
     tree: Tree
     b: float  #: inverse temperature, per unit of value
@@ -186,7 +186,7 @@ class Gibbs:
     stop: list[float]  #: probability that a cut which reaches the node contains the node itself
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
-        """Draw a cut of the subtree of `node`, unordered; `random` returns uniform numbers in [0, 1)."""
+        """Draw a cut of the subtree of `node`, unordered. `random` returns uniform numbers in [0, 1)."""
         children, stop = self.tree.children, self.stop
         cut, stack = [], [node]
         while stack:
@@ -203,7 +203,7 @@ class Gibbs:
 
 
 def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
-    """The Gibbs law with inverse temperature `b` under node values `w` (N,)."""
+    """The Gibbs distribution with inverse temperature `b` under node values `w` (N,)."""
     values, n = w.tolist(), tree.n_nodes
     log_z, stop = [b * value for value in values], [1.0] * n
     for node in range(tree.n_leaves, n):
@@ -216,7 +216,7 @@ def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
 
 @dataclass(frozen=True)
 class ExactCuts(CutSampler):
-    """Independent exact draws from the Gibbs law exp(v / temperature); `temperature` is in units of value."""
+    """Independent exact draws from the Gibbs distribution exp(v / temperature), `temperature` in units of value."""
 
     temperature: PositiveFloat = 1.0
 

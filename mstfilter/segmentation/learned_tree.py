@@ -1,15 +1,15 @@
-"""Segmentation trees whose merges are decided by learned log odds: same object or not.
+"""Segmentation trees whose merges are decided by learned log odds of "different objects".
 
-Watershed regions of a boundary map are merged, the pair with the lowest log odds first. The log odds that two regions
-are different objects are linear in `FEATURES` of their border and of their union, which are recomputed when a region
-grows. A file of the model names the features and their weights, which were fitted on simulated scenes only.
+Watershed regions of a boundary map are merged. The pair with the lowest log odds is merged first. The log odds that
+two regions are different objects are linear in `FEATURES` of their border and of their union. The features are
+recomputed when a region grows. A model file has the features and their weights, fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
 >>> w = MergeLogOdds().values(tree, frame)
 
-Features of the size of a region are in pixels of a 640 px wide image. Disparity is in sensor units (1/8 px at f = 525
-px), lengths are in metres. "Front" is the region that is nearer to the camera at the border.
+Features that depend on the size of a region are in pixels of a 640 px wide image. Disparity is in sensor units (1/8
+px at f = 525 px), lengths are in metres. "Front" is the region that is nearer to the camera at the border.
 """
 
 from __future__ import annotations
@@ -186,15 +186,15 @@ def pair_features(
 ) -> np.ndarray:
     """The named features (k, f) of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
 
-    `border` (k, B) are their common borders, seen from `a`; `table_a` and `table_b` (k, B) their borders with the
-    table, zeros if there is none. `scale` is the image width / 640.
+    `border` (k, B) are the common borders of the pairs, seen from `a`. `table_a` and `table_b` (k, B) are the borders
+    of a and b with the table, with zeros if there is none. `scale` is the image width / 640.
     """
     pair = _PairMeasures(a, b, border, table_a, table_b, scale)
     return np.stack([FEATURES[name](pair) for name in names], axis=1)
 
 
 def check_weights(weights: Mapping[str, float], names: Iterable[str], where: object, hint: str) -> None:
-    """Raise InputError unless there is one finite weight for each of the features `names`."""
+    """Raise InputError unless every feature in `names` has one finite weight."""
     if not isinstance(weights, Mapping):
         raise InputError(f"{where} is no mapping from features to weights", f"fit them with: {hint}")
     for name in sorted(set(weights) ^ set(names)):
@@ -206,7 +206,7 @@ def check_weights(weights: Mapping[str, float], names: Iterable[str], where: obj
 
 
 class Agglomeration:
-    """Best-first merging of regions by the log odds that they are different objects; region 0, the table, stays."""
+    """Best-first merging of regions by the log odds that they differ. Region 0, the table, is never merged."""
 
     def __init__(self, regions: Regions, log_odds: PairLogOdds) -> None:
         n = len(regions.sums)
@@ -232,7 +232,7 @@ class Agglomeration:
             heapq.heappush(self.heap, (value, min(i, j), max(i, j)))
 
     def pop(self) -> tuple[float, int, int] | None:
-        """Remove the pair with the lowest log odds, (log odds, i, j); None if no pair is left."""
+        """Remove the pair with the lowest log odds, and return (log odds, i, j); None if no pair is left."""
         while self.heap:
             odds, i, j = heapq.heappop(self.heap)
             if i in self.alive and j in self.alive and j in self.borders[i]:
@@ -246,7 +246,7 @@ class Agglomeration:
             self.merge(i, j, odds)
 
     def merge(self, i: int, j: int, odds: float) -> int:
-        """Merge two regions and return the number of the new one."""
+        """Merge two regions and return the number of the new region."""
         new = len(self.borders)
         self.merges.append((i, j, odds))
         self.sums[new] = self.sums[i] + self.sums[j]
@@ -269,7 +269,7 @@ class Agglomeration:
 
 @dataclass(frozen=True)
 class MergedTree(TreeBuilder):
-    """Best-first merging of watershed regions, the leaves of the tree of `leaves`, by learned log odds.
+    """Best-first merging of watershed regions by learned log odds.
 
     The table is one leaf, with all else that is no object. Only the root merges it with other regions.
     """
@@ -278,11 +278,11 @@ class MergedTree(TreeBuilder):
 
     @abstractmethod
     def model(self) -> tuple[Mapping[str, float], str]:
-        """Weights of the features, and the key of the files of the model. Raises InputError if they do not fit."""
+        """Weights of the features, and key of the model files. Raises InputError if they do not match the code."""
 
     @abstractmethod
     def look(self, frame: Frame) -> SeenBorders | None:
-        """What a network sees in the frame; None without a network."""
+        """The output of a network for the frame; None without a network."""
 
     @property
     def weights_key(self) -> str:
@@ -291,7 +291,7 @@ class MergedTree(TreeBuilder):
 
     @property
     def bound_key(self) -> bytes:
-        """What is cached depends on the weights."""
+        """Key of the model, since cached values depend on the weights."""
         return self.weights_key.encode()
 
     def regions(self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray) -> Regions:
@@ -317,12 +317,12 @@ class MergedTree(TreeBuilder):
 
 @dataclass(frozen=True)
 class LearnedTree(MergedTree):
-    """`MergedTree` by the measurements of the image.
+    """`MergedTree` with the measurements of the image.
 
     Parameters
     ----------
     leaves : TreeBuilder
-        Its leaves are merged.
+        Builds the leaves that are merged.
     weights : str
         Name of a model of the package, or the path of a JSON file with one weight for each of `PAIR_FEATURES`.
     """
@@ -347,15 +347,15 @@ def read_tree_weights(name: str) -> tuple[Mapping[str, float], str]:
 
 @dataclass(frozen=True)
 class BorderTree(MergedTree):
-    """`MergedTree` by the measurements of the image and the evidence of a border network.
+    """`MergedTree` with the measurements of the image and the evidence of a border network.
 
-    The evidence is the log odds that the network gives to a border between two regions, and how far apart it sees the
-    centres of their objects. All weights were fitted together, on scenes that the network was not trained on.
+    The evidence is the log odds of a border between two regions, and the distance between the estimated centres of
+    their objects. All weights were fitted together, on scenes that were not used to train the network.
 
     Parameters
     ----------
     leaves : TreeBuilder
-        Its leaves are merged.
+        Builds the leaves that are merged.
     weights : str
         Name of a trained model of the package, or the path of its folder.
     """
@@ -377,7 +377,7 @@ class BorderTree(MergedTree):
 
 
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
-    """The tree of a list of merges. Merge k creates node n_regions + k; a root joins the remaining regions.
+    """The tree of a list of merges. Merge k creates node n_regions + k. A root joins the remaining regions.
 
     `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is its two nodes and its log
     odds.

@@ -1,6 +1,6 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
-The chain starts at the optimal cut c*. Its target is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
+The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
 ``s2 = sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The second form is
 for values that are log odds (`MergeLogOdds`), which need no scale.
 
@@ -12,11 +12,11 @@ for values that are log odds (`MergeLogOdds`), which need no scale.
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
 >>> sample.diagnostics["acceptance"], sample.diagnostics["autocorrelation_steps"]
 
-A `MoveRule` proposes the next cut. MoveNode (`NodeMoves`) draws one of the n nodes of the cut, and *up* or *down* by
-a fair coin. Up replaces the node and all its siblings, which must be in the cut, by their parent. Down replaces the
-node by its children. Each of m siblings proposes the same move up, so its probability is ``g(up) = m / (2 n)``. The
-reverse move has ``1 / (2 n')``, with n' nodes in the cut after the move up. A rule draws a choice, which determines
-the move:
+A `MoveRule` proposes the next cut. MoveNode (`NodeMoves`) draws one of the n nodes of the cut, and then *up* or
+*down* with equal probability. A move up replaces the node and all its siblings, which must be in the cut, by their
+parent. A move down replaces the node by its children. Each of the m siblings proposes the same move up, so the
+probability of this move is ``g(up) = m / (2 n)``. The reverse move has probability ``1 / (2 n')``, where n' is the
+number of nodes after the move up. A rule draws a choice, which determines the move:
 
 >>> state = CutState(tree, cut)
 >>> rule = NodeMoves()
@@ -80,7 +80,7 @@ class CutState:
         self.splittable -= bool(self.children[node])
 
     def apply(self, move: Move) -> None:
-        """Replace the removed nodes of a move by the added ones."""
+        """Replace the removed nodes of a move by the added nodes."""
         for node in move.removed:
             self._remove(node)
         for node in move.added:
@@ -122,12 +122,12 @@ class MoveRule(ABC):
 
     @abstractmethod
     def outcome(self, state: CutState, choice: Any) -> Move | None:
-        """The move that a choice results in; None if the chain stays."""
+        """The move that results from a choice; None if the cut does not change."""
 
 
 @dataclass(frozen=True)
 class NodeMoves(MoveRule):
-    """MoveNode of the paper: a uniform node of the cut, then up or down by a fair coin; impossible moves stay."""
+    """MoveNode of the paper: a uniform node of the cut, then up or down with equal probability, if possible."""
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool]:
         """A node of the cut, and True for up."""
@@ -153,11 +153,11 @@ class NodeMoves(MoveRule):
 
 @dataclass(frozen=True)
 class AuthorsMoves(MoveRule):
-    """The moves of the authors' program, including its error: the target law is not stationary.
+    """The moves of the authors' program, including its error: the target distribution is not stationary.
 
-    Uniform over (node, direction). Up is allowed for every node but the root and removes all nodes of the cut below
-    the parent. The forward probability of a move up is taken as 1 / M although each sibling in the cut proposes the
-    same move, so merges are accepted too often.
+    The choice is uniform over (node, direction). A move up is allowed for every node except the root. A move up
+    removes all nodes of the cut below the parent. The program takes 1 / M as the forward probability of a move up.
+    But each sibling in the cut proposes the same move, so merges are accepted too often.
     """
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:
@@ -198,16 +198,16 @@ class AuthorsMoves(MoveRule):
 
     @staticmethod
     def _count(n: int, splittable: int, at_root: bool) -> int:
-        """Number of possible moves: up for every node but the root, down for every inner node."""
+        """Number of possible moves: up for every node except the root, and down for every inner node."""
         return (0 if at_root else n) + splittable
 
 
 @dataclass(frozen=True, eq=False)
 class SubtreeRedraw(MoveRule):
-    """Redraw the part of the cut inside a random subtree from the Gibbs law `law`, the target of a temperature.
+    """Redraw the cut inside a random subtree from the Gibbs distribution `law`, the target with a temperature.
 
-    The subtree's node is uniform over the inner nodes, for any state; if an ancestor of it is in the cut, the chain
-    stays. A choice is (inner node, new nodes).
+    The subtree's node is uniform over the inner nodes in every state. If an ancestor of it is in the cut, the cut
+    does not change. A choice is (inner node, new nodes).
     """
 
     law: Gibbs
@@ -239,7 +239,7 @@ LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsM
 class CutChain:
     """A Metropolis-Hastings chain over cuts from an initial cut, one step at a time.
 
-    The target is the law with ``log_p(value)``, the log probability of a cut with this value, up to a constant.
+    The target distribution has the log probability ``log_p(value)`` for a cut with this value, up to a constant.
     """
 
     def __init__(self, tree: Tree, w: np.ndarray, log_p: Callable[[float], float], cut: np.ndarray) -> None:
@@ -253,7 +253,7 @@ class CutChain:
         self.value = sum(self.w[x] for x in self.state.nodes)
 
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
-        """Move of a choice (None: stay), value after it, and log of its acceptance ratio."""
+        """Move of a choice (None: no change), value after the move, and log of its acceptance ratio."""
         move = rule.outcome(self.state, choice)
         if move is None or move.log_ratio == -inf:
             return None, self.value, -inf
@@ -265,7 +265,7 @@ class CutChain:
         return move, value, self.log_p(value) - self.log_p(self.value) + move.log_ratio
 
     def step(self, random: Callable[[], float], rule: MoveRule) -> None:
-        """One step under a rule."""
+        """Make one step under a rule."""
         move, value, log_ratio = self.judge(rule, rule.choose(random, self.state))
         self.steps += 1
         if move is not None and (log_ratio >= 0 or random() < exp(log_ratio)):
@@ -274,7 +274,7 @@ class CutChain:
             self.accepted += 1
 
     def cut(self) -> np.ndarray:
-        """The present cut, ascending."""
+        """The present cut, in ascending order."""
         return np.sort(np.array(self.state.nodes, dtype=np.int64))
 
 
@@ -285,23 +285,24 @@ class MetropolisHastingsCuts(CutSampler):
     Parameters
     ----------
     sigma2 : float
-        s2 relative to the squared value of the optimal cut. No unit. Not used with a temperature.
+        s2 relative to the squared value of the optimal cut, without unit.It is not used with a temperature.
     burn_in : int
-        Steps before the first sample, in addition to `thinning`, per chain.
+        Steps before the first sample of each chain, in addition to `thinning`.
     thinning : int
-        Steps from one sample to the next.
+        Number of steps between samples.
     moves : {"node", "authors"}
-        Local moves: the paper's (exact), or the authors' program's, whose forward probability is wrong.
+        Rule of the local moves: the exact rule of the paper, or that of the authors, with a wrong forward
+        probability.
     redraw_share : float
-        Fraction of the steps that redraw a random subtree instead of making a local move; only with a temperature.
+        Fraction of steps that redraw a random subtree instead of a local move. Used only with a temperature.
     restart : bool
-        Start a new chain at the optimal cut for each sample.
+        If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
-        The first sample is the optimal cut itself.
+        If True, the first sample is the optimal cut.
     redraw_repeated : bool
-        If a cut was drawn before, draw once more and keep the second cut in any case.
+        If True and a cut was drawn before, draw once more and keep the second cut in any case.
     temperature : float
-        0: the law of the paper. > 0: the Gibbs law exp(v / temperature), in units of value.
+        0: the distribution of the paper. > 0: the Gibbs distribution exp(v / temperature), in units of value.
     """
 
     sigma2: PositiveFloat = 1e-3
@@ -350,14 +351,14 @@ class MetropolisHastingsCuts(CutSampler):
         return CutSample(tuple(cuts), np.array([log_p(float(w[cut].sum())) for cut in cuts]), diagnostics)
 
     def _law(self, best: float) -> Callable[[float], float]:
-        """Log probability of a cut relative to the optimal cut, from its value; `best` is v(c*)."""
+        """Log probability of a cut relative to the optimal cut, from its value. `best` is v(c*)."""
         if self.temperature > 0:
             return lambda value: (value - best) / self.temperature
         s2 = max(self.sigma2 * best**2, 1e-300)
         return lambda value: -((best - value) ** 2) / s2
 
     def _values(self, rng: np.random.Generator, chain: CutChain, w: np.ndarray) -> Iterator[float]:
-        """Make steps of a chain without end; yields the value of its cut after each step."""
+        """Make steps of a chain without end. Yields the value of the cut after each step."""
         random = _uniforms(rng).__next__
         local = LOCAL_MOVES[self.moves]()
         redraw = None
@@ -369,7 +370,7 @@ class MetropolisHastingsCuts(CutSampler):
 
 
 def _uniforms(rng: np.random.Generator) -> Iterator[float]:
-    """Uniform numbers, drawn in blocks: ten times faster than single draws."""
+    """Uniform numbers drawn in blocks, which is ten times faster than single draws."""
     while True:
         yield from rng.random(1024).tolist()
 
@@ -377,7 +378,8 @@ def _uniforms(rng: np.random.Generator) -> Iterator[float]:
 def _autocorrelation(trace: np.ndarray) -> float | None:
     """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
 
-    A chain shorter than about 50 such times underestimates it, so a low value does not prove convergence.
+    A chain shorter than about 50 autocorrelation times underestimates them, so a low value does not prove
+    convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:
         return None

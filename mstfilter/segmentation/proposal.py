@@ -5,9 +5,9 @@
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
 
 There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. If
-several objects of a hypothesis contain a voxel, one of them gets it, in every hypothesis separately.
+several objects of a hypothesis contain a voxel, one of them gets it. Each hypothesis is resolved separately.
 
-`ObjectRule` decides which regions of a cut are objects:
+An `ObjectRule` decides which regions of a cut are objects:
 
 >>> labels = ObjectRule().label_image(tree, cut, frame)      # (H, W): 0 background, k + 1 for node k of the cut
 """
@@ -101,7 +101,7 @@ class ObjectRule:
         return Segments(pixels, is_object)
 
     def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-        """(H, W) int32 segments of a cut: 0 is background, k + 1 the k-th node of the cut."""
+        """(H, W) int32 segments of a cut (default: the optimal one): 0 is background, and k + 1 its k-th node."""
         segments = self.segments(tree, frame, grid)
         cut = np.asarray(cut)
         numbers = np.where(segments.is_object[cut], np.arange(1, len(cut) + 1), 0)
@@ -111,9 +111,9 @@ class ObjectRule:
 def _core(tree: Tree, pixels: np.ndarray, radius: int) -> np.ndarray:
     """Number of pixels (N,) of each node whose square neighbourhood lies in the node and in `pixels`.
 
-    A neighbourhood lies in the lowest node that contains all of it and in the ancestors of that node, so one pass
-    over the pixels is sufficient. The lowest node is the one that contains the first and the last leaf of the
-    neighbourhood in depth-first order.
+    A neighbourhood lies in the lowest node that contains all of it, and in the ancestors of this node. So one pass
+    over the pixels is sufficient. In depth-first order of the leaves, the lowest node is the one that contains the
+    first and the last leaf of the neighbourhood.
     """
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     # First fill single missing readings inside an object.
@@ -134,13 +134,12 @@ class TreeCutProposal(Proposal):
     Parameters
     ----------
     sampler : CutSampler
-        Must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
+        Draws the cuts, and must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is
-        ``log p(c) - log p(c*)`` as in the paper and the authors' program; p then counts twice, in the draw and in the
-        weight.
+        ``log p(c) - log p(c*)`` as in the paper and the authors' program. With "p", p counts twice.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -169,7 +168,7 @@ class TreeCutProposal(Proposal):
         return memo("segmentation_tree", key, compute, stored_as=(Tree, np.ndarray))
 
     def of_clip(self, clip: Clip) -> TreeCutProposal:
-        """The same proposal with the boundary model of a clip, if the model depends on the clip."""
+        """The same proposal with the boundary model for a clip, if the model depends on the clip."""
         return replace(self, boundary=self.boundary.at(clip)) if isinstance(self.boundary, ClipBoundary) else self
 
     def label_image(self, frame: Frame, grid: VoxelGrid | None = None, cut: np.ndarray | None = None) -> np.ndarray:
@@ -214,9 +213,10 @@ def complete_segments(
 ) -> tuple[tuple[Hypothesis, ...], dict[str, Any]]:
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts for the notes.
 
-    Each sample is an array of segments, int64; ``mask_of(segment)`` is (H, W) bool. Each distinct segment is
-    completed once, with the stream ``"completion", segment``, so the result does not depend on the other segments. A
-    stochastic completer completes it again for each further sample, with the stream ``"completion", segment, k``.
+    Each sample is an array of segments, int64. ``mask_of(segment)`` returns (H, W) bool. Each distinct segment is
+    completed once, with the stream ``"completion", segment``. So the result does not depend on the other segments. A
+    stochastic completer completes a segment again for each further sample, with the stream
+    ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()
@@ -247,7 +247,7 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from completed segments of a frame, at the pause `birth`.
 
-    Labels are 1, 2, ... in order; segments without voxels get no record. `threshold` is the smallest probability of
+    Labels are 1, 2, ... in order. Segments without voxels get no record. `threshold` is the smallest probability of
     an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
     """
     labels = arbitrate(completions, grid, threshold)

@@ -1,6 +1,6 @@
 """Measurements of image regions and of their common borders.
 
-Regions and borders are measured as sums over pixels, so the row of a merged region is the sum of two rows. Disparity
+Regions and borders are measured as sums over pixels. So the row of a merged region is the sum of two rows. Disparity
 is in sensor units (1/8 px at f = 525 px), lengths are in metres.
 
 >>> leaves = object_leaves(watershed, pixels)                 # objects do not share a leaf with the table
@@ -69,7 +69,7 @@ _MOST_LOG_ODDS = 6.0  # of a seen border
 
 @dataclass(frozen=True, eq=False)
 class SeenBorders:
-    """What a border network sees in a frame."""
+    """The output of a border network for a frame."""
 
     border: np.ndarray  #: (H, W) float32, calibrated log odds that the pixel is at the border of an object
     foreground: np.ndarray  #: (H, W) float32, log odds that the pixel belongs to an object
@@ -176,7 +176,7 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
 
 
 def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:
-    """For every region its neighbours and the border rows (columns `BORDER`).
+    """For every region, its neighbours and the border rows (columns `BORDER`).
 
     `maps` (H, W, 4) are the boundary strength, the concave and the convex curvature, and the log odds of a border.
     """
@@ -221,7 +221,7 @@ def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray
 
 
 def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: int) -> np.ndarray:
-    """Values of an image (H, W) at pixels moved along an axis; pixels outside take the value at the edge."""
+    """Values of an image (H, W) at pixels moved along an axis. Pixels outside take the value at the edge."""
     index = list(at)
     index[axis] = np.clip(at[axis] + shift, 0, image.shape[axis] - 1)
     return image[tuple(index)]

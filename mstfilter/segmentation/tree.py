@@ -1,8 +1,8 @@
 """The segmentation tree: a hierarchy of image regions, and its construction from a boundary map.
 
-A tree is a parent array. Leaves come first (0 .. n_leaves - 1), every parent has a larger index than its children,
-and the root is last, so a loop over ascending indices visits children before parents. A *cut* is an ascending array
-of nodes that covers every leaf exactly once: one segmentation of the image.
+A tree is stored as a parent array. Leaves come first (0 .. n_leaves - 1), and the root is last. Every parent has a
+larger index than its children, so a loop over ascending indices visits children first. A *cut* is an ascending array
+of nodes that covers every leaf exactly once, so it is a segmentation of the image.
 
 >>> import numpy as np
 >>> from mstfilter.segmentation import Tree
@@ -13,10 +13,10 @@ of nodes that covers every leaf exactly once: one segmentation of the image.
 array([[1, 1],
        [1, 0]])
 
-`UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011): watershed regions of the boundary map are merged
-in order of the mean strength of their common border. A logistic curve maps the height of a merge, which is this mean,
-to P(boundary), the probability that it joins different objects. `start` is P(boundary) of the merge that makes a
-node: near 0 if the node lies inside one object, near 1 if it contains several.
+`UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
+in order of the mean strength of their common border. The height of a merge is this mean strength. A logistic curve
+maps this height to P(boundary), the probability that the merge joins different objects. `start` is P(boundary) of the
+merge that makes a node. `start` is near 0 if the node lies inside one object, and near 1 if it contains several.
 """
 
 from __future__ import annotations
@@ -94,14 +94,14 @@ class Tree:
 
     @cached_property
     def end(self) -> np.ndarray:
-        """(N,) `start` of the parent: P(boundary) of the merge that absorbs the node. 1 for the root."""
+        """(N,) `start` of the parent: P(boundary) of the merge that absorbs the node, or 1 for the root."""
         end = self.start[self.parent]
         end[self.root] = 1.0
         return read_only(end)
 
     @cached_property
     def children(self) -> tuple[tuple[int, ...], ...]:
-        """Children of every node, ascending; empty for leaves. Python integers, which are fast in loops."""
+        """Children of every node in ascending order, as Python integers, which are fast in loops."""
         found: list[list[int]] = [[] for _ in range(self.n_nodes)]
         for node, parent in enumerate(self.parent[:-1].tolist()):
             found[parent].append(node)
@@ -129,7 +129,7 @@ class Tree:
 
     @cached_property
     def _leaf_ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Leaves in depth-first order, and for every node the first and the end of its range in that order."""
+        """Leaves in depth-first order, and for every node the start and the end of its range in this order."""
         n, parent = self.n_nodes, self.parent.tolist()
         count = [1] * self.n_leaves + [0] * (n - self.n_leaves)
         for i in range(n - 1):
@@ -145,11 +145,11 @@ class Tree:
 
     @cached_property
     def leaf_position(self) -> np.ndarray:
-        """(n_leaves,) position of every leaf in depth-first order; the leaves of a node are consecutive."""
+        """(n_leaves,) position of every leaf in depth-first order. The leaves of a node are consecutive."""
         return read_only(self._leaf_ranges[1][: self.n_leaves].copy())
 
     def lowest_common(self, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Lowest nodes (k,) that contain the leaves at positions `first` (k,) to `last` (k,), first <= last."""
+        """Lowest nodes (k,) that contain the leaves at positions `first` (k,) to `last` (k,); first <= last."""
         order, _, end = self._leaf_ranges
         node = order[np.asarray(first)]
         last = np.asarray(last)
@@ -165,7 +165,7 @@ class Tree:
         return order[first[node] : last[node]]
 
     def label_image(self, cut: np.ndarray) -> np.ndarray:
-        """(H, W) index into `cut` of the node that covers each pixel; -1 for pixels that no node covers."""
+        """(H, W) index into `cut` of the node that covers each pixel; -1 for pixels without a node."""
         labels = np.full(self.n_leaves, -1, dtype=np.int64)
         for k, node in enumerate(np.asarray(cut).tolist()):
             labels[self.leaves_of(node)] = k
@@ -206,7 +206,7 @@ class TreeBuilder(Checked, ABC):
 
 @dataclass(frozen=True)
 class UcmTree(TreeBuilder):
-    """Watershed, average linkage by mean boundary strength, pruned to the strongest merges.
+    """Watershed, then average linkage by mean boundary strength, pruned to the strongest merges.
 
     The logistic curve and the colour weight of `ColourDepthBoundary` were fitted together on the 45 `learn` frames of
     mOSD. experiments/osd_frames reports results on other camera set-ups.
@@ -218,7 +218,7 @@ class UcmTree(TreeBuilder):
     centre : float
         Merge height (mean boundary strength 0 .. 1) at which P(boundary) = 0.5.
     slope : float
-        Slope of the log odds, per unit of height.
+        Slope of the log odds per unit of height.
     """
 
     max_leaves: PositiveInt = 501
@@ -244,7 +244,7 @@ class UcmTree(TreeBuilder):
 
 
 def merge_tree(boundary: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The complete hierarchy: parents (N,), merge heights (N,) with 0 for leaves, leaf image (H, W)."""
+    """The complete hierarchy: parents (N,), merge heights (N,) with 0 for leaves, and leaf image (H, W)."""
     import higra as hg
 
     shape = boundary.shape
@@ -267,9 +267,9 @@ def linkage_tree(
 ) -> tuple[Any, np.ndarray, np.ndarray] | None:
     """Watershed and average linkage of a pixel graph: higra's tree, merge heights (N,), leaf image (H, W).
 
-    `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` gives the strength of the borders between the
-    watershed regions; the default is the mean weight of the edges of a border. `arcs` (E,) is the border of each
-    edge, -1 within a region. None if there is only one region.
+    `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` returns the strength of the borders between
+    the watershed regions. By default the strength is the mean weight of the edges of a border. `arcs` (E,) is the
+    border of each edge, or -1 within a region. Returns None if there is only one region.
     """
     import higra as hg
 
@@ -291,9 +291,9 @@ def linkage_tree(
 def prune(
     parent: np.ndarray, altitude: np.ndarray, leaves: np.ndarray, max_leaves: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that they merge become the leaves.
+    """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that these merges join become the leaves.
 
-    Heights do not decrease upwards and parents come after children, so the kept merges contain the root and are
+    Heights do not decrease upwards and parents come after children. So the kept merges contain the root and are
     connected.
     """
     n = len(parent)

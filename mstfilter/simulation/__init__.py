@@ -20,8 +20,8 @@ The lower modules, from bottom to top, are `solids` and `shapes` (objects), `fam
 and `renderer` (images by ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
 
 The simulation lacks camera motion, glossy and transparent surfaces, light reflected between objects, articulated and
-soft objects, and a hand. Depth noise, the shadow of the projector and losses at edges are calibrated to real frames;
-within surfaces, noise is not correlated between pixels.
+soft objects, and a hand. Depth noise, the shadow of the projector and losses at edges are calibrated to real frames.
+Within surfaces, noise is not correlated between pixels.
 """
 
 from mstfilter.lazy import attach

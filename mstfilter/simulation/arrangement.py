@@ -1,7 +1,7 @@
-"""Placement of objects on the table: clusters, twins in contact, stacks and hidden objects.
+"""Placement of objects on the table: clusters, touching pairs of equal objects (twins), stacks and hidden objects.
 
-Each object is moved towards the cluster until it nearly touches (bisection on MuJoCo's contacts), so contacts are
-designed. Then physics settles all objects.
+Each object is moved towards the cluster until it nearly touches another object (bisection on MuJoCo's contacts). So
+contacts are controlled. After placement, the physics runs until all objects are at rest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SceneObjects:
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw the shapes and textures of a scene; a family of shapes repeats only after all others have been used."""
+    """Draw the shapes and textures of a scene. A family of shapes repeats only after all others have been used."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []
@@ -84,7 +84,7 @@ def _contact_distance(
 ) -> float:
     """Least distance in metres from `goal` along a direction at which object k overlaps no object.
 
-    It is found by steps inwards until the first overlap, then by bisection.
+    The distance is found by steps inwards until the first overlap, and then by bisection.
     """
     direction = np.array([np.cos(angle), np.sin(angle)])
 
@@ -116,9 +116,9 @@ def _put_beside(
     attempts: int = _ATTEMPTS,
     pose: _RestPose = "any",
 ) -> bool:
-    """Put object k next to one of `neighbours`, `gap` metres from the first object that it meets.
+    """Put object k next to one of `neighbours`, `gap` metres from the first object on its way.
 
-    `towards` (2,) is the approximate direction from the neighbour; None for any direction.
+    `towards` (2,) is the approximate direction from the neighbour, or None for any direction.
     """
     table_radius = min(0.32, 0.20 + 0.012 * world.n_objects)
     start = world.positions()[k]
@@ -198,7 +198,7 @@ def _try_arrangement(
     n_touching: int,
     n_unseen: int,
 ) -> bool:
-    """Place all objects once; whether at least so many twins touch and so many objects are hidden."""
+    """Place all objects once. Returns whether enough twins touch and enough objects are hidden."""
     originals = [int(k) for k in rng.permutation([k for k, t in enumerate(twin_of) if t < 0])]
     twins = [k for k, t in enumerate(twin_of) if t >= 0]
     stacked = originals[len(originals) - min(family.n_stacked, len(originals) - 1) :] if family.n_stacked else []
@@ -243,10 +243,10 @@ def _try_arrangement(
 def arrange_objects(
     rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily, twin_of: tuple[int, ...]
 ) -> None:
-    """Place all objects and let them settle, with twins in contact and some objects hidden.
+    """Place all objects and run the physics until they are at rest, with touching twins and some hidden objects.
 
-    In a dense heap, settling may separate some twins or reveal hidden objects; after some attempts fewer suffice.
-    Raises InputError if the objects do not fit on the table.
+    In a dense heap, the physics may separate twins or reveal hidden objects. After some attempts fewer are
+    sufficient. Raises InputError if the objects do not fit on the table.
     """
     empty = world.save()
     twins = sum(t >= 0 for t in twin_of)

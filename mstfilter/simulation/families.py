@@ -4,10 +4,10 @@
 >>> scene_family("demo").n_frames, scene_family("table").grid().shape
 (15, (100, 100, 50))
 
-A family is a frozen `SceneFamily`; `dataclasses.replace` makes variants for `simulate_recording`. Entries of
+A family is a frozen `SceneFamily`. `dataclasses.replace` makes variants for `simulate_recording`. Entries of
 `SCENE_FAMILIES` have a name on the command line and in studies. New kinds of objects are added to `_MAKERS` in
 `shapes`. The studies use `s1`, `s2` and `s3`: 5, 9 and 15 - 20 objects with the same camera, sensor, textures and
-contacts. `catalogue` separates scenes for tuning from scenes for reporting; in `s1` - `s3` the seed decides.
+contacts. `catalogue` separates scenes for tuning from scenes for reporting. In `s1` - `s3` the seed determines it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _Edge = Annotated[float, Bounds(at_least=0.1, at_most=2.0)]
 
 @dataclass(frozen=True)
 class SceneFamily(Bounded):
-    """How scenes are drawn, moved and imaged."""
+    """Parameters of scenes: how they are drawn, moved and imaged."""
 
     name: str = "table"  #: name of the family
     n_objects_min: PositiveInt = 5  #: range of the number of objects on the table, twins included; uniform
@@ -87,7 +87,7 @@ class SceneFamily(Bounded):
 
     @property
     def action_seconds(self) -> float:
-        """Seconds from one pause to the next, without the time to settle."""
+        """Seconds from one pause to the next, without the time until objects are at rest."""
         return (self.frames_per_clip - 1) / self.fps
 
     @property
@@ -113,7 +113,7 @@ class SceneFamily(Bounded):
         return names
 
     def camera(self) -> Camera:
-        """A Kinect's camera that looks down at the middle of the table, scaled to the images of the family."""
+        """Camera of a Kinect that looks down at the middle of the table, scaled to the images of the family."""
         eye = _LOOKS_AT + self.camera_distance * _TOWARDS_CAMERA
         kinect = Camera.from_intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480, look_at(eye, _LOOKS_AT))
         scaled = kinect.scaled(self.width / 640.0)

@@ -1,8 +1,8 @@
 """Drawing of flat charts: printed cartons and labels, wood, cloth, speckle, glaze, peel.
 
-Each function takes a generator and the size of the chart in metres. It returns an RGB uint8 image with 0.4 mm per
-pixel; `textures` scales the charts to the resolution of the camera. Colours have low saturation, like real packaging
-under office light seen by a cheap sensor.
+Each function takes a generator and the size of the chart in metres. The function returns an RGB uint8 image with 0.4
+mm per pixel, which `textures` scales to the resolution of the camera. Colours have low saturation, like real
+packaging under office light in a cheap camera.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.printing import wood
@@ -75,12 +75,12 @@ def _tint(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
 
 
 def _ink(colour: _Rgb) -> _Rgb:
-    """Black or white, the one with more contrast to a ground."""
+    """Black or white, whichever has more contrast to the ground."""
     return (28, 26, 30) if 0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2] > 125 else (240, 238, 232)
 
 
 def _write(image: np.ndarray, text: str, box: _Box, ink: _Rgb, bold: bool = True) -> None:
-    """Write text that fills a box of the image, centred."""
+    """Write centred text that fills a box of the image."""
     import cv2
 
     x, y, width, height = box
@@ -194,7 +194,7 @@ def label_side(
     words: tuple[str, str],
     pool: Pool = ANY,
 ) -> np.ndarray:
-    """The unrolled label of a can or bottle: metal rims, bands, the name twice, a picture, small print."""
+    """The unrolled label of a can or bottle: metal rims, bands, the name twice, a picture, and small print."""
     import cv2
 
     ground, second = colours

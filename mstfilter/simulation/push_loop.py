@@ -1,4 +1,4 @@
-"""A simulated scene that is changed by chosen pushes: for filters that decide what the robot does next.
+"""A simulated scene that chosen pushes change, for filters that decide the next action of the robot.
 
 >>> from mstfilter import Belief, preset
 >>> from mstfilter.simulation import PushLoop, scene_family
@@ -9,8 +9,8 @@
 ...     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=50))
 ...     state, _ = mst.step(state, loop.play(push or pushes[0]))
 
-A policy chooses one of the candidates. It sees clips and beliefs; only scores use the truth. The scene and its
-candidates depend on the family, the seed and the pushes so far.
+A policy chooses one of the candidates. The policy gets clips and beliefs. Only scores use the truth. The scene and
+its candidates depend on the family, the seed and the pushes so far.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class PushLoop:
     Parameters
     ----------
     family : SceneFamily
-        `n_actions` is ignored: any number of pushes can be played.
+        `n_actions` is ignored, since any number of pushes can be played.
     seed : int
 
     Attributes
     ----------
     clip : Clip
-        From the last pause to the present one; the observation of a step of a filter.
+        The clip from the last pause to the present pause, which is the observation of a filter step.
     effects : list of PushEffect
         The effect of every push.
     """
@@ -93,9 +93,9 @@ class PushLoop:
         return len(self.effects)
 
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
-        """n pushes towards objects, with a free place for the finger to come down; the scene is left unchanged.
+        """n pushes towards objects, with a free place for the finger to come down. The scene does not change.
 
-        They are drawn towards true objects, so most of them move something; some move nothing or drop an object.
+        Pushes are drawn towards true objects, so most of them move something. Some move nothing or drop an object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)
@@ -111,7 +111,7 @@ class PushLoop:
         )
 
     def play(self, push: FingerPush) -> Clip:
-        """Play a push and record it; returns the clip from the last pause to the new one."""
+        """Simulate a push and record it. Returns the clip from the last pause to the new pause."""
         check_component("push", push, FingerPush)
         first = len(self._recorded) - 1
         self.effects.append(self._scene.play(push, self._add_frame))
@@ -126,7 +126,7 @@ class PushLoop:
         return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 
     def restore(self, state: LoopState) -> None:
-        """Return to a saved state of this loop; the same pushes then give the same images."""
+        """Return to a saved state of this loop. The same pushes then give the same images."""
         self._scene.world.restore(state.world)
         self._scene.stage.restore(state.stage)
         self._recorded, self.effects, self.clip = list(state.recorded), list(state.effects), state.clip

@@ -1,22 +1,22 @@
-"""Recording of simulated scenes: one call, one integer seed, one folder.
+"""Recording of simulated scenes, where one call and one integer seed make one folder.
 
 >>> from mstfilter.simulation import scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 >>> recording.truth(0).shape  # doctest: +SKIP
 (80, 80, 30)
 
-The same family and seed give the same bytes (on one machine and build of the libraries). Each part draws from its own
-stream, named after the part and its index.
+The same family and seed give the same bytes on one machine with one build of the libraries. Each part draws from its
+own stream, named after the part and its index.
 
-`cached_recording` keeps recordings on disk and finds them again.
+`cached_recording` stores recordings on disk and finds them again.
 
 >>> from mstfilter import open_recording
 >>> from mstfilter.simulation import cached_recording
 >>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
-The name of a cached folder holds a hash of everything that determines its bytes: all fields of the family, the seed,
-the versions of the simulator and of MuJoCo. The folder is written under another name and renamed, so it is complete.
+The name of a cached folder has a hash of everything that determines its bytes: the family's fields, the seed, and the
+versions of the simulator and of MuJoCo. The folder is written under another name and renamed, so that it is complete.
 Several processes can ask for the same recording.
 """
 
@@ -100,7 +100,7 @@ class SimulatedScene:
         return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
     def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
-        """Play a push from one pause to the next; ``on_frame(time)`` is called at each frame between them."""
+        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame between them."""
         family, world = self.family, self.world
         before, began = world.poses(), world.time
         for step in range(1, family.frames_per_clip - 1):
@@ -211,7 +211,7 @@ def _describe_push(push: FingerPush, result: PushEffect) -> dict[str, Any]:
 
 
 def cache_folder() -> Path:
-    """Folder of cached files: MSTFILTER_CACHE, else `mstfilter` in the user's cache folder."""
+    """Folder of cached files, which is MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
     if folder := os.environ.get("MSTFILTER_CACHE"):
         return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
@@ -229,14 +229,14 @@ def recipe_key(family: SceneFamily, seed: int) -> str:
 
 
 def cached_path(family: SceneFamily, seed: int, folder: Path) -> Path:
-    """Where `cached_recording` keeps a recording in a folder; it need not exist."""
+    """The path at which `cached_recording` stores a recording in a folder. The folder need not exist."""
     return folder / f"{family.name}-{seed}-{recipe_key(family, seed)}"
 
 
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
-    """The folder of a simulated recording, which is simulated if it does not exist or has changed on the disk.
+    """The folder of a simulated recording. The recording is simulated if it does not exist or has changed on disk.
 
-    `overrides` are fields of the family to change. Recordings are kept in `folder`; by default `recordings` in
+    `overrides` are fields of the family to change. Recordings are stored in `folder`, by default `recordings` in
     `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be
     written.
     """

@@ -1,4 +1,4 @@
-"""Colour, depth and instance images by ray casting; needs no display, GPU or OpenGL.
+"""Colour, depth and instance images by ray casting, which needs no display, GPU or OpenGL.
 
 One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
 the textures.
@@ -38,8 +38,8 @@ def visible_texel(camera: Camera) -> float:
 class Renderer:
     """Renders the current state of a world.
 
-    There is one skin for each object. `supersample` casts additional rays for pixels on edges. The rendered poses may
-    differ from the physics by `tolerance` metres; see `Stage`.
+    There is one skin (texture) for each object. `supersample` casts additional rays for pixels on edges. The rendered
+    poses may differ from the physics by `tolerance` metres; see `Stage`.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Renderer:
         return colour
 
     def _unshadowed_light(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Light (n, 3) on floor, wall and the rim of the table: no shadows, less with distance."""
+        """Light (n, 3) on floor, wall and the rim of the table, without shadows and decreasing with distance."""
         lamp = self.room.lamp.mean(axis=0)
         reach = np.linalg.norm(points - lamp, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -116,7 +116,7 @@ class Renderer:
         return lamp[:, None] * room.lamp_colour + sky[:, None] * room.sky_colour + room.ambient
 
     def render(self) -> View:
-        """Images of the world as it is now."""
+        """Images of the world in its present state."""
         h, w = self.camera.height, self.camera.width
         self.stage.follow()
         self._lamp_map.update(self.stage)

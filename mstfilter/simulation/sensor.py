@@ -1,10 +1,10 @@
 """Models of a structured-light depth sensor and of a colour camera.
 
-Depth: pixels on depth edges are shifted sideways, some neighbours together. Disparity has Gaussian noise and is
-rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). This gives
+In depth, pixels on depth edges are shifted sideways, with some neighbours shifted together. Disparity has Gaussian
+noise and is rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). The rounding gives
 sigma = 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the
-left of objects), at some depth edges, on surfaces seen at a grazing angle, and out of range.
-Colour: exposure, blur of the optics, photon noise, the sRGB curve.
+left of objects), at some depth edges, on surfaces at a grazing angle, and out of range. Colour has exposure, blur of
+the optics, photon noise, and the sRGB curve.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.sensor import DepthSensor
@@ -46,12 +46,12 @@ class DepthSensor(Bounded):
     Parameters
     ----------
     lateral : float
-        Standard deviation of the sideways shift on depth edges, pixels of the sensor's raster.
+        Standard deviation of the sideways shift on depth edges, in pixels of the sensor's raster.
     edge_dropout : float
-        Probability that a patch of pixels within two pixels of a depth edge has no reading. It and `fill` are fitted
-        to how often readings are missing 1 .. 10 pixels to each side of objects in 45 real frames.
+        Probability that a patch of pixels within two pixels of a depth edge has no reading. This value and `fill`
+        were fitted to the frequencies of missing readings 1 .. 10 pixels to each side of objects in 45 real frames.
     fill : float
-        Shadows of the projector up to this width are filled by the sensor, pixels of its raster.
+        The sensor fills shadows of the projector up to this width, in pixels of its raster.
     """
 
     lateral: NonNegativeFloat = 0.5
@@ -61,7 +61,7 @@ class DepthSensor(Bounded):
     def read(self, rng: np.random.Generator, depth: np.ndarray, slant: np.ndarray) -> np.ndarray:
         """Depth image (H, W) float32 in metres, NaN for no reading.
 
-        `depth` (H, W) is the true z-depth in metres, NaN for no surface; `slant` (H, W) the cosine of the angle of
+        `depth` (H, W) is the true z-depth in metres, with NaN for no surface. `slant` (H, W) is the cosine of
         incidence.
         """
         h, w = depth.shape
@@ -87,10 +87,10 @@ class DepthSensor(Bounded):
         return np.where(lost | ~np.isfinite(z), np.nan, reading).astype(np.float32)
 
     def _unlit(self, depth: np.ndarray) -> np.ndarray:
-        """Surfaces that the projector, a baseline to the right of the camera, does not light: (H, W) bool.
+        """Surfaces that the projector, a baseline to the right of the camera, does not illuminate. (H, W) bool.
 
-        Seen by the projector, column u of depth z is at u - f b / z. A surface is in shadow if another one, farther
-        right in the camera's image, is to its left there.
+        In the image of the projector, column u of depth z is at u - f b / z. A surface is in shadow if another
+        surface, farther right in the camera's image, is to its left in the projector's image.
         """
         w = depth.shape[1]
         disparity = _FOCAL * w / 640.0 * _BASELINE / np.where(np.isfinite(depth), depth, np.inf)
@@ -100,7 +100,7 @@ class DepthSensor(Bounded):
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Whether a pixel or its neighbour is at a step in depth: (H, W) bool."""
+    """Whether a pixel or its neighbour is at a step in depth. (H, W) bool."""
     edge = np.zeros(depth.shape, bool)
     for here, there in NEIGHBOURS:
         first, second = depth[here], depth[there]
@@ -119,7 +119,7 @@ def _patches(draw: Callable[..., np.ndarray], h: int, w: int, side: int) -> np.n
 
 
 def colour_reading(rng: np.random.Generator, linear: np.ndarray) -> np.ndarray:
-    """sRGB image (H, W, 3) uint8 of a colour camera from exposed linear light (H, W, 3), 1 for white."""
+    """sRGB image (H, W, 3) uint8 of a colour camera from exposed linear light (H, W, 3), in which 1 is white."""
     import cv2
 
     light = np.maximum(cv2.GaussianBlur(linear, (0, 0), _BLUR), 0.0)

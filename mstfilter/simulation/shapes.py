@@ -1,4 +1,4 @@
-"""Household objects made of convex pieces: their shapes, the sizes they are drawn with, the voxels they fill.
+"""Household objects made of convex pieces: their shapes, sizes and voxels.
 
 `draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body, the poses in which it rests, its mass
 and the layout of its texture. The origin of the frame is the middle of the bounding box; z is up in the main pose.
@@ -9,15 +9,14 @@ and the layout of its texture. The origin of the frame is the middle of the boun
 >>> len(shape.pieces), shape.family
 (1, 'can')
 
-Sizes and masses follow objects of the YCB set, rounded. The set is that of B. Calli, A. Walsman, A. Singh, S.
-Srinivasa, P. Abbeel, A. M. Dollar, "Benchmarking in manipulation research: the YCB object and model set", IEEE
-Robotics & Automation Magazine 22(3), 2015, table of objects. The objects are cracker, sugar, pudding and gelatin box,
-soup, tuna and coffee can, mug, bowl, banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits,
-bricks, bottle, soap and angle are not in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls
-of bowl and mug are 1 cm, thicker than the real ones. A thinner wall falls between the centres of 1 cm voxels and
-would be missing from the true volume.
+Sizes and masses follow objects of the YCB set, rounded. The YCB set is described by Calli et al., "Benchmarking in
+manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3), 2015, table of
+objects. The objects are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl, banana, ball.
+The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not in the set
+and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, which is thicker than
+real walls. A thinner wall would fall between the centres of 1 cm voxels and be missing in the true volume.
 
-`label_voxels` gives the true volume: the voxels of each object, hidden ones included.
+`label_voxels` returns the true volume: the voxels of each object, including hidden ones.
 
 >>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.simulation.shapes import label_voxels
@@ -54,10 +53,10 @@ _UP_X, _UP_Y, _UP_Z, _DOWN_Z = 1, 2, 3, -3
 
 @dataclass(frozen=True)
 class Pool:
-    """The sizes, hues and names that scenes draw from.
+    """The sizes, hues and names from which scenes are drawn.
 
     Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range in alternate bands,
-    so neither is harder than the other.
+    so that they are equally difficult.
     """
 
     half: int | None = None  #: {0, 1, None}: which of the two disjoint pools; None for all sizes, hues and names
@@ -80,7 +79,7 @@ class Pool:
         return (2 * k + self.half + _within_band(u * _N_HUES / 2 - k)) / _N_HUES
 
     def name(self, rng: np.random.Generator, names: Sequence[str]) -> str:
-        """One of the names that belong to the pool."""
+        """One of the names in the pool."""
         available = names if self.half is None else names[self.half :: 2]
         return available[int(rng.integers(len(available)))]
 
@@ -140,10 +139,10 @@ class Shape:
 
 
 def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, 0 if it lies in none.
+    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, and 0 if it lies in none.
 
-    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre; a centre that lies in two
-    objects belongs to the first.
+    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A centre in two objects
+    belongs to the first.
     """
     labels = np.zeros(grid.shape, np.uint16)
     for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
@@ -295,7 +294,7 @@ SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)  #: Names of the families of ob
 
 
 def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:
-    """Draw a member of one of `SHAPE_FAMILIES`; each measure is scaled by a factor drawn from the pool."""
+    """Draw a member of one of `SHAPE_FAMILIES`. Each measure is scaled by a factor from the pool."""
     if family not in _MAKERS:
         raise InputError(f"unknown family of shapes {family!r}", f"known: {', '.join(SHAPE_FAMILIES)}")
     return _MAKERS[family](rng, lambda: pool.factor(rng))

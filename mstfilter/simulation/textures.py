@@ -1,8 +1,8 @@
 """Textures of objects and the room around them.
 
-The skin of a body is a few flat charts (`draw_skin`). The body coordinates and the normal of a surface point give its
-chart and its place there (`texture_coordinates`). An `Atlas` holds the charts of all bodies in one array, so shading
-is one gather. Charts are seen from outside with their upper edge up: text is never mirrored.
+The skin of a body consists of a few flat charts (`draw_skin`). Body coordinates and normal of a surface point
+determine its chart and its place in the chart (`texture_coordinates`). An `Atlas` holds the charts of all bodies in
+one array, so shading is one gather. Charts show the outside with the upper edge up, so text is never mirrored.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -11,7 +11,7 @@ is one gather. Charts are seen from outside with their upper edge up: text is ne
 >>> len(skin.charts), skin.gloss < 0.2
 (7, True)
 
-The `Room` is table top, floor, wall, light and exposure; each scene draws its own (`draw_room`).
+The `Room` consists of table top, floor, wall, light and exposure. The room is drawn for each scene (`draw_room`).
 
 >>> from mstfilter.simulation.textures import draw_room
 >>> room = draw_room(np.random.default_rng(0), texel=0.004)
@@ -69,10 +69,10 @@ def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
 def texture_coordinates(
     shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chart number (n,) of surface points and place (n, 2) in it, 0 .. 1 from its upper left corner.
+    """Chart number (n,) of surface points, and place (n, 2) in it, 0 .. 1 from its upper left corner.
 
-    `points` and outward unit `normals` (n, 3) are in the body's frame, metres; `plain` (n,) bool are points of pieces
-    that have one colour.
+    `points` and outward unit `normals` (n, 3) are in the body's frame, in metres. `plain` (n,) bool are points with
+    one colour.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":
@@ -99,7 +99,7 @@ def texture_coordinates(
 
 
 def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
-    """Draw a texture that suits the shape, with hues and names of a pool."""
+    """Draw a texture that is suitable for the shape, with hues and names from a pool."""
     style = shape.finish[int(rng.integers(len(shape.finish)))]
     sizes = _chart_sizes(shape)
     pair = (printing.shade(rng, pool=pool), printing.shade(rng, (0.55, 0.95), 0.65, pool))
@@ -147,7 +147,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
 
 
 class Atlas:
-    """The charts of many skins in one array, averaged down to the resolution of a camera: `texel` metres."""
+    """The charts of many skins in one array, averaged to the resolution of a camera, `texel` metres."""
 
     def __init__(self, skins: list[Skin], texel: float) -> None:
         import cv2
@@ -212,7 +212,7 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
 
 
 def draw_room(rng: np.random.Generator, texel: float) -> Room:
-    """Draw the surroundings of a scene; `texel` is the resolution of the table top in metres."""
+    """Draw the surroundings of a scene. `texel` is the resolution of the table top in metres."""
     table = _linear(_table_top(rng, texel))
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])

@@ -9,12 +9,12 @@
 True
 
 The time step is 2 ms, the integrator is implicit, friction cones are elliptic. Objects are unions of convex pieces
-with torsional and rolling friction. The finger is a capsule on three slides with stiff position actuators; the arm
+with torsional and rolling friction. The finger is a capsule on three slides with stiff position actuators. The arm
 above it is visible but touches nothing.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates candidate lines through the objects from the saved state and takes the first that moves enough of them
-without dropping any off the table. Physics costs little compared with rendering, so dozens of candidates are tried.
+simulates candidate lines through the objects from the saved state. `choose_push` takes the first line that moves
+enough objects and drops none. Physics is fast compared with rendering, so dozens of candidates are tried.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
-    Object k of the world is shapes[k]; its id in images, voxels and poses is k + 1. Objects start far away: `place`
-    puts one on the table. The arm of the finger is visible and casts shadows but touches nothing.
+    Object k of the world is shapes[k]. The id of the object in images, voxels and poses is k + 1. Objects start far
+    away. `place` puts one object on the table. The arm of the finger is visible but touches nothing.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:
@@ -192,7 +192,7 @@ class PhysicsWorld:
         self.data.ctrl[:] = position
 
     def forward(self) -> None:
-        """Bring contacts and positions of all geoms up to date."""
+        """Update contacts and positions of all geoms."""
         self._mj.mj_forward(self.model, self.data)
 
     def step(self, n: int = 1) -> None:
@@ -200,7 +200,7 @@ class PhysicsWorld:
         self._mj.mj_step(self.model, self.data, n)
 
     def settle(self) -> bool:
-        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s; False if that takes more than 4 s."""
+        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s; False if this takes more than 4 s."""
         calm = 0
         for _ in range(200):
             self.step(10)
@@ -246,8 +246,8 @@ class PhysicsWorld:
         """Cast rays from one point (3,), in metres, along directions (n, 3) of any length.
 
         `groups` are the visible geoms: 0 the room, 1 objects, 2 finger and arm. `data` is another state of the same
-        model; by default the state of the world after `forward`. Returns the first geom (n,) int32 that each ray
-        meets, -1 for none, the distance (n,), and the normal (n, 3) of the surface. The distance is in units of the
+        model. The default is the state of the world after `forward`. Returns the first geom (n,) int32 that each ray
+        hits (-1 for none), the distance (n,), and the normal (n, 3) of the surface. The distance is in units of the
         length of the direction.
         """
         n = len(directions)
@@ -272,7 +272,7 @@ class FingerPush:
     seconds: float  #: from one pause to the next, without the time to settle
 
     def swept(self, grid: VoxelGrid) -> np.ndarray:
-        """(X, Y, Z) bool: voxels with centres that the finger passes through while it pushes."""
+        """(X, Y, Z) bool: voxels with centres that the finger passes during the push."""
         centres = grid.centres()
         a, b = np.array(self.start), np.array(self.end)
         along = np.clip((centres[..., :2] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0.0, 1.0)
@@ -323,7 +323,7 @@ def advance_push(world: PhysicsWorld, push: FingerPush, start: float, stop: floa
 
 
 def finish_push(world: PhysicsWorld) -> bool:
-    """Park the finger and wait until all objects are at rest; False if that takes too long."""
+    """Park the finger and wait until all objects are at rest. Returns False if this takes too long."""
     world.move_finger(_PARKED)
     return world.settle()
 
@@ -359,7 +359,7 @@ def is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
 
 
 def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
-    """A line towards one object, preferably one with others behind it."""
+    """A line towards one object, preferably an object with others behind it."""
     at = world.positions()[:, :2]
     goal = at[int(rng.integers(len(at)))]
     others = at[np.linalg.norm(at - goal, axis=1) > 1e-6]
@@ -378,11 +378,11 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 
 
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
-    """Choose a push that moves objects by simulating candidates; the world is left unchanged.
+    """Choose a push that moves objects by simulating candidates. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken, otherwise the one that moves
-    most and topples fewest. Candidates that drop an object or leave one in motion are discarded. Raises InputError if
-    no candidate moves any object.
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If none does, the candidate
+    is taken that moves most and topples fewest. Candidates that drop an object or leave one in motion are discarded.
+    Raises InputError if no candidate moves any object.
     """
     saved = world.save()
     best: tuple[float, FingerPush] | None = None

@@ -1,6 +1,6 @@
-"""Many runs of one filter together, as arrays (run, particle, ...); `mstfilter.smc.run_many` uses it where it can.
+"""Many runs of one filter together, as arrays (run, particle, ...).
 
-Run r equals ``filter.run(observations, seeds[r])`` bit for bit: it draws from the same streams.
+`mstfilter.smc.run_many` uses this module where possible.
 
 The components are called once per step with the particles of all runs, as one population of R n particles. This is
 done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
@@ -38,7 +38,7 @@ _SLOTS = ("initial", "transition", "update")
 
 
 class NotTogether(Exception):
-    """The runs have to be made one by one."""
+    """The runs must be made one by one."""
 
     def __init__(self, slot: str, reason: str) -> None:
         super().__init__(slot, reason)
@@ -47,7 +47,7 @@ class NotTogether(Exception):
 
 @dataclass(frozen=True)
 class RunFilters:
-    """The filters of some runs, which may differ in the numbers that their components hold."""
+    """The filters of some runs, whose components may hold different numbers."""
 
     one: Callable[[int], ParticleFilter]  #: the filter of a run
     rows: Callable[[np.ndarray], ParticleFilter]  #: one filter of the rows of some runs, in their order
@@ -55,7 +55,7 @@ class RunFilters:
 
 @dataclass(frozen=True)
 class Collected:
-    """What was collected in one run."""
+    """The collected values of one run."""
 
     rows: dict[str, np.ndarray]  #: name -> (t, ...), up to the last step, or to the one at which the run is lost
     lost: str = ""  #: why the run is lost, "" if it is not
@@ -84,9 +84,9 @@ def run_together(
 ) -> list[Collected]:
     """The runs of some seeds with the observations `ys`.
 
-    Without `check`, runs are not compared with single runs; with `rounding`, differences by rounding are accepted.
+    Without `check`, runs are not compared with single runs. With `rounding`, differences by rounding are accepted.
 
-    Raises `NotTogether` if the runs have to be made one by one, and InputError if a component that states
+    Raises `NotTogether` if the runs must be made one by one, and InputError if a component that states
     ``batched=True`` mixes runs.
     """
     keep_freed_memory()
@@ -104,7 +104,7 @@ class _RunInfo(Info):
 
 
 class _Sweep:
-    """The steps of R runs; rows are runs that are not lost, with particles (R, n, ...) and log weights (R, n)."""
+    """The steps of R runs. Rows are runs that are not lost, with particles (R, n, ...) and log weights (R, n)."""
 
     def __init__(
         self,
@@ -167,7 +167,7 @@ class _Sweep:
 
     # --- calls of components --------------------------------------------------------------------------------------
     def call(self, t: int, slot: str) -> None:
-        """Call a component for all runs; those that it loses are removed."""
+        """Call a component for all runs, and remove the runs that it loses."""
         rows = np.arange(len(self.runs))
         try:
             particles, log_weights = self.together(t, slot)
@@ -256,7 +256,7 @@ class _Sweep:
             self.agree(t, slot, run, "log weights", log_weights[k], alone.log_weights)
 
     def same_scheme(self, other: ParticleFilter) -> None:
-        """Make single runs if the filter of a run has another number of particles, resampler or trigger."""
+        """Raise `NotTogether` if the filter of a run has another number of particles, resampler or trigger."""
         for name in ("n", "resample", "resampler", "trigger"):
             if other is not self.filter and getattr(other, name) != getattr(self.filter, name):
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
@@ -271,14 +271,14 @@ class _Sweep:
         self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} alone")
 
     def refuse_error(self, t: int, slot: str, error: Exception) -> NoReturn:
-        """Make single runs if one of them raises an error too; else refuse the component."""
+        """Raise `NotTogether` if a single run raises an error too, and else refuse the component."""
         for row in range(len(self.runs)):
             with suppress(LostRunError):
                 self.alone(t, slot, row)
         self.refuse(t, slot, f"a call for all runs raises {type(error).__name__}: {error}; single runs do not")
 
     def refuse(self, t: int, slot: str, reason: str) -> NoReturn:
-        """Raise InputError if the component states that it is batched; else make single runs."""
+        """Raise InputError if the component states that it is batched, and else `NotTogether`."""
         if getattr(self.filter, slot).batched is True:
             raise InputError(
                 f"step {t}, {slot}: {reason}",
@@ -290,7 +290,7 @@ class _Sweep:
 
     # --- resampling -----------------------------------------------------------------------------------------------
     def select(self, t: int) -> None:
-        """Resample the runs whose trigger asks for it."""
+        """Resample the runs for which the trigger requires it."""
         self.resampled = np.array(np.broadcast_to(self.wanted(t), len(self.runs)))
         rows = np.flatnonzero(self.resampled)
         if not len(rows):
@@ -305,7 +305,7 @@ class _Sweep:
         self.particles = each_array(lambda a: _with_rows(a, rows, a[rows[:, None], index]), self.particles)
 
     def wanted(self, t: int) -> Any:
-        """(R,) bool, or one: the runs to resample."""
+        """(R,) bool, or a single bool: the runs to resample."""
         trigger = self.filter.trigger
         if trigger.batched:
             runs: Any = SimpleNamespace(
@@ -316,7 +316,7 @@ class _Sweep:
         return [trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t) for row in rows]
 
     def selected(self, t: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Ancestors (len(rows), n) and log weights of some runs, as `WeightResampler.select` returns them."""
+        """Ancestors (len(rows), n) and log weights of some runs, in the form of `WeightResampler.select`."""
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
         if resampler.batched:
@@ -335,7 +335,7 @@ class _Sweep:
         return self.streams.keys[self.runs[row]].child(slot, t)
 
     def record(self, t: int) -> None:
-        """Keep what the collectors return for each run."""
+        """Store the results of the collectors for each run."""
         log_mean = self.log_mean if self.filter.properly_weighted else np.full(len(self.runs), np.nan)
         quick: dict[Collector, np.ndarray] = {log_evidence: log_mean, ess: self.ess, resampled: self.resampled}
         steps = [self.seen(t, row) for row in range(len(self.runs))] if self.traced else []
@@ -367,7 +367,7 @@ class _Sweep:
         return State(t + 1, population, self.streams.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
-        """(T, R, ...) results of a collector; those of lost runs are undefined."""
+        """(T, R, ...) results of a collector. The results of lost runs are undefined."""
         steps = self.found[name]
         check_one_shape(name, [values.shape[1:] for _, values in steps])
         shape = steps[0][1].shape[1:] if steps else ()
@@ -397,7 +397,7 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 
 def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
-    """The first difference of two arrays or mappings of arrays, and whether it is rounding; None if there is none."""
+    """The first difference of arrays or mappings of arrays, and whether it is rounding; None if they are equal."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

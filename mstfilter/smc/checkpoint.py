@@ -1,4 +1,4 @@
-"""Storing the state of a run, so that a new process continues it to the identical result.
+"""Storage of the state of a run, so that a new process continues the run with identical results.
 
 >>> for state, info in filter.iterate(observations, seed):
 ...     save_state(path, state)
@@ -38,11 +38,11 @@ _FORMAT = 1
 def save_state(
     path: Path, state: State, codec: Codec | None = None, *, compress: bool = False, **description: Any
 ) -> None:
-    """Write a state after at least one step to an .npz file, atomically. The folder exists.
+    """Write a state after at least one step to an .npz file, atomically. The folder must exist.
 
-    `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and slower to
-    write. Further values, of types that JSON represents, are stored by name. Raises InputError if the particles
-    cannot be stored or the file cannot be written.
+    `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and writing is
+    slower. Other values, of types that JSON represents, are stored by name. Raises InputError if the particles cannot
+    be stored or the file cannot be written.
     """
     population = state.population
     if population is None:
@@ -68,7 +68,7 @@ def save_state(
 def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> tuple[State, dict[str, Any]]:
     """The state in a file, and the description stored with it.
 
-    Raises InputError if the file is missing or damaged, is no checkpoint, or its arrays need more than `limit` bytes.
+    Raises InputError if the file is missing, damaged, not a checkpoint, or its arrays need more than `limit` bytes.
     """
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")

@@ -3,7 +3,7 @@
 >>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
 >>> transition = Branching(Dynamics(model), branches=4)
 
-A trigger decides when to resample, a size to how many particles:
+A trigger decides when to resample. A size decides the number of particles:
 
 >>> import numpy as np
 >>> from mstfilter.smc import Bins, Kld, Population
@@ -13,7 +13,7 @@ A trigger decides when to resample, a size to how many particles:
 >>> size.choose(wide), size.choose(narrow)
 (374, 47)
 
-`Kld` and `Coalesced` take an `Equivalence`, which says which particles count as equal:
+`Kld` and `Coalesced` take an `Equivalence`, which defines equal particles:
 
 >>> Bins(width=0.5).classes(np.array([0.1, 0.4, 0.6, -0.1]))
 array([0, 0, 1, 2])
@@ -35,10 +35,10 @@ from mstfilter.smc.population import Population, as_matrix, union
 
 @dataclass(frozen=True)
 class Reweight(Update):
-    """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights: the update of the bootstrap filter.
+    """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights, as in the bootstrap filter.
 
-    Proposed particles, if any, join the predicted ones. `batched` says whether the function treats each
-    particle by itself (see `Component.batched`).
+    Proposed particles, if any, are added to the predicted particles. `batched` states whether the function treats
+    each particle independently (see `Component.batched`).
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
@@ -62,11 +62,11 @@ class Reweight(Update):
 
 @dataclass(frozen=True)
 class Branching(Transition):
-    """Moves `branches` copies of every particle independently; the mean weight, and so the evidence, is kept.
+    """Moves `branches` copies of every particle independently. The mean weight, and so the evidence, does not change.
 
-    Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles; from n of
-    n particles they keep all, and the filter degenerates. With discrete states and all successors as branches this is
-    the filter of Fearnhead and Clifford (2003):
+    Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. From n of
+    n particles these schemes keep all, and the filter degenerates. For discrete states with all successors as
+    branches, this is the filter of Fearnhead and Clifford (2003):
 
     >>> filter = replace(
     ...     bootstrap(model, n=50),
@@ -81,7 +81,7 @@ class Branching(Transition):
     inner : Transition
         Moves the copies.
     branches : int
-        Copies of each particle; they are adjacent in the result.
+        Number of copies of each particle. Copies are adjacent in the result.
     """
 
     inner: Transition
@@ -170,7 +170,7 @@ class ExactEquality(Equivalence):
 
 @dataclass(frozen=True)
 class Bins(Equivalence):
-    """Array particles in the same cell of a regular grid; `width` is the side of a cell, in their units."""
+    """Array particles in the same cell of a regular grid; `width` is the side of a cell in their units."""
 
     width: Annotated[float, Bounds(above=0, unit="side of a cell")] = 1.0
 
@@ -184,23 +184,23 @@ class Bins(Equivalence):
 
 @dataclass(frozen=True)
 class Kld(Size):
-    """Enough particles to know the distribution over bins up to a Kullback-Leibler distance epsilon.
+    """The least n for which the Kullback-Leibler distance of the distribution over bins is at most epsilon.
 
     With k occupied bins this takes n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample size
     in particle filters through KLD-sampling"). Fox counts the bins while drawing. Here the masses W_b of the bins are
-    known, and n is the least number with n >= bound(sum_b 1 - (1 - W_b)^n), the expected number of bins that n draws
-    occupy. This holds for any resampling scheme, and gives slightly more particles than Fox's sequential stopping.
+    known. n is the least number with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected number of bins that n
+    draws occupy. The bound holds for any resampling scheme, and gives slightly more particles than Fox's method.
 
     Parameters
     ----------
     equivalence : Equivalence
-        The bins: a grid for vectors, classes of equal particles for objects.
+        Defines the bins: a grid for vectors, or classes of equal particles for objects.
     epsilon : float
         Kullback-Leibler distance in nats, positive.
     delta : float
         Probability that the distance is larger, in (0, 1).
     n_min, n_max : int
-        Bounds of the result. One occupied bin gives `n_min`.
+        Bounds of the number of particles. If one bin is occupied, the number is `n_min`.
     """
 
     equivalence: Equivalence = Bins()

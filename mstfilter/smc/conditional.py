@@ -1,10 +1,10 @@
-"""Paths of states given all observations, one at a time: conditional SMC.
+"""Paths of states given all observations, drawn one at a time by conditional SMC.
 
 >>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 
-`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant, for any number of particles,
-also for programs (Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint log density of a path and the
+`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant, for any number of particles
+and also for programs (Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint log density of a path and the
 observations. `particle_gibbs` uses both.
 """
 
@@ -35,17 +35,17 @@ def conditional_path(
 ) -> Particles:
     """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
 
-    One particle follows `path`, the others are drawn as usual, and one of the final particles is traced back.
-    Ancestors are multinomial at every step: `resampler` and `trigger` of the filter are not used. The particle that
-    follows the path draws its ancestors, too, if the density of the transition is known; a program must then keep
-    nothing but its sites.
+    One particle follows `path`, the others are drawn as usual, and the path of one of the final particles is
+    returned. Ancestors are multinomial at every step; `resampler` and `trigger` of the filter are not used. If the
+    density of the transition is known, the particle that follows the path also draws its ancestors. A program must
+    then keep nothing except its sites.
 
     Parameters
     ----------
     filter : ParticleFilter
         Bootstrap or guided filter of a model or a program, with at least two particles.
     path : T particles, optional
-        The present path: row t is the particle at time t. Without it the path is drawn by an ordinary filter.
+        The present path. Row t is the particle at time t. Without a given path, an ordinary filter draws the path.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def _ancestor(
 
 
 def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
-    """(n,) log f(new | old), for programs with log p(y | new, old); None if it is not known."""
+    """(n,) log f(new | old), and for programs also log p(y | new, old); None if it is not known."""
     if isinstance(transition, ProgramTransition):
         handler = ScoreHandler(dict(new))
         particles, density = run_program(transition.model, handler, old, y, count_particles(old))
@@ -124,7 +124,7 @@ def _log_density(transition: Transition | None, old: Particles, new: Particles, 
 def _moved(
     filter: ParticleFilter, streams: Key, past: Population | None, given: Particles | None, y: Any
 ) -> Population:
-    """The particles of a step before the update; particle 0 is the given one, with its weight."""
+    """The particles of a step before the update. Particle 0 is the given particle, with its weight."""
     component: Any
     slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
     particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
@@ -176,7 +176,7 @@ def _given_to_program(component: Any, old: Particles | None, given: Particles, y
 
 
 def _with_first(particles: Particles, first: Particles) -> Particles:
-    """The particles with another one at index 0."""
+    """The particles with the particle at index 0 replaced."""
     if isinstance(particles, Mapping):
         return {name: _with_first(a, first[name]) for name, a in particles.items()}
     if not isinstance(particles, np.ndarray):
@@ -187,7 +187,7 @@ def _with_first(particles: Particles, first: Particles) -> Particles:
 
 
 def _joined(rows: list[Particles]) -> Particles:
-    """Particles of all times, from one particle each; values that a program does not have at a time are NaN or 0."""
+    """Particles of all times, from one particle each. Values that a program does not have at a time are NaN or 0."""
     if isinstance(rows[0], np.ndarray):
         return np.concatenate(rows)
     if not isinstance(rows[0], Mapping):

@@ -32,12 +32,13 @@ def energy_distance(
 ) -> float:
     """Energy distance between two weighted populations (Szekely and Rizzo 2013), in the units of the distance.
 
-    2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second; the square of
-    `scipy.stats.energy_distance` for numbers. It is 0 if both represent the same distribution, else positive.
+    2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second population. For numbers
+    the distance is the square of `scipy.stats.energy_distance`. The energy distance is 0 if both populations
+    represent the same distribution, and else positive.
 
-    ``distance(particles)`` is (n, n), such as ``lambda p: 1 - Gaussian().matrix(p)``, and must be of negative type
-    (`mstfilter.forecasts.is_negative_type`); otherwise the result can be 0 for different distributions.
-    Default: Euclidean, for arrays and mappings of arrays.
+    ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
+    of negative type (`mstfilter.forecasts.is_negative_type`). For other distances, the result can be 0 for different
+    distributions. Default: The default is Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -88,39 +89,40 @@ def run_variance(
     Let A_e be the weight of the particles at time t whose ancestor at time 0 is e; all weights sum to 1. The relative
     variance of the evidence, and so the variance of its log, is estimated by
 
-        V = 1 - f (1 - sum_e A_e^2),    f = N / (N - 1) * product of f_s over the selections s,
+        V = 1 - f (1 - sum_e A_e^2), where f = N / (N - 1) * product of f_s over the selections s.
 
-    and the variance of a weighted mean by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the particles
-    of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
-    unbiased. Other schemes make fewer duplicates, so f_s is measured here:
+    The variance of a weighted mean is estimated by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the
+    particles of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
+    unbiased. Other schemes make fewer duplicates, so f_s is computed from the weights:
 
         f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
 
-    W_e and V_e are the weights of the descendants of e before and after the selection. This is the ratio of the
-    probabilities that two draws have different ancestors; it is N / (N - 1) on average for independent selections of
-    particles with different ancestors. For other schemes than `Multinomial` it is an approximation: it takes pairs of
-    particles with different ancestors as equally likely to be selected together, in proportion to their weights.
+    W_e and V_e are the weights of the descendants of e before and after the selection. The factor f_s is the ratio of
+    the probabilities that two draws have different ancestors. For independent selections of particles with different
+    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` the factor is an approximation. The
+    approximation assumes that pairs of particles with different ancestors are selected in proportion to their
+    weights.
 
-    With a lag L (Olsson and Douc 2019), ancestors L steps earlier take the place of those at time 0 for the mean. For
-    the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts are
-    added. This reduces the noise of the estimates and keeps them valid when all particles share one ancestor. The
-    bias is small if the model forgets its state in L steps.
+    With a lag L (Olsson and Douc 2019), ancestors L steps earlier replace those at time 0 in the estimate for the
+    mean. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts
+    are added. The lag reduces the noise of the estimates and keeps them valid when all particles share one ancestor.
+    The bias is small if the model forgets its state in L steps.
 
-    All estimates are of first order in 1 / n, and too low for small n. With 300 particles they are within 15 % of the
-    variance over seeds. Where 30 particles give the log evidence a variance of 2, those of means are 90 % too low
-    (`experiments/run_variance/sizes.csv`). Take more particles if the variance of the log evidence is above .3.
+    All estimates are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
+    % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
+    means are 90 % too low (`experiments/run_variance/sizes.csv`). Take more particles above a variance of .3.
 
     Parameters
     ----------
     filter : ParticleFilter
-        Properly weighted, with n of at least 2.
+        A properly weighted filter with n of at least 2.
     observations : iterable
     seed : int
     lag : int, optional
-        Steps, at least 1. Default: all. Time and memory grow with n times the lag.
+        Number of steps, at least 1. By default, all steps. Time and memory grow with n times the lag.
     function : callable, optional
-        ``(particles) -> (n, ...)``, whose weighted mean is estimated. Default: the particles, if they are an array;
-        else means are of shape (T, 0).
+        ``(particles) -> (n, ...)``, whose weighted mean is estimated. By default, the particles if they are an array.
+        For other particles, means have the shape (T, 0).
 
     Returns
     -------
@@ -205,11 +207,11 @@ class _Ancestry:
         self.weights = np.zeros(0)
 
     def begin(self, n: int) -> None:
-        """Take the present particles as n independent draws."""
+        """Start with the present particles as n independent draws."""
         self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
 
     def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:
-        """Go to the next population."""
+        """Continue with the next population."""
         if self.lag is not None and len(self.window) > self.lag:
             self.past += self._relative(0) - self._relative(1)
             self.window.popleft()
@@ -223,7 +225,7 @@ class _Ancestry:
         self.weights = weights
 
     def _relative(self, place: int) -> float:
-        """Relative variance of the evidence that arises from the time of `place` to now."""
+        """Relative variance of the evidence that arises from the time of `place` to the present."""
         index, f = self.window[place]
         return 1.0 - f * _differ(index, self.weights)
 
@@ -231,7 +233,7 @@ class _Ancestry:
         return self.past + self._relative(0)
 
     def mean(self, centred: np.ndarray) -> np.ndarray:
-        """(...) variance of the weighted mean of (n, ...) values minus that mean."""
+        """(...) variance of the weighted mean of values (n, ...) from which that mean is subtracted."""
         index, f = self.window[0]
         columns = (self.weights[:, None] * centred.reshape(len(centred), -1)).T
         squares = [float(np.square(np.bincount(index, column)).sum()) for column in columns]
@@ -239,6 +241,6 @@ class _Ancestry:
 
 
 def _differ(groups: np.ndarray, weights: np.ndarray) -> float:
-    """Probability that two draws by weight are of different groups."""
+    """Probability that two draws by weight belong to different groups."""
     masses = np.bincount(groups, weights)
     return 1.0 - float(masses @ masses)

@@ -6,9 +6,9 @@
 >>> Normal(x, 1.0).log_prob(0.3).shape
 (5,)
 
-The first axis is that of the particles. Parameters of shape () or (n,) give values (n,): the event shape is ().
-Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,), the entries of an event are independent, and
-their log densities are summed. `log_prob` is always (n,), or a number if nothing has rows.
+The first axis is the axis of the particles. Parameters of shape () or (n,) give values (n,): the event shape is ().
+Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The entries of an event are independent, and
+their log densities are summed. `log_prob` is always (n,), or a number if no argument has rows.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
 of these (`as_distribution`); they take three to six times as long. The classes here are the most used ones. For a
@@ -65,7 +65,7 @@ class Range(NamedTuple):
         return (value > self.low) & (value < self.high) if self.open else (value >= self.low) & (value <= self.high)
 
     def surely_contains(self, value: Any) -> bool:
-        """Whether all numbers of a float or float64 array are known to be in the range, by their sum and minimum."""
+        """Whether all numbers of a float or float64 array are known to be in the range, from sum and minimum."""
         if type(value) is float:
             return self.low < value < self.high
         if self.high < math.inf or not _is_finite(value):
@@ -80,8 +80,8 @@ POSITIVE = Range("a positive number", 0.0)
 class _Checked(Distribution):
     """A distribution that checks its parameters, which are fields.
 
-    Numbers are checked when it is made. So are arrays, unless they are `lazy`, as the log density at a value out of
-    range is NaN: these are checked when it is sampled.
+    Numbers are checked when the distribution is made. Arrays are also checked then, unless they are `lazy`. Lazy
+    arrays are checked when the distribution is sampled, as the log density at a value out of range is NaN.
     """
 
     draws_numbers = True
@@ -123,7 +123,7 @@ class _Checked(Distribution):
 
 
 class _Independent(_Checked):
-    """Independent entries. The fields are the parameters: (), (n,), (1, d) or (n, d)."""
+    """A distribution with independent entries. The fields are parameters of shape (), (n,), (1, d) or (n, d)."""
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -139,14 +139,14 @@ class _Independent(_Checked):
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether all numbers of a float or float64 array are finite. False also if their sum is not."""
+    """Whether all numbers of a float or float64 array, and their sum, are finite."""
     if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
         return math.isfinite(np.add.reduce(value, axis=None))
     return type(value) is float and math.isfinite(value)
 
 
 def _impossible(value: np.ndarray) -> Any:
-    """Log density of a value outside of the support: -inf, or NaN if the value is NaN."""
+    """Log density of a value outside the support: -inf, or NaN if the value is NaN."""
     return np.where(np.isnan(value), np.nan, -np.inf) if value.dtype.kind == "f" else -np.inf
 
 
@@ -170,7 +170,7 @@ def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
 
 
 def _sum_rows(log_prob: Any) -> np.ndarray:
-    """Sum over all axes but the first: the entries of a row are independent."""
+    """Sum over all axes except the first, since the entries of a row are independent."""
     out = np.asarray(log_prob)
     return out if out.ndim <= 1 else out.reshape(len(out), math.prod(out.shape[1:])).sum(axis=1)
 
@@ -284,7 +284,7 @@ class Uniform(_Independent):
 
 
 def _cholesky(cov: np.ndarray) -> np.ndarray:
-    """Lower triangular root of each covariance; NaN in `hypothetical` for a row that is not positive definite."""
+    """Lower triangular root of each covariance; in `hypothetical`, NaN for a row that is not positive definite."""
     if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
         raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
     difference = cov - np.swapaxes(cov, -1, -2)
@@ -312,8 +312,7 @@ def _cholesky(cov: np.ndarray) -> np.ndarray:
 class MultivariateNormal(_Checked):
     """Gaussian vectors.
 
-    The mean `loc` is (d,) or (n, d), one for all particles or one for each; the covariance `cov` is (d, d) or (n, d,
-    d), positive definite.
+    The mean `loc` is (d,) for all particles or (n, d). The covariance `cov` (d, d) or (n, d, d) is positive definite.
     """
 
     loc: Any
@@ -382,7 +381,7 @@ class Bernoulli(_Independent):
 
 @dataclass(frozen=True, eq=False)
 class Categorical(Distribution):
-    """One of k categories, numbered from 0; the rows of `probs` (k,) or (n, k) are scaled to sum to one."""
+    """One of k categories, numbered from 0. The rows of `probs` (k,) or (n, k) are scaled to sum to one."""
 
     probs: Any
     discrete = True
@@ -410,7 +409,7 @@ class Categorical(Distribution):
         return self.probs.shape[:-1]
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Draw; a category of probability zero is never drawn."""
+        """Draw categories. A category of probability zero is never drawn."""
         u = rng.random(self.value_shape(size))
         return search(self.probs, u) if self.probs.ndim == 1 else draw_rows(self.probs, u)
 

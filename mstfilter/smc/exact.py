@@ -8,9 +8,9 @@
 >>> exact = forward_backward(initial, transition, log_likelihood, observations)
 >>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
 
-The first observation updates the initial state before any prediction, as in all filters of this package. An
-observation that is missing is None. Matrices that change with time have a first axis of T entries: entry t of a
-transition moves x_{t-1} to x_t, and entry 0 is not used.
+The first observation updates the initial state before any prediction, as in all filters of this package. A missing
+observation is None. Matrices that change with time have a first axis of T entries. Entry t of a transition moves
+x_{t-1} to x_t, and entry 0 is not used.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from mstfilter.smc.state_space import StateSpaceModel
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = None) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d).
 
-    The matrices may have a first axis of T entries; entry t of `H` and `R` belongs to y_t. With `B` (d, j), each step
+    The matrices may have a first axis of T entries. Entry t of `H` and `R` belongs to y_t. With `B` (d, j), each step
     after the first needs an input (j,), see `WithInput`. `Q` and `P0` may be singular (see `nonlinear_gaussian`).
     `kalman_filter` has the exact answers.
 
-    Raises InputError if a shape does not fit, and in a step if there is no entry for it or no input.
+    Raises InputError if shapes do not fit, and at a step without an entry or a required input.
     """
     m = _matrices(F, Q, H, R, m0, P0, B)
 
@@ -97,10 +97,10 @@ class Kalman(NamedTuple):
 def kalman_filter(
     F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any], B: Any = None
 ) -> Kalman:
-    """The Kalman filter and the Rauch-Tung-Striebel smoother of filterpy, of (k,) observations; None if missing.
+    """The Kalman filter and the Rauch-Tung-Striebel smoother of filterpy for (k,) observations; None if missing.
 
-    The arguments are as in `linear_gaussian`; matrices that change have T entries. With `B` the inputs are given with
-    the observations, by `WithInput`. Raises InputError if a shape does not fit, an input is not given or an
+    The arguments are as in `linear_gaussian`. Matrices that change with time have T entries. With `B` the inputs are
+    given with the observations, by `WithInput`. Raises InputError if shapes do not fit, an input is missing, or an
     observation is not finite.
     """
     from filterpy.kalman import KalmanFilter
@@ -130,7 +130,7 @@ def kalman_filter(
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
-    """The inverse of a covariance; the pseudo-inverse if it is singular, as a condition on its range needs."""
+    """The inverse of a covariance, or the pseudo-inverse for conditioning on its range if it is singular."""
     values = np.linalg.eigvalsh(cov)
     if values.min() > 1e-12 * values.max():
         return np.linalg.inv(cov)
@@ -147,7 +147,7 @@ def _observed(t: int, y: Any, k: int) -> np.ndarray:
 
 
 def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
-    """(T, d) the effect of all inputs so far on the state."""
+    """(T, d) sum of the effects of all inputs so far on the state."""
     found = np.zeros(F.shape[:2])
     for t in range(1, len(F)):
         if inputs[t] is None:
@@ -159,9 +159,10 @@ def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:
     """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
 
-    `initial` (K,) has the probabilities of x_0, row i of `transition` (K, K) those of x_t given x_{t-1} = i. With a
-    first axis of T entries, entry t moves x_{t-1} to x_t; entry 0 is not used. ``log_likelihood(y)`` (K,) is
-    log p(y_t | x_t = 0 .. K-1); -inf if impossible. It may have the further parameters ``t`` and ``u``.
+    `initial` (K,) has the probabilities of x_0. Row i of `transition` (K, K) has those of x_t given x_{t-1} = i. If
+    `transition` has a first axis of T entries, entry t moves x_{t-1} to x_t, and entry 0 is not used.
+    ``log_likelihood(y)`` (K,) is log p(y_t | x_t = 0 .. K-1, which is -inf if impossible. The function may also have
+    the parameters ``t`` and ``u``.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -191,7 +192,7 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
 
 
 def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Checked probabilities (K,) of the first state and (K, K), or (T, K, K), of the moves."""
+    """Checked probabilities of the first state (K,), and of the moves (K, K) or (T, K, K)."""
     found = []
     for name, given, dimensions in (("initial", initial, (1,)), ("transition", transition, (2, 3))):
         p = np.asarray(given, dtype=np.float64)

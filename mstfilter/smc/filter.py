@@ -14,10 +14,10 @@ A step selects, predicts, proposes, fuses and selects (y is the observation)::
 
 With "before", a step that ends with more than n particles resamples them too.
 
-`ParticleFilter.step` has one line for each of these; `_Step` has one method for each. Textbook filters have no
-`proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that weights
-its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a pure
-function of a `State`, so a run can be stopped, stored and resumed at any step.
+`ParticleFilter.step` has one line for each of these stages, and `_Step` has one method for each. Textbook filters
+have no `proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that
+weights its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a pure
+function of a `State`. So a run can be stopped, stored and resumed at any step.
 """
 
 from __future__ import annotations
@@ -66,32 +66,32 @@ class ParticleFilter(AtStep):
     Parameters
     ----------
     initial : Proposal
-        Draws the particles of the first step. The first observation updates them; the first prediction is in the
-        second step. If `initial` is None or equal to `proposal`, the first step has proposed particles only, as in
-        MST.
+        Draws the particles of the first step. The first observation updates these particles, and the first prediction
+        is in the second step. If `initial` is None or equal to `proposal`, the first step has only proposed
+        particles.
     transition : Transition
-        Moves the particles from the previous time to this one. If None, they stay.
+        Moves the particles from the previous time to the present time. If None, the particles do not move.
     proposal : Proposal, optional
         Draws new particles from the observation at every step.
     update : Update
-        Weights the particles by the observation. Not needed if the transition weights them (probabilistic programs).
+        Weights the particles by the observation. Not needed if the transition weights the particles.
     resampler : Resampler
         Selects particles by weight.
     trigger : Trigger
         Decides whether a step resamples. More than `n` particles are always resampled.
     lookahead : Lookahead, optional
-        For auxiliary filters: particles are selected by weight times priority. Needs ``resample="before"``.
+        For auxiliary filters. Particles are selected by weight times priority. Needs ``resample="before"``.
     rejuvenation : Rejuvenation, optional
-        For resample-move filters: moves the particles at the end of a step that resampled.
+        For resample-move filters. Moves the particles at the end of a step that resampled.
     size : Size, optional
-        Chooses the number of particles that are selected. Default: always `n`.
+        Chooses the number of particles that are selected. By default, the number is always `n`.
     n : int
         Number of particles at the start and after each resampling (unless `size` chooses another).
     n_proposed : int
-        Number of particles that `proposal` draws at each step. 0: as many as `n`.
+        Number of particles that `proposal` draws at each step. 0 means `n`.
     resample : {"after", "before"}
-        With "after", particles are resampled after the update, as in MST. With "before", they are resampled before
-        the next prediction, as in textbooks; the population after a step then has the weights of its observation.
+        With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
+        before the next prediction, as in textbooks. The weights after a step are then those of its observation.
     """
 
     initial: Proposal | None = None
@@ -127,7 +127,7 @@ class ParticleFilter(AtStep):
     def properly_weighted(self) -> bool:
         """Whether all components are properly weighted and there is no `proposal`.
 
-        A proposal adds particles whose weights do not contain the evidence of earlier observations.
+        The weights of proposed particles do not contain the evidence of earlier observations.
         """
         if self.proposal is not None:
             return False
@@ -139,9 +139,9 @@ class ParticleFilter(AtStep):
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
     def step(self, state: State, observation: Any) -> tuple[State, Info]:
-        """Process one observation; None if it is missing: then without proposal and update.
+        """Process one observation, or None if it is missing. A missing observation has no proposal and no update.
 
-        A step with an input takes ``WithInput(observation, u)``.
+        To give an input too, pass ``WithInput(observation, u)``.
 
         Raises InputError if a component raises it. The message starts with the step and the slot of the component.
         """
@@ -165,7 +165,7 @@ class ParticleFilter(AtStep):
         Parameters
         ----------
         observations : iterable
-            One observation for each step, or `WithInput`. An observation that is missing is None.
+            One observation, or `WithInput`, for each step. A missing observation is None.
         state : State or int
             The state to continue from, or a seed.
         """
@@ -183,9 +183,9 @@ class ParticleFilter(AtStep):
         *,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
-        """Run all steps; returns the last state and the infos. Parameters as in `iterate`.
+        """Run all steps, and return the last state and the infos. Parameters as in `iterate`.
 
-        ``progress=True`` shows a progress bar; a function is called as ``progress(done, total)``.
+        ``progress=True`` shows a progress bar. A function is called as ``progress(done, total)``.
 
         To keep weights or particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
         """
@@ -201,7 +201,7 @@ class ParticleFilter(AtStep):
 
 
 class _Step:
-    """The stages of one step. Each component call is wrapped by ``with self.slot(name)``."""
+    """The stages of one step. Each call of a component is wrapped by ``with self.slot(name)``."""
 
     def __init__(self, filter: ParticleFilter, state: State, observation: Any) -> None:
         self.observation, u = split_input(observation)
@@ -214,7 +214,7 @@ class _Step:
         return self.state.key.child(slot, self.state.t).generator()
 
     def select_before(self) -> tuple[Population | None, bool]:
-        """Select: the particles x_{t-1} to move, and whether they were resampled."""
+        """Select the particles x_{t-1} to move. Returns the particles and whether they were resampled."""
         population, priority = self.state.population, None
         if population is None or self.filter.resample == "after":
             return population, False
@@ -236,7 +236,7 @@ class _Step:
         return selected, True
 
     def _resample(self, population: Population, n: int, stream: str) -> Population:
-        """Resampled particles; their ancestors are -1 if the resampler does not report them."""
+        """Resampled particles. The ancestors are -1 if the resampler does not report them."""
         resampler = self.filter.resampler
         selected = _checked(resampler.resample(self.rng(stream), population, n), resampler)
         if "ancestor" in selected.parents:
@@ -244,7 +244,7 @@ class _Step:
         return selected.with_ancestors(np.full(len(selected), -1))
 
     def predict(self, past: Population | None) -> Population | None:
-        """Predict: the moved particles; None at the first step of a filter that starts from its proposal."""
+        """The moved particles; None at the first step of a filter that starts from its proposal."""
         if past is None:
             return self._first()
         stayed = {"previous": identity(len(past))}
@@ -272,7 +272,7 @@ class _Step:
         return population
 
     def propose(self, predicted: Population | None) -> Population | None:
-        """Propose: particles drawn from the observation; None if there is no proposal or no observation."""
+        """Particles drawn from the observation; None if there is no proposal or no observation."""
         proposal = self.filter.proposal
         if proposal is None or (self.observation is None and predicted is not None):
             return None
@@ -285,7 +285,7 @@ class _Step:
         return proposed.labelled({"proposed": identity(len(proposed))}, proposed.notes)
 
     def fuse(self, predicted: Population | None, proposed: Population | None) -> Population:
-        """Fuse: the particles after the update."""
+        """The particles after the update."""
         update = self.filter.update
         if self.observation is None or update is None:
             fused = predicted if predicted is not None else proposed
@@ -298,7 +298,7 @@ class _Step:
         return fused
 
     def select_after(self, fused: Population, past: Population | None) -> tuple[Population, bool]:
-        """Select: the particles to keep, and whether they were resampled."""
+        """Select the particles to keep. Returns the particles and whether they were resampled."""
         size, after = self.filter.size, self.filter.resample == "after"
         n = limit = self.filter.n
         if len(fused) <= n and not after and size is None:
@@ -319,7 +319,7 @@ class _Step:
         return fused, False
 
     def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
-        """Move the particles by `rejuvenation`; their parents do not change."""
+        """Move the particles by `rejuvenation`. The parents of particles do not change."""
         rejuvenation = self.filter.rejuvenation
         if rejuvenation is None:
             return chosen
@@ -366,7 +366,7 @@ class _Step:
 
 
 class _Slot:
-    """Wraps the calls of components: measures wall time, and adds step and slot to the messages of errors.
+    """Wraps the calls of components. The wrapper measures wall time, and adds step and slot to error messages.
 
     >>> with slot("transition"):
     ...     moved = transition.predict(rng, population, observation)
@@ -399,7 +399,7 @@ class _Slot:
 
 
 def _checked(found: Any, component: Component) -> Population:
-    """The population that a component returned; InputError if it returned something else."""
+    """The population that a component returned. Raises InputError for any other result."""
     if isinstance(found, Population):
         return found
     name = type(component).__name__
@@ -426,8 +426,8 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 def keep_freed_memory() -> None:
     """Free one large block, once per process.
 
-    After this, glibc keeps freed arrays of up to 32 MB, its largest value, instead of returning them to the system
-    after every step. Returning them takes a fifth of the time of a filter of 10,000 particles and a third of a
-    resampling of a million. The memory of the block itself is never touched. Other C libraries are not affected.
+    After this, glibc keeps freed arrays of up to 32 MB (its largest value) instead of returning them to the system
+    after every step. Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of
+    the time of resampling a million weights. The block is never used. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

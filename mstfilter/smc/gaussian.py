@@ -8,14 +8,14 @@ A model with Gaussian noise and nonlinear functions has a good proposal: the upd
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.particles["mean"].shape           # (n, d)
 
-In a Rao-Blackwellised filter part of the state, u_t (a regime, a contact, an association), is drawn. Given u_0 .. u_t
-the rest is linear and Gaussian:
+A Rao-Blackwellised filter draws a part of the state, u_t (a regime, a contact, an association). Given u_0 .. u_t, the
+other part z is linear and Gaussian:
 
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
-A particle holds u with the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
-arrays, moved by a Transition (draw u, predict z) and an Update (weight by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}),
-correct z). Reference: Doucet, de Freitas, Murphy, Russell (2000).
+A particle holds u, and the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
+arrays. A Transition draws u and predicts z, and an Update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) and corrects
+z. Reference: Doucet, de Freitas, Murphy, Russell (2000).
 
 `mstfilter.smc.exact` has linear models and their exact answers.
 """
@@ -44,12 +44,12 @@ def nonlinear_gaussian(
 ) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
 
-    `f` and `h` give the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
-    row. They may have the further parameters ``t`` and ``u``; `Q` and `R` may have a first axis of T entries.
+    `f` and `h` return the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
+    row. The functions may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of T entries.
 
-    `Q` and `P0` may be singular, as that of noise that acts on the velocity only. Then x_t has no density given
-    x_{t-1}: the model has no `log_transition` (for `P0`: no `log_initial`), and what needs it raises InputError. A
-    conditional path is then drawn without ancestor sampling.
+    `Q` and `P0` may be singular, for example if noise acts only on the velocity. With a singular `Q`, x_t has no
+    density given x_{t-1}. The model has no `log_transition` (for `P0`: no `log_initial`), and functions that need it
+    raise InputError. A conditional path is then drawn without ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
@@ -77,7 +77,7 @@ def nonlinear_gaussian(
 
 
 class _Noise:
-    """Normal noise of mean 0 and one covariance (k, k)."""
+    """Normal noise with mean 0 and covariance (k, k)."""
 
     def __init__(self, name: str, cov: np.ndarray, k: int | None, semidefinite: bool) -> None:
         root, self.singular = _covariance(name, cov, k, semidefinite)
@@ -97,7 +97,7 @@ class _Noise:
 
 
 class _Noises:
-    """Noise with one covariance (k, k) for all steps, or with one for each step, (T, k, k)."""
+    """Noise with one covariance (k, k) for all steps, or one for each step, (T, k, k)."""
 
     def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
         cov = np.asarray(given, np.float64)
@@ -109,7 +109,7 @@ class _Noises:
 
 
 class _OfStep:
-    """A function of particles and, if it has such parameters, of the step `t` and its input `u`."""
+    """A function of particles, and of the step `t` and its input `u` if it has these parameters."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.parameters = function, step_parameters(function, 1)
@@ -136,7 +136,7 @@ def vector_of(what: str, given: Any, size: int) -> np.ndarray:
 
 
 def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool = False) -> tuple[np.ndarray, bool]:
-    """A square root of a covariance: the Cholesky factor, or one by eigenvalues if it is singular; whether it is."""
+    """A square root of a covariance (Cholesky, or from eigenvalues if singular), and whether it is singular."""
     cov = np.asarray(given, dtype=np.float64)
     if cov.ndim != 2 or cov.shape != (d or len(cov), d or len(cov)):
         expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
@@ -153,7 +153,7 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
 
 
 class Linear(NamedTuple):
-    """Matrices of the linear part for each particle, or without the particle axis if shared by all."""
+    """Matrices of the linear part for each particle, or without the particle axis if all particles share them."""
 
     F: Any  #: (n, d, d)
     Q: Any
@@ -167,8 +167,9 @@ class ConditionallyLinear(AtStep):
     """A model that is linear and Gaussian given the part u, which is drawn.
 
     ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
-    ``linear(u)`` gives the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
-    have a further parameter ``t``, the index of the step, or ``u`` after a first one of another name, its input.
+    ``linear(u)`` returns the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
+    also have a parameter ``t``, the index of the step. If their first parameter has another name, a parameter ``u``
+    gets the input.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -240,7 +241,7 @@ class _Correct(Update):
 def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> ParticleFilter:
     """The Rao-Blackwellised filter of a model with `n` particles.
 
-    `components` are further fields of `ParticleFilter`, such as ``resampler``.
+    `components` are other fields of `ParticleFilter`, such as ``resampler``.
     """
     return ParticleFilter(
         initial=_Initial(model), transition=_Predict(model), update=_Correct(model), n=n, **components

@@ -1,4 +1,4 @@
-"""Recording quantities of a run.
+"""Recording of quantities of a run.
 
 A collector is a function ``(state, info) -> number or array``, called after every step. `ess`, `unique_ancestors`,
 `log_evidence`, `mean` and `resampled` are collectors.
@@ -121,7 +121,7 @@ def _summary(name: str, a: np.ndarray) -> str:
 def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:
     """Iterate over a run, ``filter.iterate(observations, seed)``, and keep the results of the collectors.
 
-    Each collector is a function of (state, info), whose result has the same shape at every step.
+    Each collector is a function of (state, info). The result of a collector must have the same shape at every step.
     """
     rows: dict[str, list[Any]] = {name: [] for name in collectors}
     state, times = None, []
@@ -134,7 +134,7 @@ def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> 
 
 
 def stacked(name: str, rows: list[np.ndarray]) -> np.ndarray:
-    """What a collector returned at each step, as one array."""
+    """The results of a collector at all steps, as one array."""
     check_one_shape(name, [row.shape for row in rows])
     return np.stack(rows) if rows else np.zeros(0)
 

@@ -8,11 +8,11 @@ A model with parameters is a function that returns a filter:
 >>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
 >>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
 
-- `pmmh` is a Metropolis chain whose likelihood is the filter's unbiased estimate. The estimate of the current
-  parameters is kept until a proposal is accepted; so the chain has the exact posterior, for any number of particles
+- `pmmh` is a Metropolis chain whose likelihood is the filter's unbiased estimate. The estimate for the current
+  parameters is kept until a proposal is accepted. So the chain has the exact posterior, for any number of particles
   (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` does the same with the walkers of emcee, without a scale to choose.
-- `particle_gibbs` alternates draws of parameters given the path of states, and of the path given the parameters.
+- `ensemble` does the same with the walkers of emcee, which need no scale.
+- `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
   the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which
   the early states hardly change.
@@ -69,14 +69,14 @@ class Chains:
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
 
-        emcee logs a warning if the chains are shorter than 50 times the result, which is then too low.
+        emcee logs a warning if the chains are shorter than 50 times the result, since the result is then too low.
         """
         from emcee.autocorr import integrated_time
 
         return integrated_time(self.theta[discard:], quiet=True)
 
     def effective_sizes(self, discard: int = 0) -> np.ndarray:
-        """(d,) numbers of independent draws that estimate a mean equally well; parameters as above."""
+        """(d,) numbers of independent draws that estimate a mean equally well, after `discard` iterations."""
         n_iterations, n_chains, _ = self.theta[discard:].shape
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 
@@ -133,7 +133,7 @@ class _Posterior:
     def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """The estimates of a batch whose components hold the parameters of each row.
 
-        Sweeps 0, 1, 2, 4, 8, ... are compared with single runs.
+        Batches 0, 1, 2, 4, 8, ... are compared with single runs.
         """
         first = self._filter(thetas[0])
 
@@ -161,13 +161,13 @@ def pmmh(
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
-    The number of particles decides how well the chain mixes: the log evidence should have a standard deviation of
+    The number of particles determines how well the chain mixes. The log evidence should have a standard deviation of
     about 1 at the posterior mean (Doucet, Pitt, Deligiannidis, Kohn 2015).
 
     Parameters
     ----------
     filter_of : callable
-        ``(theta) -> ParticleFilter`` for parameters (d,). Its components must be properly weighted.
+        ``(theta) -> ParticleFilter`` for parameters (d,). The components of the filter must be properly weighted.
     log_prior : callable
         ``(theta) -> float``; -inf outside of the support.
     start : (d,) or (R, d) array_like
@@ -175,15 +175,15 @@ def pmmh(
     scale : (d,) or (d, d) array_like
         Standard deviations, or covariance, of a step. 2.4 / sqrt(d) posterior standard deviations are a good choice.
     batched : bool
-        Whether ``filter_of`` also takes parameters (d, m), a column for each of m particles of several chains. All
-        chains then move in one sweep of filters, see `mstfilter.smc.batching`. A parameter that is combined with
+        Whether ``filter_of`` also accepts parameters (d, m), with a column for each of m particles of several chains.
+        All chains then move in one batch of filters, see `mstfilter.smc.batching`. A parameter that is combined with
         particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
         parameters; some are compared. If they differ, InputError, or a warning and single runs.
 
     Raises
     ------
     InputError
-        If a chain starts where the prior is zero, or 20 estimates of the evidence at its start are zero.
+        If a chain starts where the prior is zero, or 20 estimates of the evidence there are zero.
     """
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
@@ -204,7 +204,7 @@ def pmmh(
 
 
 def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
-    """The first parameters with their estimates; those that are lost are drawn again."""
+    """The first parameters with their estimates. Lost estimates are drawn again."""
     state = posterior(key.generator(), theta)
     for attempt in range(1, _N_STARTS + 1):
         lost = np.flatnonzero(~np.isfinite(state["log_density"]))
@@ -251,17 +251,17 @@ def ensemble(
 ) -> Chains:
     """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
 
-    emcee keeps the log density of a walker until the walker moves, and the estimated evidence beside it (as a blob).
-    No estimate is drawn again for parameters that stay, so the chain has the exact posterior.
+    emcee keeps the log density of a walker until the walker moves, together with the estimated evidence (as a blob).
+    For parameters that do not change, no estimate is drawn again. So the chain has the exact posterior.
 
     Parameters
     ----------
     filter_of, observations, log_prior, batched
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
-        First parameters: different ones, at least 2 d.
+        First parameters. At least 2 d different parameters are needed.
     moves : optional
-        Of emcee; default its stretch move.
+        Moves of emcee; the default is its stretch move.
     """
     import emcee
 
@@ -298,8 +298,8 @@ def particle_gibbs(
     filter_of : callable
         ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
     draw : callable
-        ``(rng, theta, path) -> theta`` (d,), by a kernel that leaves p(theta | path, y) invariant: an exact draw
-        where the prior is conjugate, or a Metropolis step with `path_log_prob`.
+        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. The draw is an exact
+        draw if the prior is conjugate, or a Metropolis step with `path_log_prob`.
     start : (d,) array_like
         First parameters.
     """

@@ -1,4 +1,4 @@
-"""Observations, time and inputs: what a step gives to the functions of its components.
+"""Observations, time and inputs, which a step gives to the functions of its components.
 
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
@@ -7,12 +7,12 @@
 ... )
 >>> filter.run([WithInput(y, u) for y, u in zip(observations, odometry)])
 
-A function of a model that has a parameter named ``t`` or ``u`` gets them by keyword. The first observation has t = 0;
-the transition to x_t is called with t >= 1. An observation without input is given as it is.
+If a function of a model has a parameter named ``t`` or ``u``, it gets time or input by keyword. The first observation
+has t = 0. The transition to x_t is called with t >= 1. An observation without input is given unchanged.
 
-A filter gives both to a component by `Component.at_step`, which returns the component at that step. A component or
-model with functions among its fields names them in `step_functions`; others override `at_step`, or ignore time and
-inputs.
+A filter gives both to a component by `Component.at_step`, which returns the component for that step. A component or
+model that has functions among its fields names them in `step_functions`. Others override `at_step`, or ignore time
+and inputs.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from mstfilter.fields import Bounded
 
 @dataclass(frozen=True, eq=False)
 class WithInput:
-    """An observation with the input of its step, given to a filter in place of the observation.
+    """An observation with the input of its step, given to a filter instead of the observation.
 
-    The filter gives `y` to its components as the observation. The input is that of the move from x_{t-1} to x_t; at
-    the first step it is available to the initial distribution and the likelihood.
+    The filter gives `y` to its components as the observation. The input belongs to the move from x_{t-1} to x_t. At
+    the first step the input is available to the initial distribution and the likelihood.
     """
 
     y: Any  #: the observation; None if missing
@@ -43,14 +43,16 @@ class WithInput:
 
 
 def split_input(observation: Any) -> tuple[Any, Any]:
-    """The observation and the input of a step; None for an input that is not given."""
+    """The observation and the input of a step; the input is None if there is none."""
     if isinstance(observation, WithInput):
         return observation.y, observation.u
     return observation, None
 
 
 def check_observations(observations: Iterable[Any], where: str = "") -> Any:
-    """The same observations; InputError for a table, a mapping or a text, and for one that is NaN in every entry.
+    """The same observations.
+
+    Raises InputError for a table, a mapping or a text, and for an observation that is NaN in every entry.
 
     Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
     """
@@ -86,9 +88,9 @@ class StepFunction:
 
 
 def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
-    """Which of ``t`` and ``u`` a function takes after its first `n_arguments` parameters, and whether it must get it.
+    """Which of ``t`` and ``u`` a function accepts after its first `n_arguments` parameters, and which are required.
 
-    A parameter with a default value need not be given.
+    A parameter with a default value is not required.
     """
     if isinstance(function, StepFunction):
         return dict(function.parameters)
@@ -106,12 +108,12 @@ def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
 
 
 def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> Callable[..., Any]:
-    """A function ``(*arguments, **step)`` that takes the given parameters by name."""
+    """A function ``(*arguments, **step)`` that accepts the given parameters by name."""
     return StepFunction(function, parameters) if parameters else function
 
 
 def bind_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: int, u: Any) -> Callable[..., Any]:
-    """The function with ``t`` and ``u`` given; a call raises InputError if it needs an input and there is none."""
+    """The function with ``t`` and ``u`` given. A call raises InputError if a required input is missing."""
     given = {name: value for name, value in (("t", t), ("u", u)) if name in parameters}
     if u is None and "u" in given:
         if parameters["u"]:
@@ -128,7 +130,7 @@ def _no_input(t: int, *args: Any, **named: Any) -> Any:
 
 
 class AtStep(Bounded):
-    """Base class of components and models: `at_step` gives time and input to the functions among the fields."""
+    """Base class of components and models: `at_step` gives time and input to the functions in their fields."""
 
     #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field
     #: that is a component or a model.
@@ -136,7 +138,7 @@ class AtStep(Bounded):
 
     @cached_property
     def _of_step(self) -> dict[str, dict[str, bool] | None]:
-        """Fields that change with the step -> parameters that they take; None for a component or model."""
+        """The fields that change with the step, and their parameters; None for a component or model."""
         found: dict[str, dict[str, bool] | None] = {}
         for name, n_arguments in self.step_functions.items():
             value = getattr(self, name)
@@ -148,12 +150,12 @@ class AtStep(Bounded):
         return found
 
     def at_step(self, t: int, u: Any = None) -> Self:
-        """The component or model at step `t` with input `u`; itself if it does not depend on them.
+        """The component or model at step `t` with input `u`, or the object itself if it does not depend on them.
 
         Parameters
         ----------
         t : int
-            Index of the observation, from 0. The transition from x_{t-1} to x_t is that at t.
+            Index of the observation, from 0. The transition from x_{t-1} to x_t belongs to t.
         u : optional
             The input of the step, of any type; None if there is none.
         """

@@ -1,8 +1,8 @@
 """Interfaces of the components of a particle filter, and its `State` and `Info`.
 
-A component is a frozen dataclass: its fields are hyperparameters, with bounds in their annotations (see
-`mstfilter.fields`), its behaviour is one method. Methods that draw take the generator as first argument. All methods
-work on whole populations, so a component can share work between particles.
+A component is a frozen dataclass. The fields of a component are hyperparameters, with bounds in their annotations
+(see `mstfilter.fields`), and one method defines its behaviour. Methods that draw random numbers take the generator as
+first argument. All methods work on whole populations, so a component can share work between particles.
 
 >>> from dataclasses import dataclass
 >>> import numpy as np
@@ -18,10 +18,10 @@ work on whole populations, so a component can share work between particles.
 A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
 to the log weights. `mstfilter.smc.Dynamics` does so for any model with densities.
 
-Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`; most have a `Transition` and
-an `Update`. Optional are `Size` (number of particles), `Lookahead` (auxiliary filter), `Rejuvenation`
-(resample-move) and `Codec` (checkpoints of your own particle type). An interface for an additional ability extends
-another one: `DensityTransition`, `WeightResampler`. Models and programs are made of `Distribution`.
+Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
+`Transition` and an `Update`. Optional components are `Size` (number of particles), `Lookahead` (auxiliary filter),
+`Rejuvenation` (resample-move) and `Codec` (checkpoints of other particle types). Two interfaces extend another one
+with an additional ability: `DensityTransition` and `WeightResampler`. Models and programs use `Distribution` objects.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Component(AtStep, ABC):
     """A component that takes part in a step.
 
     The filter uses ``component.at_step(t, u)``, the component at step t with its input (see `mstfilter.smc.inputs`).
-    The three properties can be overridden by class attributes: ``properly_weighted = False``.
+    Class attributes can override the three properties: ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
@@ -55,25 +55,25 @@ class Component(AtStep, ABC):
 
     @property
     def properly_weighted(self) -> bool:
-        """Whether weighted means of its result are unbiased up to the normalising constant.
+        """Whether weighted means of the result are unbiased up to the normalising constant.
 
-        The author of a component states this: True is the default, ``properly_weighted = False`` in the class changes
-        it. `mstfilter check` tests it for resamplers. A filter reports the log evidence only if all its components
-        are properly weighted and it has no `proposal`.
+        The author of a component states this. The default is True, and ``properly_weighted = False`` in the class
+        changes it. `mstfilter check` tests the statement for resamplers. A filter reports the log evidence only if
+        all its components are properly weighted and it has no `proposal`.
         """
         return True
 
     @property
     def draws(self) -> bool:
-        """Whether the component uses the generator that it is given. If False, it must not use it."""
+        """Whether the component uses the given generator. If False, the component must not use the generator."""
         return True
 
     @property
     def batched(self) -> bool | None:
-        """Whether the component treats each particle by itself, so that those of several runs can be given together.
+        """Whether the component treats each particle independently, so that it can process several runs together.
 
-        True states so. With None, `run_many` tries it, and makes runs one by one if the results differ (see
-        `mstfilter.smc.batching`). Default: False, then runs are made one by one.
+        True states that particles are independent. With None, `run_many` tries this, and makes the runs one by one if
+        the results differ (see `mstfilter.smc.batching`). Default: With False, the runs are made one by one.
         """
         return False
 
@@ -83,11 +83,11 @@ class Proposal(Component):
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw `n` particles, repeating some if there are fewer distinct ones."""
+        """Draw `n` particles. Some are repeated if fewer distinct particles exist."""
 
 
 class Transition(Component):
-    """Moves particles from the previous time to this one (prediction)."""
+    """Moves particles from the previous time to the present time (prediction)."""
 
     @abstractmethod
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
@@ -101,27 +101,29 @@ class DensityTransition(Transition):
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
         """Log density (n,) float64 of each move from row i of `previous` to row i of `new`; -inf if it is impossible.
 
-        `observation` is that given to `predict`; None if it is missing.
+        `observation` is the one given to `predict`; None if it is missing.
         """
 
 
 class Update(Component):
-    """Uses the observation: weights particles, projects them, or makes new ones from pairs."""
+    """Uses the observation. Weights particles, projects them, or makes new ones from pairs."""
 
     @abstractmethod
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
-        """Any number of particles, from the predicted and the proposed ones; at least one of the two is given.
+        """The updated population, of any size, from the predicted and the proposed particles.
+
+        At least one of the two is given.
 
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
-        `proposed` are new particles, None if the filter has no proposal. The result has the ``parents`` of the
-        particles that it was made from (see `union`).
+        `proposed` are new particles; None if the filter has no proposal. The result has the ``parents`` of the
+        particles from which it was made (see `union`).
         """
 
 
 class Resampler(Component):
-    """Selects particles by weight. Base class of schemes that look at particles; define `resample`.
+    """Selects particles by weight. Base class of schemes that compare particles. The schemes define `resample`.
 
     A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
     """
@@ -148,16 +150,16 @@ class WeightResampler(Resampler):
         Parameters
         ----------
         log_weights : (m,) float64
-            Unnormalised; finite or -inf, at least one finite.
+            Unnormalised log weights, finite or -inf, with at least one finite value.
         n : int
-            Number of ancestors.
+            Number of ancestors to choose.
 
         Returns
         -------
         ancestors : (n,) int
             Indices into the m particles.
         log_weights : (n,) float or None
-            Log weights of the selected particles. None: all get the log mean of the old weights, which keeps the
+            Log weights of the selected particles. If None, all get the log mean of the old weights, which keeps the
             estimate of the evidence.
         """
 
@@ -181,14 +183,14 @@ class Trigger(Bounded, ABC):
 
 
 class Size(Bounded, ABC):
-    """Chooses the number of particles of a resampling. The filter then only starts with `n` particles."""
+    """Chooses the number of particles of a resampling. With a size, `n` is only the number of the first particles."""
 
     @abstractmethod
     def choose(self, population: Population) -> int:
-        """Number of particles (at least 1), from the weighted particles that are about to be resampled."""
+        """Number of particles (at least 1), from the weighted particles that will be resampled."""
 
     def checked(self, population: Population) -> int:
-        """The number that `choose` returns; InputError if it is no integer of at least 1."""
+        """The number that `choose` returns. Raises InputError if it is not an integer of at least 1."""
         n = self.choose(population)
         check_integer(f"number of particles that {type(self).__name__} chose", n)
         return int(n)
@@ -199,11 +201,11 @@ class Similarity(Bounded, ABC):
 
     @abstractmethod
     def matrix(self, particles: Any) -> np.ndarray:
-        """(n, n) symmetric similarities in [0, 1], 1 on the diagonal. It need not be positive semidefinite."""
+        """(n, n) symmetric similarities in [0, 1], 1 on the diagonal; need not be positive semidefinite."""
 
 
 class Equivalence(Bounded, ABC):
-    """Classes of particles that count as equal."""
+    """Defines classes of equal particles."""
 
     @abstractmethod
     def classes(self, particles: Any) -> np.ndarray:
@@ -213,17 +215,17 @@ class Equivalence(Bounded, ABC):
 class Lookahead(Component):
     """Evaluates the next observation before particles are selected (auxiliary filter).
 
-    The filter selects by log weight + priority and subtracts the priority from the selected log weights. So the
-    filter is exact for any priority; a good one is close to log p(y_t | x_{t-1}).
+    The filter selects by log weight + priority and subtracts the priority from the selected log weights. The filter
+    is exact for any priority. A good priority is close to log p(y_t | x_{t-1}).
     """
 
     @abstractmethod
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
-        """(n,) log priority of each particle x_{t-1} given y_t. Finite: -inf would bias the filter."""
+        """(n,) finite log priority of each particle x_{t-1} given y_t; -inf would bias the filter."""
 
 
 class Rejuvenation(Component):
-    """Moves particles at the end of a step that resampled, by a kernel that keeps their law (resample-move)."""
+    """Moves particles after a step that resampled, by a kernel that keeps their distribution (resample-move)."""
 
     @abstractmethod
     def move(
@@ -231,9 +233,10 @@ class Rejuvenation(Component):
     ) -> Population:
         """Move x_t without changing its distribution.
 
-        `population` holds the weighted particles x_t after the observation, `previous` their x_{t-1} row by row; None
-        at the first step. The result has as many particles in the same order, moved by a kernel that leaves p(x_t |
-        x_{t-1}, y_t) invariant, and unchanged log weights. `observation` is y_t; None if it is missing.
+        `population` holds the weighted particles x_t after the observation. `previous` holds their x_{t-1} row by
+        row; None at the first step. The result has as many particles in the same order and with unchanged log
+        weights. The particles are moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant. `observation` is
+        y_t; None if it is missing.
         """
 
 
@@ -245,7 +248,7 @@ class Distribution(ABC):
     discrete : bool
         Whether the values are integers: a move then draws new values.
     draws_numbers : bool
-        Whether draws are known not to be NaN. If False, programs check them.
+        Whether draws are known not to be NaN. If False, programs check the draws.
     """
 
     discrete = False
@@ -303,7 +306,7 @@ class Codec(ABC):
 
     @abstractmethod
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The particles that `encode` has encoded (its inverse)."""
+        """The particles from the arrays of `encode`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +335,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Record of a step: numbers whose size does not depend on n. Weights and parents are those of the `State`."""
+    """Record of a step. The size of the record does not depend on n. The `State` has the weights and parents."""
 
     t: int  #: index of the observation, from 0
     n: int  #: particles after the step

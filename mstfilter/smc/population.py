@@ -8,12 +8,11 @@ array([0.25, 0.25, 0.5 ])
 >>> round(population.ess, 3)
 2.667
 
-Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, whose
-particles are built when they are accessed. `take` selects from any of these: rows of arrays are copied, objects are
-shared.
+Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
+particles on access. `take` selects from all of these. Rows of arrays are copied, and objects are shared.
 
-A population is immutable, but it does not copy the arrays that it is given: it holds read-only views of them. Do not
-write to an array after a population was made from it; pass ``array.copy()`` if you need to.
+A population is immutable. A population does not copy the given arrays but holds read-only views of them. Do not write
+to an array after a population was made from it; pass ``array.copy()`` if you need to.
 """
 
 from __future__ import annotations
@@ -58,11 +57,11 @@ def identity(n: int) -> np.ndarray:
 
 
 class Candidates(Sequence[_T], Generic[_T]):
-    """Particles ``build(index)`` that are built when they are accessed, and then stored.
+    """Particles ``build(index)`` that are built on first access, and then stored.
 
-    In MST the weight of a candidate depends only on the pair that it is made from, so candidates can be resampled
-    before they are built. `build` must return the same particle at every call with the same index. `indices` (n,) are
-    the candidates, in order; an index may occur more than once. An integer n stands for 0 .. n-1.
+    In MST the weight of a candidate depends only on its pair of parents, so candidates can be resampled before they
+    are built. `build` must return the same particle at every call with the same index. `indices` (n,) are the
+    candidates in order. An index may occur more than once. An integer n means 0 .. n-1.
     """
 
     def __init__(
@@ -88,7 +87,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     @property
     def n_built(self) -> int:
-        """Number of distinct candidates built so far; selections by `take` share them."""
+        """Number of distinct candidates built so far. Selections by `take` share built candidates."""
         return len(self._built)
 
     def take(self, positions: np.ndarray) -> Candidates[_T]:
@@ -96,7 +95,7 @@ class Candidates(Sequence[_T], Generic[_T]):
         return Candidates(self._build, self._indices[np.asarray(positions)], self._built)
 
     def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
-        """Candidates ``function(candidate)``, computed when they are accessed."""
+        """Candidates ``function(candidate)``, computed on access."""
         return Candidates(lambda position: function(self[position]), len(self))
 
 
@@ -136,7 +135,7 @@ def as_matrix(particles: Any) -> np.ndarray:
 
 
 def frozen_view(array: np.ndarray) -> np.ndarray:
-    """A read-only view of an array; the array if it is read-only."""
+    """A read-only view of an array, or the array itself if it is read-only."""
     if not array.flags.writeable:
         return array
     view = array.view()
@@ -173,7 +172,7 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
 
 
 def _integers(what: str, index: Any) -> np.ndarray:
-    """An index array as int64; raises InputError if it holds other numbers than integers."""
+    """An index array as int64; raises InputError if it contains other values than integers."""
     index = np.asarray(index)
     if index.dtype.kind not in "iu":
         raise InputError(f"{what} are of type {index.dtype}, expected integers")
@@ -181,7 +180,7 @@ def _integers(what: str, index: Any) -> np.ndarray:
 
 
 def _within(index: np.ndarray, n: int) -> np.ndarray:
-    """Indices of n particles; raises InputError if one is negative or too large."""
+    """Indices of n particles; raises InputError if an index is negative or too large."""
     if len(index) and index.view(np.uint64).max() >= n:  # as unsigned integers, negative ones are too large
         wrong = int(np.flatnonzero((index < 0) | (index >= n))[0])
         raise InputError(
@@ -198,9 +197,9 @@ class Population:
     Parameters
     ----------
     particles : ndarray (n, ...) | mapping of ndarray (n, ...) | sequence of n objects | Candidates
-        Treated as immutable; shared, not copied.
+        The particles, treated as immutable; shared, not copied.
     log_weights : (n,) float
-        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. Default: all 0.
+        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. The default is 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
         proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. A resampler adds
@@ -278,7 +277,7 @@ class Population:
         return self._summary()[1]
 
     def _summary(self) -> tuple[float, float]:
-        """Effective sample size and log mean weight, computed together and stored: a step uses them repeatedly."""
+        """Effective sample size and log mean weight, computed together and stored, since steps use them often."""
         if "_both" not in self.__dict__:
             top = self.log_weights.max()
             weights = self.log_weights - top
@@ -290,13 +289,13 @@ class Population:
 
     @property
     def unique_ancestors(self) -> int:
-        """Number of particles of the previous population that have descendants; 0 if it is not known."""
+        """Number of particles of the previous population that have descendants; 0 if unknown."""
         previous = self.parents.get("previous", np.zeros(0, np.int64))
         return len(np.unique(previous[previous >= 0]))
 
     @property
     def best(self) -> Any:
-        """The particle of largest weight; the first, if several have equal weights."""
+        """The particle of largest weight; the first one if several have equal weights."""
         index = int(np.argmax(self.log_weights))
         if isinstance(self.particles, Mapping):
             return {name: a[index] for name, a in self.particles.items()}
@@ -323,11 +322,11 @@ class Population:
         )
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
-        """The result of a resampling: `take`, with ``parents["ancestor"]`` and further notes."""
+        """The result of a resampling. The result is `take` with ``parents["ancestor"]`` and additional notes."""
         return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
-        """The same particles with ``parents["ancestor"]`` set and further notes."""
+        """The same particles with ``parents["ancestor"]`` set and additional notes."""
         parents = {**self.parents, "ancestor": _integers("ancestors", ancestors)}
         return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
 
@@ -352,7 +351,7 @@ class Population:
         return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
-        """Replace the particles by as many new ones; weights and parents stay, notes are dropped."""
+        """Replace the particles by the same number of new ones. Weights and parents are kept, notes are dropped."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")
@@ -388,7 +387,7 @@ def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarr
 
 
 def _kind(particles: Particles) -> str:
-    """What the particles are, in a few words."""
+    """The kind of the particles, in a few words."""
     if isinstance(particles, Candidates):
         return f"candidates, {particles.n_built} built"
     if isinstance(particles, Mapping):

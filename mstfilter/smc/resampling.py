@@ -1,7 +1,7 @@
 """Resampling by weight: schemes with equal output weights.
 
-W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, f = frac(n W_i).
-The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. They differ in the variance of N_i.
+W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, and f = frac(n
+W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. The schemes differ in the variance of N_i.
 
 ==============  =================================================  ====================================
 scheme          N_i                                                variance of N_i
@@ -24,19 +24,19 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-The variance of `Residual` is that of its default, the multinomial remainder. Weights need not sum to 1, may have any
-float type, and may be zero (log weight -inf); n may differ from their number. A particle of weight zero is never
+The variance of `Residual` is given for its default, the multinomial remainder. Weights need not sum to 1, may have
+any float type, and may be zero (log weight -inf). n may differ from their number. A particle of weight zero is never
 selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights are zero.
 
-All schemes share the inverse of the cumulative weights, at the end of this module: `inverse_cdf` takes one point in
-each of n equal strata, `independent_draws` n independent points, and `draw_rows` one point for each row of a matrix.
-A user's scheme is a `WeightResampler` whose `select` uses them.
+All schemes share functions for the inverse of the cumulative weights, at the end of this module: `inverse_cdf` takes
+one point in each of n equal strata, `independent_draws` takes n independent points, and `draw_rows` takes one point
+for each row of a matrix. A user's scheme is a `WeightResampler` whose `select` uses them.
 
-Ties: the random schemes do not compare weights. Of particles with equal weights, `LargestWeights.select` (a stable
-sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first.
+Random schemes do not compare weights, so they have no ties. If weights are equal, `LargestWeights.select` (a stable
+sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first particle.
 
-Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class: in exact arithmetic it selects the same
-particles as `Systematic` and as ``Residual("systematic")`` if all use the same uniform number.
+Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class. In exact arithmetic this scheme selects the
+same particles as `Systematic` and as ``Residual("systematic")`` for the same uniform number.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
@@ -55,7 +55,7 @@ from mstfilter.smc.interfaces import WeightResampler
 
 @dataclass(frozen=True)
 class Multinomial(WeightResampler):
-    """Independent draws by weight (Gordon, Salmond, Smith 1993). It has the largest variance; used as a reference."""
+    """Independent draws by weight (Gordon, Salmond, Smith 1993); a reference, with the largest variance."""
 
     batched: ClassVar[bool] = True
 
@@ -86,7 +86,7 @@ class Systematic(WeightResampler):
 
 
 def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """floor(n W_i) (m,) int64, the fractions frac(n W_i) (m,), and the sum of the fractions: the copies to draw."""
+    """floor(n W_i) (m,) int64, the fractions frac(n W_i) (m,), and their sum, the number of copies to draw."""
     fractions = weights * (n / weights.sum())
     floors = fractions * (1 + 1e-13)  # an integer up to rounding counts as that integer
     np.floor(floors, out=floors)
@@ -106,9 +106,10 @@ def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) ->
 
 @dataclass(frozen=True)
 class Residual(WeightResampler):
-    """floor(n W_i) copies of each particle; the rest is drawn by another scheme (Liu and Chen 1998).
+    """floor(n W_i) copies of each particle. The rest is drawn by another scheme (Liu and Chen 1998).
 
-    `remainder` is the scheme for the fractions frac(n W_i). Systematic has the least variance, f (1 - f).
+    `remainder` is the scheme for the fractions frac(n W_i). The remainder `systematic` has the least variance, f (1 -
+    f).
     """
 
     remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
@@ -132,11 +133,11 @@ _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
 class Ssp(WeightResampler):
     """Srinivasan sampling process: N_i is floor or ceil of n W_i, for any order of the particles.
 
-    Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability
-    down / (up + down), a grows and b shrinks by `up`; otherwise a shrinks and b grows by `down`. Then one of the two
-    is 0 or 1, which is final; the other one is paired again. Here all pairs of a round are
-    processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019,
-    "Negative association, ordering and convergence of resampling methods").
+    Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability down / (up +
+    down), a increases and b decreases by `up`. With the remaining probability, a decreases and b increases by `down`.
+    After this step, one of the two is 0 or 1, which is final. The other fraction is paired again. Here all pairs of a
+    round are processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative
+    association, ordering and convergence of resampling methods").
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -159,7 +160,7 @@ class Ssp(WeightResampler):
 def _settle_pairs(
     rng: np.random.Generator, copies: np.ndarray, index: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One round of `Ssp`: adds settled fractions to `copies`, in place; returns the particles and fractions left."""
+    """One round of `Ssp`. Adds settled fractions to `copies` in place, and returns the remaining particles."""
     a, b = value[:-1:2], value[1::2]
     total = a + b
     exceeds = total >= 1
@@ -179,7 +180,7 @@ def _settle_pairs(
 
 
 def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
-    """(n,) particle that each position belongs to: floor(n / m) positions for each, one more for a random subset."""
+    """(n,) particle of each position. Each particle gets floor(n / m) positions, a random subset one more."""
     particles = np.arange(m) if n == m else np.tile(np.arange(m), n // m)
     if n % m:
         particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
@@ -188,12 +189,13 @@ def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.n
 
 @dataclass(frozen=True)
 class Killing(WeightResampler):
-    """A particle keeps its position with probability w_i / max w; the others are replaced by draws by weight.
+    """A particle keeps its position with probability w_i / max w. The other positions are filled by draws by weight.
 
     Most particles keep their positions if the weights are nearly equal. Del Moral (2004), "Feynman-Kac formulae",
-    section 5.6, for n = m. For n != m each of n positions belongs to one particle: floor(n / m) positions each, and
-    one more for a random subset. Each position then survives or is replaced. E[N_i] = n W_i for any n. For n = m,
-    with p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
+    section 5.6, for n = m. For n != m each of the n positions belongs to one particle. Each particle has floor(n / m)
+    positions, and a random subset has one more. Each position then survives or is replaced. E[N_i] = n W_i for any n.
+    For n = m and p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 -
+    W_i).
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -207,10 +209,12 @@ class Killing(WeightResampler):
 
 @dataclass(frozen=True)
 class LargestWeights(WeightResampler):
-    """Selects the n particles of largest weight, with equal weights; draws nothing. Not properly weighted.
+    """Selects the n particles of largest weight, with equal weights and without random draws.
 
-    Of particles with equal weights the first is selected: the sort in `select` is stable. If fewer than n particles
-    have positive weight, they are repeated in turn.
+    The scheme is not properly weighted.
+
+    If weights are equal, the first particle is selected, since the sort in `select` is stable. If fewer than n
+    particles have positive weight, they are repeated in turn.
     """
 
     properly_weighted: ClassVar[bool] = False
@@ -229,7 +233,7 @@ _BLOCK = 1 << 13  # arrays of so many numbers stay in cache
 def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     """(m,) float64 weights with maximum 1, from log weights of any float type.
 
-    Raises InputError if the log weights are not one-dimensional, hold NaN or +inf, or are all -inf, or if n < 1.
+    Raises InputError if the log weights are not one-dimensional, contain NaN or +inf, or are all -inf, or if n < 1.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     if lw.ndim != 1 or len(lw) == 0:
@@ -245,7 +249,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """`checked_weights` of a run; those of the runs of a batch, (R, m), are not checked."""
+    """`checked_weights` of a run. The weights of the runs of a batch, (R, m), are not checked."""
     if log_weights.ndim != 2:
         return checked_weights(log_weights, n)
     weights = log_weights - log_weights.max(axis=1, keepdims=True)
@@ -255,7 +259,7 @@ def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
 def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
     """(..., n) ascending indices at the points (k + shift_k) / n of the cumulative weights (..., m), k = 0 .. n - 1.
 
-    The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same.
+    The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same shift.
     """
     ends = weights.cumsum(axis=-1)
     total = ends[..., -1:]
@@ -283,7 +287,7 @@ def _subtract(positions: np.ndarray, shifts: np.ndarray) -> None:
 
 
 def expanded(ends: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) indices if i gets the places from ends[i - 1] to ends[i]: place k that of the number of ends <= k."""
+    """(..., n) indices in which i has the places from ends[i - 1] to ends[i]: place k has the number of ends <= k."""
     if ends.ndim == 1:
         counts = np.bincount(ends[:-1], minlength=n)[:n]
         return counts.cumsum(out=counts)
@@ -304,7 +308,8 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    Fewer than 2000 ascend. More are drawn in O(m + n), and ascend from one stratum of the weight to the next only.
+    Fewer than 2000 indices are in ascending order. More indices are drawn in O(m + n). The indices ascend only from
+    one stratum of the weight to the next.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -331,10 +336,12 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices of many points, distributed to strata of equal weight. Four times as fast as a search for 10^6.
+    """(n,) indices of many points, which are distributed to strata of equal weight.
 
-    Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. It is
-    increased where it is too small.
+    The method is four times as fast as a search for 10^6 points.
+
+    Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. The
+    bound is increased where it is too small.
     """
     # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
     bits = 62 - max(n.bit_length() - 14, 0)

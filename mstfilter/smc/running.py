@@ -9,10 +9,10 @@
 >>> runs["log_evidence"].shape                         # (arm, seed, time)
 (2, 20, 50)
 
-Every run equals ``filter.run(observations, seed)`` bit for bit, whatever the number of workers and the other arms.
-The runs of an arm are processed together, as arrays of the particles of all runs, if its components treat each
-particle by itself (see `mstfilter.smc.batching`); otherwise one by one. Run k of every arm has the same seed and so
-the same random streams, which makes differences between arms less noisy than those of independent runs.
+Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. The
+runs of an arm are processed together, as arrays of the particles of all runs, if its components treat each particle
+independently (see `mstfilter.smc.batching`). In other cases the runs are made one by one. Run k of every arm has the
+same seed and so the same random streams. So differences between arms have less noise than those of independent runs.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def run_many(
     Parameters
     ----------
     filters : ParticleFilter or mapping
-        A filter, or name of an arm -> filter. All arms get the same observations and seeds.
+        A filter, or a mapping from names of arms to filters. All arms get the same observations and seeds.
     observations : iterable
-        T observations, the same for all runs; None if missing, `WithInput` with an input.
+        T observations, the same for all runs. None is a missing observation; use `WithInput` for an input.
     seeds : iterable of int
         Different non-negative integers.
     workers : int
@@ -61,16 +61,16 @@ def run_many(
         get the filters by cloudpickle, and limit the numerical libraries to one thread. InputError if a worker dies,
         with the runs that may have ended it.
     progress : bool or callable
-        True shows a progress bar; a function is called as ``progress(done, total)`` when runs finish.
+        True shows a progress bar. A function is called as ``progress(done, total)`` when runs finish.
     **collectors
         As for `collect`; default `log_evidence`.
 
     Returns
     -------
     History
-        Arrays (arm, seed, time, ...), or (seed, time, ...) of a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). From that step on, its log evidence is -inf and other results are NaN.
-        `History.lost` has the reasons, and `History.single` says why the runs of an arm were made one by one.
+        Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
+        an observation (`LostRunError`). From that step on, the log evidence of a lost run is -inf and the other
+        results are NaN. `History.lost` has the reasons. `History.single` has the reasons for single runs.
 
     Warns
     -----
@@ -111,7 +111,7 @@ _Chunk = tuple[str, list[int]]  # an arm and some seeds
 
 @dataclass(frozen=True)
 class _Part:
-    """Some finished runs, and why those of an arm were made one by one."""
+    """Some finished runs, and the reason if they were made one by one."""
 
     runs: dict[_Task, Collected]
     single: dict[str, str]
@@ -119,7 +119,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Job:
-    """What `run_many` runs."""
+    """The task of `run_many`."""
 
     arms: dict[str, ParticleFilter]
     ys: list[Any]
@@ -127,7 +127,7 @@ class _Job:
     collectors: dict[str, Collector]
 
     def where(self, arm: str, seed: int | None = None) -> str:
-        """What an error is about; a single filter has no name."""
+        """Place for error messages; a single filter has no name."""
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
     def chunks(self, workers: int) -> list[_Chunk]:
@@ -150,7 +150,7 @@ class _Job:
         return _Part(found, {arm: why} if why else {})
 
     def made(self, arm: str, seeds: list[int]) -> tuple[list[Collected], str]:
-        """Some runs of an arm, and why they were made one by one; "" if they were made together, or there is one."""
+        """Some runs of an arm, and the reason if several runs were made one by one, or else ""."""
         filter, why = self.arms[arm], ""
         try:
             check_together(filter)
@@ -196,7 +196,7 @@ class _Job:
 
 
 def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
-    """The steps of a run; if it is lost, the reason is appended."""
+    """The steps of a run. If the run is lost, the reason is appended."""
     try:
         yield from steps
     except LostRunError as error:
@@ -207,7 +207,7 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
 def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
     """Results of chunks of runs in the order in which they finish.
 
-    Workers are new processes: a fork of a process with threads can deadlock.
+    Workers are new processes, since a fork of a process with threads can deadlock.
     """
     if workers == 1:
         yield from (job.run(*chunk) for chunk in chunks)

@@ -6,14 +6,14 @@
 
 Three smoothers of a record return a tuple with one population per time:
 
-- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). It needs only the record; after many
-  resamplings all paths share their beginning.
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It has more distinct
-  particles, and a bias if the state depends on observations more than `lag` steps later.
+- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). `genealogy` needs only the record. After
+  many resamplings all paths have the same beginning.
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` has more
+  distinct particles. The result has a bias if the state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
   path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"``.
 
-They are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
+The paths are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
 
 `mstfilter.smc.conditional` draws single paths, also of programs.
 """
@@ -51,12 +51,12 @@ class Record:
         return len(self.populations)
 
     def parents(self, t: int) -> np.ndarray:
-        """(n,) indices into population t - 1 of the particles at time t."""
+        """(n,) indices in population t - 1 of the parents of the particles at time t."""
         return known_parents(self.populations[t], t)
 
 
 def known_parents(population: Population, t: int) -> np.ndarray:
-    """(n,) indices into the population before; InputError if a particle has no known parent."""
+    """(n,) indices of the parents in the previous population; InputError if a particle has no known parent."""
     index = population.parents.get("previous")
     if index is None or (index < 0).any():
         raise InputError(
@@ -67,7 +67,7 @@ def known_parents(population: Population, t: int) -> np.ndarray:
 
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
-    """Run a filter and keep every population; memory grows with n times the number of steps."""
+    """Run a filter and store every population. Memory grows with n times the number of steps."""
     ys = tuple(check_observations(observations))
     if not ys:
         raise InputError("there are no observations to smooth over")
@@ -79,12 +79,12 @@ def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State 
 
 
 def genealogy(record: Record) -> tuple[Population, ...]:
-    """Paths of the last particles: row k of all populations is one path, weighted by the last particle."""
+    """Paths of the last particles. Row k of all populations is one path, weighted by the last particle."""
     return _traced(record, len(record) - 1, 0)
 
 
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
-    """At each time t the ancestors of the particles at t + `lag` (or the end), with their weights.
+    """At each time t, the ancestors of the particles at t + `lag` (or the end), with the weights of these particles.
 
     A lag of 0 steps returns the filter's populations.
     """
@@ -114,7 +114,7 @@ def backward_paths(
     *,
     steps: int = 1,
 ) -> tuple[Population, ...]:
-    """Draw `n` equally weighted paths from the smoothing distribution: row k of all populations is a path.
+    """Draw `n` equally weighted paths from the smoothing distribution. Row k of all populations is a path.
 
     The predecessor of a state x_{t+1} is particle i at time t with probability proportional to w_i f(x_{t+1} | x_i).
 
@@ -127,10 +127,11 @@ def backward_paths(
         "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
-        steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. It needs a record with parents.
-        The steps need not converge. Given x_{t+1}, a parent has the law of "exact" already after independent
-        selections of a bootstrap filter, and up to order 1 / N after others. So there is no further bias (Dau and
-        Chopin 2023). Steps reduce the variance: without accepted steps, paths are those of `genealogy`.
+        steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. The method needs a record with
+        parents. The chain need not converge. Given x_{t+1}, a parent already has the distribution of "exact" after
+        independent selections of a bootstrap filter, and up to order 1 / N after other selections. So a small number
+        of steps causes no additional bias (Dau and Chopin 2023). Steps reduce the variance. Without accepted steps,
+        the paths are those of `genealogy`.
     steps : int
         Metropolis steps of "mcmc".
     """
@@ -195,7 +196,7 @@ class _Move:
 
 
 def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight, in random order: those of `independent_draws` are nearly sorted."""
+    """(n,) indices drawn independently by weight, in random order."""
     index = independent_draws(rng, population.weights, n)
     rng.shuffle(index)
     return index

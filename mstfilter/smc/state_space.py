@@ -50,7 +50,7 @@ _Chains = TypeVar("_Chains")  # states of Markov chains
 class StateSpaceModel(AtStep):
     """A hidden Markov model on any state space.
 
-    A function with a further parameter ``t`` gets the index of the step, one with a parameter ``u`` its input (see
+    If a function also has a parameter ``t``, it gets the index of the step. A parameter ``u`` gets the input (see
     `mstfilter.smc.inputs`).
 
     Parameters
@@ -62,12 +62,12 @@ class StateSpaceModel(AtStep):
     log_likelihood : callable
         ``(particles, y) -> (n,)`` log p(y_t | x_t).
     log_initial : callable, optional
-        ``(particles) -> (n,)`` log p(x_0). Guided filters and moves need it.
+        ``(particles) -> (n,)`` log p(x_0). The function is needed by guided filters and moves.
     log_transition : callable, optional
-        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows. Guided filters and moves need it.
+        ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     batched : bool or None
-        Whether the functions treat each particle by itself, so that they can be called with the particles of many
-        runs (see `mstfilter.smc.batching`). None: `run_many` tries it.
+        Whether the functions treat each particle independently, so that they can be called with the particles of many
+        runs (see `mstfilter.smc.batching`). None: With None, `run_many` tests this.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -90,7 +90,7 @@ class StateSpaceModel(AtStep):
         """A model from distributions of this package, or frozen ones of scipy.stats.
 
         `initial` is the distribution of x_0, ``transition(particles)`` that of x_t, and ``observation(particles)``
-        that of y_t, one row per particle. The functions may have the further parameters ``t`` and ``u``.
+        that of y_t, with one row per particle. The functions may also have the parameters ``t`` and ``u``.
         """
         first = as_distribution(initial)
         for name, function in (("transition", transition), ("observation", observation)):
@@ -133,7 +133,7 @@ class StateSpaceModel(AtStep):
 
 
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
-    """(n,) log p(y | x). Without the check, entries of a vector would be compared with the particles one by one."""
+    """(n,) log p(y | x). Without this check, entries of a vector would be compared with the particles one by one."""
     found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
     if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
         raise InputError(
@@ -144,14 +144,14 @@ def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
 
 
 class _OfModel(AtStep):
-    """A component that draws from a model, or from a proposal of it."""
+    """A component that draws from a model or from a proposal."""
 
     model: StateSpaceModel
     proposal: Callable[..., Any] | None
 
     @property
     def batched(self) -> bool | None:
-        """That of the model; a batch tries whether a proposal treats each particle by itself."""
+        """The value of the model. A batch tests whether a proposal treats each particle independently."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
@@ -162,9 +162,9 @@ class Prior(_OfModel, Proposal):
     Parameters
     ----------
     model : StateSpaceModel
-        With `log_initial` if there is a proposal.
+        The model, with `log_initial` if there is a proposal.
     proposal : callable, optional
-        ``y -> distribution`` q. If y_0 is missing, p(x_0) is drawn.
+        ``y -> distribution`` q. If y_0 is missing, particles are drawn from p(x_0).
     """
 
     model: StateSpaceModel
@@ -192,10 +192,10 @@ class Dynamics(_OfModel, DensityTransition):
     Parameters
     ----------
     model : StateSpaceModel
-        With `log_transition` if there is a proposal.
+        The model, with `log_transition` if there is a proposal.
     proposal : callable, optional
-        ``(particles, y) -> distribution`` of x_t, one row per particle. Its tails must not be lighter than those of
-        f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
+        ``(particles, y) -> distribution`` of x_t, one row per particle. The tails of the distribution must not be
+        lighter than those of f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
     """
 
     model: StateSpaceModel
@@ -237,19 +237,21 @@ class PriorityLookahead(Lookahead):
 
 @dataclass(frozen=True)
 class RandomWalkMove(Rejuvenation):
-    """Metropolis steps with Gaussian increments on an array of particles; ``notes["accepted"]`` is their rate.
+    """Metropolis steps with Gaussian increments on an array of particles.
 
-    After a resampling several particles share a parent. The move separates them by a Markov kernel that leaves
-    p(x_t | x_{t-1}, y_t) invariant; the weights do not change.
+    ``notes["accepted"]`` is the acceptance rate.
+
+    After a resampling several particles share a parent. A Markov kernel separates these particles, and leaves p(x_t |
+    x_{t-1}, y_t) invariant. The weights do not change.
 
     Parameters
     ----------
     model : StateSpaceModel
-        With its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of such.
+        The model with its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of them.
     scale : float or array_like
-        Standard deviation of a step, in the units of the state. Fixed, so that the evidence is unbiased.
+        Standard deviation of a step, in the units of the state. The scale is fixed, so that the evidence is unbiased.
     steps : int
-        Metropolis steps per move.
+        Number of Metropolis steps per move.
     """
 
     model: StateSpaceModel
@@ -289,7 +291,7 @@ class RandomWalkMove(Rejuvenation):
 
 
 def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
-    """Rows of `new` where `accepted` is True, else of `old`: arrays, or mappings of such."""
+    """Rows of `new` where `accepted` is True, and else rows of `old`; arrays, or mappings of arrays."""
     if isinstance(old, Mapping):
         return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
     rows = accepted if old.ndim == 1 else accepted.reshape(-1, *(1,) * (old.ndim - 1))
@@ -308,8 +310,8 @@ def metropolis(
     Parameters
     ----------
     state
-        One row per chain: an array, or a mapping of arrays. It also holds the log densities, so that those of the
-        present state are not evaluated again.
+        One row per chain: an array, or a mapping of arrays. The state also holds the log densities, so that those of
+        the present state are not evaluated again.
     propose : callable
         ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
         q(new | old)). A ratio of NaN (both states are impossible) is rejected.
@@ -319,7 +321,7 @@ def metropolis(
     Yields
     ------
     state, accepted
-        After each step, and (n,) bool whether its proposal was accepted.
+        After each step, the state and (n,) bool whether its proposal was accepted.
     """
     for _ in range(steps):
         new, log_ratio = propose(rng, state)
@@ -372,13 +374,13 @@ def guided(
     Parameters
     ----------
     model : StateSpaceModel
-        With its log densities.
+        The model with its log densities.
     proposal : callable
         ``(particles, y) -> distribution`` of x_t; None: the transition of the model.
     initial : callable, optional
-        ``(y) -> distribution`` of x_0; default the prior of the model.
+        ``(y) -> distribution`` of x_0; the default is the prior of the model.
     **components
-        Further fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
+        Other fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
     """
     return replace(
         bootstrap(model, n),
@@ -401,9 +403,9 @@ def auxiliary(
     Parameters
     ----------
     model : StateSpaceModel
-        With its log densities if `proposal` is given.
+        The model, with its log densities if `proposal` is given.
     log_priority : callable
-        ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}); the filter is exact for any finite priority.
+        ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}). The filter is exact for any finite priority.
     proposal, initial : callable, optional
         As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
         adapted.

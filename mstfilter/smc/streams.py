@@ -1,20 +1,20 @@
 """Keyed random streams.
 
-All random numbers of a run are drawn from streams named by their use: (seed, step, slot, index). The number of
-workers, the order of work, and removing a component therefore change no other stream.
+All random numbers of a run are drawn from streams named by their use: (seed, step, slot, index). So the number of
+workers, the order of work, and the removal of a component change no other stream.
 
 >>> from mstfilter.smc import Key, child
 >>> rng = Key(seed=1).child("transition", 3).generator()     # of step 3, as `ParticleFilter` makes it
 >>> child(rng, "object", 7).random() == child(rng, "object", 7).random()    # does not consume `rng`
 True
 
-A `Key` is data (an integer and a tuple) and can be stored; generators are not stored. The generator of a key is
-numpy's PCG64; its seed of 256 bits is the hash SHAKE-128 (FIPS 202) of the key. Streams of different keys are
-independent as far as a cryptographic hash cannot be told from a random function. Two of a billion streams have the
-same seed with a probability below 1e-50.
+A `Key` is data (an integer and a tuple) and can be stored. Generators are not stored. The generator of a key is
+numpy's PCG64. The seed of a generator of 256 bits is the hash SHAKE-128 (FIPS 202) of the key. Streams of different
+keys are independent as far as a cryptographic hash behaves like a random function. The probability that two of a
+billion streams have the same seed is below 1e-50.
 
-Rows (R n, ...) are the particles of R runs of n particles, run by run, in components that are called once for all of
-them. `Rows` are such arrays; `RunGenerators` draw them, row r of every array by the generator of run r.
+If components are called once for R runs of n particles, rows (R n, ...) are the particles, run by run. `Rows` are
+arrays of this form. `RunGenerators` draw `Rows`, with row r of every array from the generator of run r.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Key:
         object.__setattr__(self, "seed", int(self.seed))
 
     def child(self, *parts: int | str) -> Key:
-        """The key of a step, a slot (by name) or an index within this one."""
+        """The key of a step, a slot (by name) or an index below this key."""
         for part in parts:
             if type(part) is not str and (type(part) is not int or part < 0):
                 parts = tuple(map(_part, parts))
@@ -82,7 +82,7 @@ class _KeySequence(ISpawnableSeedSequence):
         return np.random.SeedSequence(words.tolist()).generate_state(n_words, dtype)  # for other bit generators
 
     def spawn(self, n_children: int) -> list[Any]:
-        """Seeds of `numpy.random.Generator.spawn`; repeated calls give new ones."""
+        """Seeds of `numpy.random.Generator.spawn`. Repeated calls return new seeds."""
         first = self._n_spawned
         self._n_spawned += n_children
         return [_KeySequence(self.key.child("spawn", k)) for k in range(first, self._n_spawned)]
@@ -101,13 +101,13 @@ def _digest(seed: int, path: tuple[int | str, ...], block: int | None) -> bytes:
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
     """A stream derived from the stream of `rng` and named by `parts`, for example ``"object", 7``.
 
-    `rng` is made from a seed, for example by numpy.random.default_rng or `Key`. It is not advanced.
+    `rng` must be made from a seed, for example by numpy.random.default_rng or `Key`. `rng` is not advanced.
     """
     return key_of(rng).child(*parts).generator()
 
 
 def key_of(rng: np.random.Generator) -> Key:
-    """The key of the stream of a generator, whatever its current position in the stream."""
+    """The key of the stream of a generator, for any current position in the stream."""
     sequence = rng.bit_generator.seed_seq
     if isinstance(sequence, _KeySequence):
         return sequence.key
@@ -131,7 +131,7 @@ def _part(part: int | str) -> int | str:
 class Rows(np.ndarray):
     """Arrays (R n, ...) of the particles of R runs, run by run, in the functions of batched components.
 
-    Products with a matrix are computed for each run, as BLAS rounds an entry by the number of rows of the product.
+    Products with a matrix are computed for each run, since the rounding of BLAS depends on the number of rows.
     """
 
     n: ClassVar[int] = 0  #: particles of a run
@@ -145,7 +145,7 @@ class Rows(np.ndarray):
 
 @lru_cache(maxsize=64)
 def rows_of(n: int) -> type[Rows]:
-    """The class of arrays with `n` rows for each run; numpy gives it to the results of operations."""
+    """The class of arrays with `n` rows for each run. numpy gives it to the results of operations."""
     return type("Rows", (Rows,), {"n": n})
 
 
@@ -177,7 +177,7 @@ class _SeedsInTurn(ISeedSequence):
 
 
 class RunGenerators:
-    """The generators of R runs, for batched components: row r of every array is drawn by the generator of run r.
+    """The generators of R runs, for batched components. The generator of run r draws row r of every array.
 
     ``standard_normal``, ``random`` and ``standard_exponential`` are fast. Any other method of
     `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. With `n`, the
@@ -257,7 +257,7 @@ def _signature(method: str) -> inspect.Signature:
 
 
 def summaries(log_weights: np.ndarray, top: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n); the numbers of `Population`.
+    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n), equal to those of `Population`.
 
     `top` are the largest log weights (R,), if they are known.
     """
@@ -281,5 +281,5 @@ def each_array(function: Callable[[np.ndarray], np.ndarray], particles: Any) -> 
 
 
 def of_runs(particles: Any, row: Any) -> Any:
-    """Particles of one run, or of the runs of an index."""
+    """Particles of one run, or of several runs of an index."""
     return each_array(lambda a: a[row], particles)

@@ -1,7 +1,7 @@
 """Resampling around another scheme.
 
-`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme: they change the order of the particles,
-merge equal ones, or change the weights.
+`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme. The wrappers change the order of the
+particles, merge equal ones, or change the weights.
 
 >>> import numpy as np
 >>> from mstfilter.smc import Coalesced, FearnheadClifford, Population
@@ -31,7 +31,7 @@ from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, checke
 class ResamplerWrapper(Resampler):
     """Base class of resamplers that change the input or the result of another resampler, `scheme`.
 
-    It is properly weighted if the wrapped resampler is.
+    The wrapper is properly weighted if the wrapped resampler is.
     """
 
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
@@ -52,13 +52,14 @@ class Sorted(ResamplerWrapper):
     Parameters
     ----------
     order : {"position", "mean_partition"}
-        "position": by value; particles that are vectors, along a Hilbert curve. In one dimension, the distribution
-        function of the particles that `Systematic` or `Stratified` select differs from the weighted one by at most
-        1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of resampling
-        methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte Carlo".
-        With "mean_partition", particles of at most the mean weight come first, then the others, each in its order.
-        `Systematic` then keeps as many of the light particles as on average, rounded up or down. Chopin, Singh, Soto,
-        Vihola (2022), "On resampling schemes for particle filters with weakly informative observations".
+        "position": by value, or along a Hilbert curve for particles that are vectors. In one dimension, the
+        distribution function of the particles that `Systematic` or `Stratified` select differs from the weighted one
+        by at most 1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of
+        resampling methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte
+        Carlo". With "mean_partition", particles of at most the mean weight are first, then the others. The order
+        inside each group does not change. `Systematic` then keeps the expected number of light particles, rounded up
+        or down. Chopin, Singh, Soto, Vihola (2022), "On resampling schemes for particle filters with weakly
+        informative observations".
     """
 
     scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
@@ -75,7 +76,7 @@ class Sorted(ResamplerWrapper):
 
 
 def _line(x: np.ndarray) -> np.ndarray:
-    """(n,) numbers that order (n, d) rows: the value if d = 1, else the position along a Hilbert curve."""
+    """(n,) numbers that order (n, d) rows: the value if d = 1, and else the position along a Hilbert curve."""
     d = x.shape[1]
     if d == 1:
         return x[:, 0]
@@ -131,11 +132,11 @@ class Shuffled(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class Coalesced(ResamplerWrapper):
-    """Merges particles that `equivalence` takes as equal, with the sum of their weights, before the selection.
+    """Merges particles that are equal by `equivalence`, with the sum of their weights, before the selection.
 
-    The heaviest particle of a class is kept, the first of several. The result represents the same distribution with
-    fewer particles. The population grows again only if a transition or update makes more candidates.
-    ``notes["distinct"]`` is the number of different particles of positive weight.
+    The heaviest particle of a class is kept; if several have equal weights, the first. The result represents the same
+    distribution with fewer particles. The population grows again only if a transition or update makes more
+    candidates. ``notes["distinct"]`` is the number of different particles of positive weight.
     """
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
@@ -153,9 +154,9 @@ class Coalesced(ResamplerWrapper):
 def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Select one particle for each class: the heaviest, with the weight of the class.
 
-    Returns the representatives (k,), ascending, the first if several have equal weights, and their log weights (k,).
-    A log weight is the log of the summed weights times k / m, which keeps the log mean. Classes of weight zero are
-    left out.
+    Returns the representatives (k,) in ascending order and their log weights (k,). If several particles have equal
+    weights, the first is the representative. A log weight is the log of the summed weights times k / m, which keeps
+    the log mean. Classes of weight zero are omitted.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)
@@ -170,9 +171,9 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Tempered(ResamplerWrapper):
-    """Selects by w^power and multiplies the selected weights by w^(1 - power): light particles survive longer.
+    """Selects by w^power and multiplies selected weights by w^(1 - power), so that light particles survive longer.
 
-    `power` is in [0, 1]. With 1 this is the wrapped scheme; with 0 all particles of positive weight are equally
+    `power` is in [0, 1]. With 1 this is the wrapped scheme. With 0 all particles of positive weight are equally
     likely.
     """
 
@@ -193,7 +194,7 @@ class Tempered(ResamplerWrapper):
 class KeepWeights(ResamplerWrapper):
     """Selected particles keep their weights, as in the program of the MST authors.
 
-    Selecting by weight and keeping the weight counts the same evidence twice, so this is not properly weighted.
+    Selecting by weight and keeping the weight counts evidence twice, so this scheme is not properly weighted.
     """
 
     scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)

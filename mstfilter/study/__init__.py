@@ -1,12 +1,12 @@
-"""Studies: filters compared on many scenes.
+"""Studies, which compare filters on many scenes.
 
 >>> from mstfilter.study import Local, load_study, run_study
 >>> study = load_study("experiments/main/study.toml", smoke=True)
 >>> result = run_study(study, Path("studies/main"), Local(workers=2))
 >>> result.folder.summary().compared()[0].words
 
-`run_study` plans the runs (every arm on every scene with every seed), and an executor (`Local` or `Cluster`) makes
-those that are not done yet. Then `run_study` writes the tables of the study folder. Each run is a
+`run_study` plans the runs (every arm on every scene with every seed). An executor (`Local` or `Cluster`) makes the
+runs that are missing. Then `run_study` writes the tables of the study folder. Each run is a
 `mstfilter.runs.RunFolder`.
 """
 

@@ -30,7 +30,7 @@ class Cluster(Executor):
     Parameters
     ----------
     address : str
-        For example ``tcp://head:8786``.
+        Address, for example ``tcp://head:8786``.
     connect_s : float
         Time limit in seconds for the first answer of the scheduler, and for its first worker.
     """
@@ -55,7 +55,7 @@ class Cluster(Executor):
         return [outcomes[k] for k in range(len(jobs))]
 
     def _warn_without_tls(self) -> None:
-        """Warn if the scheduler is on another host and the connection has no TLS: who reaches it can run code."""
+        """Warn if the scheduler is on another host without TLS, since any program that reaches it can run code."""
         protocol, _, rest = self.address.rpartition("://")
         host = rest.rpartition(":")[0].strip("[]")
         if protocol not in ("tls", "wss", "inproc") and host not in ("localhost", "::1") and host[:4] != "127.":

@@ -1,4 +1,4 @@
-"""A study as a TOML file, and the arms that it compares.
+"""A study as a TOML file, and the arms (configurations of the filter) that it compares.
 
 >>> study = load_study("experiments/main/study.toml")
 >>> study.arms[0].preset, study.scenes[0].family
@@ -126,8 +126,8 @@ class StudyConfig(_Entry):
 def load_study(path: str | Path, *, smoke: bool = False) -> StudyConfig:
     """Read a study from a TOML file.
 
-    `smoke` applies the table ``[smoke]``: a small study that shows that everything works. Raises InputError if the
-    file is missing, is not valid TOML, or has an unknown or invalid entry.
+    `smoke` applies the table ``[smoke]``, which defines a small study for a quick test. Raises InputError if the file
+    is missing, is not valid TOML, or has an unknown or invalid entry.
     """
     path = Path(path)
     data = read_toml(path, "a study")
@@ -178,7 +178,7 @@ def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
-    """The arms of a study, grids multiplied out. `overrides` are applied to each; commas in them make a grid too."""
+    """The arms of a study, with grids expanded. The `overrides` are applied to each; commas make a grid."""
     for entry in study.arms:
         yield from _expand(entry, study.folder, overrides)
 
@@ -200,7 +200,7 @@ def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator
 
 
 def _preset_path(folder: Path, name: str) -> str:
-    """The file of a preset in the study's folder if there is one, else the name."""
+    """The file of a preset in the study's folder if there is one, or else the name."""
     return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
 
 
@@ -209,7 +209,7 @@ def _stem(preset: str) -> str:
 
 
 def split_grid(text: str) -> list[str]:
-    """``"path=a,b"`` as ``["path=a", "path=b"]``; commas inside brackets and quotes do not separate."""
+    """``"path=a,b"`` as ``["path=a", "path=b"]``. Commas inside brackets and quotes do not separate."""
     path, equals, values = text.partition("=")
     if not equals:
         return [text]

@@ -2,8 +2,8 @@
 
 >>> outcomes = Local(workers=2).run(jobs, tell=print)
 
-A job is a mapping of plain values (see `mstfilter.study.jobs`). It always ends with a `JobOutcome`: an error in a
-job, a worker that dies and a time limit that is exceeded do not stop the other jobs.
+A job is a mapping of plain values (see `mstfilter.study.jobs`). A job always ends with a `JobOutcome`. An error in a
+job, the death of a worker or an exceeded time limit does not stop the other jobs.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ class Executor(Bounded, ABC):
 class Local(Executor):
     """Runs jobs in processes of this machine, one thread each.
 
-    Each worker is a `pebble.ProcessPool` of one process, which is started with ``spawn`` and does many jobs. A worker
-    that dies or exceeds the time limit of its job is replaced. As with `multiprocessing`, a script that uses this
-    class needs ``if __name__ == "__main__":``.
+    Each worker is a `pebble.ProcessPool` of one process. The process is started with ``spawn`` and runs many jobs. If
+    a worker dies or exceeds the time limit of its job, it is replaced. As with `multiprocessing`, a script that uses
+    this class needs ``if __name__ == "__main__":``.
 
     Parameters
     ----------
     workers : int
-        Number of processes. 0: the number of cores that this process may use.
+        Number of processes. 0 means the number of cores that this process may use.
     logs : Path, optional
-        Folder for the output of the workers. Default: their output is discarded.
+        Folder for the output of the workers. By default, their output is discarded.
     """
 
     workers: NonNegativeInt = 0
@@ -178,7 +178,7 @@ class _Worker:
 
 
 def _initialise(log: str) -> None:
-    """Prepare a worker process: output goes to the log, one thread, exit when the study ends."""
+    """Prepare a worker process: output to the log, one thread, and exit when the study ends."""
     import cv2
 
     target = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -191,7 +191,7 @@ def _initialise(log: str) -> None:
 
 
 def _exit_with_parent() -> None:
-    """Exit as soon as the process of the study has ended, also during a job."""
+    """Exit as soon as the process of the study has ended, even during a job."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

@@ -1,11 +1,11 @@
-"""The jobs of a study: simulate a recording, or run a filter on one.
+"""The jobs of a study, which simulate a recording or run a filter on one.
 
 >>> perform({"kind": "run", "name": "mst on demo-0", ...})
 JobOutcome(status='done')
 
-A job is a mapping of plain values, so that a process on another machine can do it. A run is written under a temporary
-name and renamed when it is complete. So two workers with the same run do not disturb each other, and the remains of a
-killed worker are never taken for a result.
+A job is a mapping of plain values, so that a process on another machine can run it. A run is written under a
+temporary name and renamed when it is complete. So two workers with the same run do not disturb each other, and the
+remains of a killed worker are never used as a result.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
 
 def perform(job: Job) -> JobOutcome:
-    """Do a job; an error in it becomes its outcome.
+    """Run a job. An error in a job becomes its outcome.
 
-    ``job["kind"]`` is "record" or "run"; the other keys are those that `mstfilter.study.study` makes.
+    ``job["kind"]`` is "record" or "run". The other keys are those that `mstfilter.study.study` writes.
     """
     try:
         if job["kind"] == "record":
@@ -58,7 +58,7 @@ def _failure(error: BaseException) -> JobOutcome:
 
 
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
-    """The recording of a scene; a simulated one is made if it is missing."""
+    """The recording of a scene. A missing simulated recording is made."""
     if "path" in source:
         return open_recording(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation import cached_recording
@@ -68,7 +68,7 @@ def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
 
 @functools.cache
 def _check_code(expected: str) -> None:
-    """Raise InputError unless this process runs the code that the study was planned with.
+    """Raise InputError unless this process runs the code with which the study was planned.
 
     All packages of the filter are imported, so that later changes of their files have no effect on this process.
     """
@@ -118,7 +118,7 @@ def _run(job: Job) -> None:
 
 
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
-    """The metrics of each pause of a run; the counts of its forecasts are written into its folder."""
+    """The metrics of each pause of a run. The counts of the run's forecasts are written into its folder."""
     measured = [
         measure_pause(
             recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)
@@ -140,7 +140,7 @@ def reset_peak() -> bool:
 
 
 def peak_megabytes() -> float:
-    """Peak resident memory of this process in MB since the last `reset_peak`; NaN if the system cannot tell."""
+    """Peak resident memory of this process in MB since the last `reset_peak`; NaN if it is unknown."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("VmHWM:"):

@@ -4,8 +4,9 @@
 >>> [run.name for run in plan.runs]
 
 The identity of a run is a hash of its configuration, its recording, its seed, the files of mstfilter and of the user,
-and the versions of the libraries. A simulated recording is hashed as its recipe, another as its content with the
-ground truth. A run whose identity is unchanged is not repeated. Equal runs of two studies have equal identities.
+and the versions of the libraries. A simulated recording is hashed as its recipe. Other recordings are hashed as their
+content with the ground truth. A run is not repeated if its identity has not changed. Equal runs have equal
+identities.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class StudyRun:
 
 @dataclass(frozen=True)
 class Plan:
-    """All runs of a study, ordered by scene, and the version of the code that they were planned with."""
+    """All runs of a study, ordered by scene, and the version of the code with which they were planned."""
 
     config: StudyConfig
     code: str
@@ -88,7 +89,7 @@ class Plan:
 
     @property
     def reference(self) -> str:
-        """The arm that the others are compared with."""
+        """The arm with which the others are compared."""
         return self.config.reference or self.arms[0].name
 
 
@@ -158,7 +159,7 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
 
 
 def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
-    """Put the group in front of names that several scenes have."""
+    """Put the group before names that several scenes have."""
     count = Counter(scene.name for scene in scenes)
     return tuple(replace(s, name=f"{s.group}-{s.name}") if count[s.name] > 1 else s for s in scenes)
 

@@ -80,7 +80,7 @@ class _Cost(BaseModel, extra="allow"):
 
 
 class _Result(BaseModel):
-    """What readers use of result.json; a result without rows is that of a run that failed."""
+    """The parts of result.json that readers use. A failed run has a result without rows."""
 
     status: str
     identity: str
@@ -118,7 +118,7 @@ class _StudyRun(BaseModel):
 
 
 class _Study(BaseModel):
-    """What readers use of study.json."""
+    """The parts of study.json that readers use."""
 
     format: int
     name: str
@@ -169,7 +169,7 @@ class StudyFolder:
 
     @property
     def truth_users(self) -> dict[str, list[str]]:
-        """Names of the arms that use the ground truth -> classes of the components that do."""
+        """Mapping from arms that use the ground truth to the classes of the components that use it."""
         return {arm["name"]: arm["uses_truth"] for arm in self.description["arms"] if arm["uses_truth"]}
 
     def run(self, folder: str) -> Path:
@@ -192,7 +192,7 @@ class StudyFolder:
         return found
 
     def records(self) -> list[dict[str, Any]]:
-        """As `rows`, including lists: ``qualities`` has one value per hypothesis."""
+        """As `rows`, but with lists: ``qualities`` has one value per hypothesis."""
         rows = []
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
@@ -239,7 +239,7 @@ class StudyFolder:
         return found
 
     def forecasts(self, family: str, arm: str) -> ForecastTable:
-        """Forecasts of an arm on a family at pauses t >= 1, as they come, pooled over scenes and seeds."""
+        """Forecasts of an arm on a family at pauses t >= 1, without recalibration, pooled over scenes and seeds."""
         counts = sum(
             (one[1:, 0].sum(axis=0, dtype=np.int64) for one in self._counts(family, arm).values()), NO_COUNTS
         )

@@ -1,10 +1,10 @@
-"""Run a study: check everything first, then do every run that is not done yet, then write the tables.
+"""Runs a study. `run_study` checks everything first, then makes every missing run, and then writes the tables.
 
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
 
-The same call resumes a study that was stopped and repeats the runs that failed. Runs whose identity is unchanged are
-not repeated; the tables are the same as those of an uninterrupted study.
+The same call resumes an interrupted study and repeats failed runs. Runs with unchanged identity are not repeated. The
+tables equal those of an uninterrupted study.
 """
 
 from __future__ import annotations
@@ -63,20 +63,20 @@ def run_study(
     Parameters
     ----------
     path : Path
-        The study folder: new, empty, or of an earlier call.
+        The study folder. The folder must be new, empty, or from an earlier call.
     executor : Executor, optional
-        Default: one process for each core of this machine.
+        By default, one process for each core of this machine.
     overrides : sequence of str
         Applied to every arm; a comma makes a grid.
     cache : Path, optional
-        Folder of simulated recordings and of intermediate results. Default: the user's cache folder.
+        Folder of simulated recordings and of intermediate results. By default, the user's cache folder.
     progress : bool or callable
         True shows progress bars; a function is called whenever a job ends or loses its worker.
 
     Raises
     ------
     InputError
-        If the study or the folder is invalid, before any run starts. Runs that fail do not raise.
+        If the study or the folder is invalid, before any run starts. Failed runs do not raise an error.
     """
     from mstfilter.simulation import cache_folder
 
@@ -110,7 +110,7 @@ def _prepare(folder: StudyFolder, cache: Path, description: dict[str, Any]) -> N
 
 @dataclass(frozen=True)
 class _Call:
-    """One call of `run_study`: its jobs are given to the executor, and failures are recorded."""
+    """One call of `run_study`, which gives jobs to the executor and records failures."""
 
     plan: Plan
     folder: StudyFolder
@@ -119,7 +119,7 @@ class _Call:
     report: Callable[[StudyProgress], None]
 
     def record_scenes(self, runs: Sequence[StudyRun]) -> dict[str, JobOutcome]:
-        """Simulate the recordings that are missing; name of a run that lacks its recording -> why."""
+        """Simulate missing recordings. Returns the runs that lack a recording, with the reason."""
         recordings = self.cache / "recordings"
         scenes = {run.scene.key: run.scene for run in runs if "family" in run.scene.source}
         missing = [scene for scene in scenes.values() if not _is_recorded(scene.source, recordings)]
@@ -134,7 +134,7 @@ class _Call:
         return {run.name: why[run.scene.key] for run in failed}
 
     def filter_scenes(self, runs: Sequence[StudyRun], n_failed: int) -> dict[str, JobOutcome]:
-        """Do some runs; name of a run that failed -> why. `n_failed` is the number of runs that failed before."""
+        """Make some runs. Returns the failed runs with reasons; `n_failed` is the number that failed before."""
         total = len(self.plan.runs)
         jobs = [self._run_job(run) for run in runs]
         count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
@@ -191,7 +191,7 @@ class _Call:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[StudyFolder]:
-    """The study folder, which need not exist, reserved for this process, without the remains of killed processes."""
+    """The study folder, which need not exist, reserved for this process. Remains of killed processes are removed."""
     with locked(path):
         try:
             sweep(path)
@@ -235,7 +235,7 @@ def _is_done(run: StudyRun, folder: StudyFolder) -> bool:
 
 
 def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
-    """Record why a run failed; if the disk is full, nothing is written."""
+    """Record the reason of a failed run. If the disk is full, nothing is written."""
     with contextlib.suppress(OSError):
         folder.write_failure(run.folder, run.identity, outcome)
 

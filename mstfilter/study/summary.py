@@ -1,12 +1,12 @@
-"""The summary of a study: means by family and arm, and paired differences from the reference.
+"""The summary of a study: means by family and arm, and paired differences to the reference.
 
 >>> summary = summarise(folder.rows(), reference="mst")
 >>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
 There are two primary endpoints, both means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality
 of the hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of their forecasts in nats after
-recalibration on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
-same pauses. Values are averaged over filter seeds first, then over scenes. Differences are arm minus reference. p
+recalibration on other scenes. Lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
+same pauses. Values are averaged over filter seeds first, then over scenes. A difference is arm minus reference. The p
 values of both endpoints are adjusted together.
 """
 
@@ -35,7 +35,7 @@ def title_of(metric: str) -> str:
 
 
 def bounds_of(metric: str) -> tuple[float, float]:
-    """The least and the largest value of a metric; slopes are not bounded."""
+    """The least and the largest value of a metric. Slopes are not bounded."""
     if metric.endswith("_slope"):
         return -np.inf, np.inf
     return 0.0, 1.0 if metric.startswith(_SHARES) else np.inf
@@ -49,7 +49,7 @@ class ArmMetric:
     ----------
     family, arm, name : str
     by_scene : mapping
-        Scene -> mean over filter seeds. Scenes where the metric is not defined are left out.
+        Scene -> mean over filter seeds. Scenes in which the metric is not defined are omitted.
     """
 
     family: str
@@ -64,7 +64,7 @@ class ArmMetric:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """t interval of the mean over scenes, cut at the least and the largest value that the metric can have."""
+        """t interval of the mean over scenes, cut at the least and the largest possible value of the metric."""
         low, high = interval(np.array(list(self.by_scene.values())))
         least, most = bounds_of(self.name)
         return max(low, least), min(high, most)
@@ -78,7 +78,7 @@ class Compared:
     ----------
     family, arm, reference, metric : str
     difference : Difference
-        For the primary endpoints, `p_claim` is adjusted over both, all families and arms.
+        For the primary endpoints, `p_claim` is adjusted over both endpoints, all families and all arms.
     reported_only : bool
         The arm is not part of the adjustment, and no conclusion is drawn.
     """
@@ -110,7 +110,7 @@ class Summary:
     Parameters
     ----------
     families, arms, names : tuple of str
-        In the order of the study; `names` are those of the metrics.
+        In the order of the study. `names` are those of the metrics.
     reference : str
     metrics : tuple of ArmMetric
     differences : tuple of Compared
@@ -125,7 +125,7 @@ class Summary:
     differences: tuple[Compared, ...]
 
     def metric(self, family: str, arm: str, name: str = "quality") -> ArmMetric | None:
-        """The value of a metric; None if the arm has none for this family of scenes."""
+        """The value of a metric; None if the arm has no value for this family."""
         for one in self.metrics:
             if (one.family, one.arm, one.name) == (family, arm, name):
                 return one
@@ -138,8 +138,8 @@ class Summary:
     def is_better(self, family: str, arm: str) -> bool:
         """Whether the reference is shown to be better than an arm on a family.
 
-        One endpoint is better after adjustment, the intervals of the other exclude that it is worse by 0.005 or more,
-        and both have at least 20 scenes.
+        One endpoint must be better after adjustment, and the intervals of the other must exclude a loss of 0.005 or
+        more. Both need at least 20 scenes.
         """
         found = []
         for one in self.differences:
@@ -184,11 +184,10 @@ def summarise(
     ----------
     rows : sequence of mapping
     reference : str
-        The arm that others are compared with.
+        The arm with which others are compared.
     cost : sequence of str
-        Columns of time and memory. They are averaged over all pauses and not compared; a stage that a step lacks
-        took 0 seconds. If an arm has several filter seeds, the first is left out: it also fills the cache with what
-        later runs share.
+        Columns of time and memory. The columns are averaged over all pauses and not compared. A stage that a step
+        lacks took 0 seconds. If an arm has several filter seeds, the first is omitted, since it fills the cache.
     reported_only : collection of str
         Arms that are not part of the comparisons.
     """

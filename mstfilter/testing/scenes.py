@@ -4,7 +4,8 @@
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
-Return it from the method `example` of a contract, or define ``example = scene_example`` in the file of a component.
+Return the example from the method `example` of a contract, or define ``example = scene_example`` in a component's
+file.
 """
 
 from __future__ import annotations

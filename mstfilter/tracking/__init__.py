@@ -1,4 +1,4 @@
-"""Prediction: hypotheses follow the video of a clip (paper IV-C).
+"""Prediction: hypotheses are moved according to the video of a clip (paper IV-C).
 
 >>> from mstfilter.tracking import MstRule, TrackingTransition
 >>> transition = TrackingTransition(MstRule(select="sample"))

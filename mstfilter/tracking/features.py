@@ -1,13 +1,13 @@
-"""Colours and features that the frames of a clip share: exposure matching and SIFT matches.
+"""Colours and features of the frames of a clip: exposure matching and SIFT matches.
 
 >>> matches = SiftMatching().match(clip.before, clip.after)     # doctest: +SKIP
 >>> matches.p, matches.q                                        # doctest: +SKIP
 
 Features are detected once in the whole image and shared by all hypotheses and segments.
 
-Automatic exposure and white balance change the colour of the whole image when something moves: in real clips most of
-an untouched table differs by more than 12 grey levels. `matched_colour` removes this change by a gain and an offset
-per channel, fitted where the depth is unchanged.
+Automatic exposure and white balance change the colour of the whole image when something moves. In real clips, most of
+an untouched table differs by more than 12 grey levels. `matched_colour` removes this change. The function fits a gain
+and an offset per channel where the depth is unchanged.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the g
 
 
 def same_depth(first: Frame, other: Frame) -> np.ndarray:
-    """Pixels (H, W) where both frames have a reading off the robot that agrees up to the sensor noise."""
+    """Pixels (H, W) off the robot where both frames have readings that agree up to the sensor noise."""
     limit = _DEPTH_SIGMAS * np.sqrt(2.0) * depth_sigma(first.depth)
     with np.errstate(invalid="ignore"):
         return (np.abs(other.depth - first.depth) <= limit) & first.valid & other.valid
 
 
 def smooth_colour(frame: Frame, width: int = 3) -> np.ndarray:
-    """Colour (H, W, 3) blurred over ``width`` pixels, to reduce the effect of shifts below a pixel."""
+    """Colour (H, W, 3) blurred over ``width`` pixels, to reduce the effect of shifts by less than a pixel."""
     return memo(
         "smooth colour", (frame.key, width), lambda: cv2.GaussianBlur(frame.rgb, (width, width), 0).astype(np.float32)
     )
@@ -87,7 +87,7 @@ class Matches:
     q: np.ndarray
 
     def within(self, first: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
-        """Indices of the pairs that start inside mask ``first`` and, if given, end inside ``last`` (H, W)."""
+        """Indices of the pairs that start inside mask ``first`` and, if ``last`` is given, end inside it (H, W)."""
         keep = first[self.before[:, 1], self.before[:, 0]]
         if last is not None:
             keep = keep & last[self.after[:, 1], self.after[:, 0]]
@@ -101,8 +101,9 @@ class SiftMatching(Bounded):
     Parameters
     ----------
     mutual : bool
-        Keep a pair only if each feature is the best match of the other and passes the ratio test (`ratio`). If False,
-        keep every pair within all three radii, as the authors' program does; clustering rejects wrong pairs.
+        If True, keep a pair only if each feature is the best match of the other and passes the ratio test (`ratio`).
+        If False, keep every pair within all three radii, as the authors' program does. Clustering rejects wrong
+        pairs.
     ratio : float
         Largest ratio of the best to the second best descriptor distance. Used if `mutual`.
     descriptor_radius : float
@@ -126,7 +127,7 @@ class SiftMatching(Bounded):
 
 
 def _features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) and descriptors (N, 128) of features with a depth reading, off the robot."""
+    """Pixels (N, 2) and descriptors (N, 128) of features that have a depth reading and are not on the robot."""
 
     def compute() -> tuple[np.ndarray, np.ndarray]:
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
@@ -170,7 +171,7 @@ def _match(before: Frame, after: Frame, settings: SiftMatching) -> Matches:
 
 
 def _far(a: np.ndarray, b: np.ndarray, reach: float) -> np.ndarray:
-    """Whether points a (N, d) and b (M, d) are farther apart than reach, (N, M)."""
+    """Whether points a (N, d) and b (M, d) are farther apart than reach, (N, M) bool."""
     squared = np.zeros((len(a), len(b)), np.float32)
     for axis in range(a.shape[1]):
         squared += (a[:, axis, None] - b[None, :, axis]) ** 2
@@ -178,7 +179,7 @@ def _far(a: np.ndarray, b: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _mutual(distance: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs that are mutual best matches and pass the ratio test against the second best of the row."""
+    """Pairs that are mutual best matches and pass the ratio test against the second best match of the row."""
     j = distance.argmin(axis=1)
     i = np.arange(len(j))
     best = distance[i, j]

@@ -1,16 +1,16 @@
-"""Dense optical flow through a clip, computed once and shared by every hypothesis.
+"""Dense optical flow through a clip, computed once for all hypotheses.
 
 Two results are accumulated over the frames of the clip:
 
-- a grid of points of the first frame, followed forward (for rigid fits);
-- a pull map: for every pixel of the last frame its position in the first. It converts label images of ``clip.before``
-  to label images of ``clip.after`` by one gather each.
+- The first result is a grid of points of the first frame, followed forward (for rigid fits).
+- The second result is a pull map. The pull map has, for every pixel of the last frame, its position in the first
+  frame. The pull map converts label images of ``clip.before`` to label images of ``clip.after`` by one gather each.
 
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
 
-A point or pixel is valid while the backward flow returns it to its start, its depth and colour do not jump, and it is
-not on the robot. The flow from the first to the last frame alone fails for long motions.
+A point or pixel is valid if the backward flow returns it to its start, its depth and colour do not jump, and it is
+not on the robot. Flow that is computed only from the first and the last frame fails for long motions.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class ClipTracks:
     unchanged: np.ndarray  #: (H, W) bool, whether depth and colour agree between first and last frame
 
     def warp(self, labels: np.ndarray) -> np.ndarray:
-        """A label image (H, W) of the first frame, moved to the last; 0 for robot pixels."""
+        """A label image (H, W) of the first frame, moved to the last frame; 0 for robot pixels."""
         flat = np.append(labels.ravel(), labels.dtype.type(0))
         return flat[self.source]
 
@@ -65,7 +65,7 @@ class ClipTracks:
         return cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) == 0
 
     def points_in(self, mask: np.ndarray) -> np.ndarray:
-        """Indices of the points that start inside a mask (H, W) and reached the end."""
+        """Indices of the points that start inside a mask (H, W) and are valid until the end."""
         return np.flatnonzero(mask[self.start[:, 1], self.start[:, 0]] & self.alive)
 
 
@@ -116,7 +116,7 @@ def _track(frames: list[Frame], preset: str) -> ClipTracks:
 
 
 def _thinned(frames: list[Frame]) -> list[Frame]:
-    """Remove frames with little motion since the last kept frame."""
+    """Remove frames with little motion since the previous kept frame."""
     if len(frames) < 3:
         return frames
     factor = 160.0 / frames[0].depth.shape[1]
@@ -148,7 +148,7 @@ def _speed(flow: np.ndarray, frame: Frame) -> float:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit OpenCV to one thread: it splits the flow's search by thread, and the result depends on the split."""
+    """Limit OpenCV to one thread, since the result of the flow depends on the number of threads."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -162,7 +162,7 @@ def _robot(frame: Frame) -> np.ndarray:
 
 
 def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
-    """Flow a -> b and b -> a, (H, W, 2) pixels."""
+    """The flow a -> b and the flow b -> a, (H, W, 2) pixels."""
     grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
     dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
     with _one_thread():
@@ -181,7 +181,7 @@ def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _advance(
     at: np.ndarray, there: np.ndarray, back: np.ndarray, a: Frame, b: Frame
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move points from frame a to b. Returns their positions (N, 2) and whether they are valid (N,)."""
+    """Move points from frame a to frame b. Returns their positions (N, 2) and whether they are valid (N,)."""
     height, width = a.depth.shape
     moved = at + _sample(there, at)
     returned = moved + _sample(back, moved)
@@ -205,8 +205,8 @@ def _pixel(at: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndar
 def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     """Pixels (H, W) with the same content in the first and last frame.
 
-    Depth differs by less than four standard deviations of the difference, and slightly blurred colour by at most 12
-    grey levels in every channel after exposure matching. Robot pixels and pixels without depth are not unchanged.
+    Depth differs by less than four standard deviations of the difference. Slightly blurred colour differs by at most
+    12 grey levels in every channel after exposure matching. Pixels of the robot or without depth are never unchanged.
     """
     change = np.abs(smooth_colour(first) - matched_colour(last, first)).max(axis=2)
     return same_depth(first, last) & (change <= 12.0)
@@ -215,8 +215,9 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
 def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
     """Positions in the first frame (D, 2) of pixels without valid flow.
 
-    Each takes the position of one of its five nearest valid pixels: the one closest to the others. They are nearest
-    in space and colour together (12 mm and 20 grey levels have equal weight; without depth 6 pixels).
+    Each pixel takes the position of one of its five nearest valid pixels: the position closest to the other four. The
+    nearest pixels are those with the smallest combined distance in space and colour (12 mm equals 20 grey levels;
+    without depth 6 pixels).
     """
     height, width = frame.depth.shape
     if not len(uncertain) or not known.any():

@@ -1,12 +1,12 @@
-"""Registration (ICP) of the surface of a segment before and after.
+"""Registration (ICP) of a segment's surfaces before and after a clip.
 
 >>> source, target = prepare(points_before), prepare(points_after)                 # doctest: +SKIP
 >>> result = SmallGicp().register(source, target, np.eye(4), reach=0.02)           # doctest: +SKIP
 >>> result.T, result.overlap                                                       # doctest: +SKIP
 
-A `Surface` holds the downsampled cloud with normals, covariances and search tree. It is prepared once and used by all
-registrations of the segment. The library small_gicp runs on one thread: with several threads the order of a sum
-changes the last digits of the result.
+A `Surface` holds the downsampled cloud with normals, covariances and search tree. A surface is prepared once for all
+registrations of the segment. The library small_gicp runs on one thread, because with several threads the order of a
+sum changes the last digits of the result.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _N_NEIGHBOURS = 12  # for normals and covariances
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A point cloud prepared for registration; make one with `prepare`."""
+    """A point cloud prepared for registration by `prepare`."""
 
     points: np.ndarray  #: (N, 3) downsampled points, metres
     cloud: Any  #: small_gicp's cloud (with normals and covariances) and search tree
@@ -81,7 +81,7 @@ class Registration(Checked, ABC):
     @returns(_check_registration)
     @abstractmethod
     def register(self, source: Surface, target: Surface, init: np.ndarray, reach: float) -> RegistrationResult | None:
-        """Align source to target; None if the result is not finite.
+        """Align the source to the target; None if the result is not finite.
 
         `init` (4, 4) is the initial motion of the source in world metres, `reach` the largest distance of a
         correspondence in metres.

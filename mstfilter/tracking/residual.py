@@ -1,19 +1,19 @@
 """Comparison of a motion with the last frame: the residual that ranks motions, and refinement.
 
-The residual compares depth and colour where the moved surface should be. Per point, with z the predicted and m the
-measured depth:
+The residual compares depth and colour at the positions of the moved surface. With predicted depth z and measured
+depth m, the cost of a point is
 
-- ``min(|z - m| / s, cap)^2 + min(|colour difference| / c, cap)^2``, s from the sensor's noise at that range;
-- z behind m by more than a margin: occluded, a constant cost;
-- outside the image: a larger constant cost;
-- no reading or robot: not counted.
+- ``min(|z - m| / s, cap)^2 + min(|colour difference| / c, cap)^2``, where s is the sensor noise at this range;
+- a constant if z is behind m by more than a margin (occluded);
+- a larger constant outside the image;
+- not counted without a reading or on the robot.
 
 The score S is the mean cost of the counted points, plus a term for the fraction of visible points on pixels that the
-flow traces back to another object. Depth and colour do not distinguish two objects of equal look. Lower is better.
+flow traces back to another object. The term distinguishes two objects that look the same. A lower score is better.
 
-`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour. It compares
-every moved point with the measurement at the pixel that it falls on, so errors of the tracked mask have no effect.
-Colour determines the motions that depth does not, for instance the rotation of a can about its axis.
+`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
+`refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
+effect. Colour determines motions that depth does not determine, for example the rotation of a can about its axis.
 
 >>> MotionResidual().score(track, T)                      # doctest: +SKIP
 >>> refine_motion(track, T)                               # doctest: +SKIP
@@ -46,7 +46,7 @@ _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do 
 class MotionResidual:
     """Robust residual of a motion.
 
-    `track_weight` is added to S if all visible points land on pixels that the flow traces back to another object.
+    `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
     """
 
     track_weight: float = 1.0
@@ -85,7 +85,7 @@ class MotionResidual:
 
 
 def normals(frame: Frame) -> np.ndarray:
-    """World unit normals (H, W, 3) that face the camera, NaN if unknown. Cached by content."""
+    """World unit normals (H, W, 3) that face the camera, with NaN where they are unknown. Cached by content."""
 
     def compute() -> np.ndarray:
         valid = np.isfinite(frame.depth)
@@ -108,7 +108,7 @@ def normals(frame: Frame) -> np.ndarray:
 
 
 def _gradients(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Smoothed grey last image and its derivatives along columns and rows, grey levels per pixel."""
+    """The smoothed grey last image, and its derivatives along columns and rows in grey levels per pixel."""
 
     def compute() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         grey = track.colour_after.mean(axis=2)
@@ -119,7 +119,7 @@ def _gradients(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def refine_motion(track: Track, T: np.ndarray) -> np.ndarray:
-    """Improve a motion (4, 4) of a segment; it is returned unchanged if too few points can be compared."""
+    """Improve a motion (4, 4) of a segment. The motion is returned unchanged if too few points can be compared."""
     points, colours = track.sample(_N_REFINED)
     grey = colours.mean(axis=1)
     for gate in _GATES:
@@ -161,7 +161,7 @@ def _improvement(track: Track, x: np.ndarray, before_grey: np.ndarray, gate: flo
 
 
 def _grey_slope(camera: Camera, x: np.ndarray, z: np.ndarray, gx: np.ndarray, gy: np.ndarray) -> np.ndarray:
-    """Derivative (N, 3) of the grey value by the position of a point, times its depth `z` (N,).
+    """Derivative (N, 3) of the grey value with respect to the position of a point, times its depth `z` (N,).
 
     `gx` and `gy` (N,) are the derivatives of the image along columns and rows.
     """
@@ -181,7 +181,7 @@ def _grey_slope(camera: Camera, x: np.ndarray, z: np.ndarray, gx: np.ndarray, gy
 def _gauss_newton(x: np.ndarray, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray | None:
     """The motion (4, 4) that reduces robust residuals of points x (N, 3); None if it is not finite.
 
-    A term has the residuals (N,) and their derivatives (N, 3) by the position of the points.
+    A term consists of residuals (N,) and their derivatives (N, 3) with respect to the positions of the points.
     """
     centre = x.mean(axis=0)
     radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)

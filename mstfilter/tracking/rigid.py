@@ -1,7 +1,7 @@
 """Rigid motions from corresponding points: least squares, robust fits, and J-Linkage for several motions.
 
 Motions are (..., 4, 4) float64 matrices T: a point p moves to ``q = R p + t`` with R = T[:3, :3] and t = T[:3, 3].
-Components exchange single motions as scipy `RigidTransform`; `rigid_transform` converts without changing a bit.
+Components exchange single motions as scipy `RigidTransform`. `rigid_transform` converts a matrix bit for bit.
 
 >>> import numpy as np
 >>> rng = np.random.default_rng(1)
@@ -10,10 +10,10 @@ Components exchange single motions as scipy `RigidTransform`; `rigid_transform` 
 >>> bool(np.allclose(T[:3, 3], [0.1, 0.0, 0.0]))
 True
 
-J-Linkage (Toldo and Fusiello, ECCV 2008) finds all rigid motions among point matches when their number is unknown.
-The preference set of a match contains the sampled motions that explain it. Matches are merged bottom-up by the
-Jaccard distance of their sets, and a merged cluster keeps the intersection, so at least one motion explains all its
-members. Merging ends when all sets are disjoint.
+J-Linkage (Toldo and Fusiello, ECCV 2008) finds all rigid motions among point matches if their number is unknown. The
+preference set of a match contains the sampled motions that explain it. Matches are merged bottom-up by the Jaccard
+distance of their sets. A merged cluster keeps the intersection, so at least one motion explains all its members.
+Merging ends when all sets are disjoint.
 
 >>> q = np.where(np.arange(40)[:, None] < 20, p + [0.5, 0, 0], p - [0, 0.5, 0])
 >>> [len(m.inliers) for m in jlinkage(rng, p, q)]
@@ -64,7 +64,7 @@ def displacement(T: np.ndarray, centre: np.ndarray) -> np.ndarray:
 def kabsch(p: np.ndarray, q: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Least-squares rigid motions (..., 4, 4) of points p to points q, both (..., N, 3), with det R = +1.
 
-    `weights` (..., N) are not negative and not all zero (Kabsch 1976; the sign correction excludes reflections).
+    `weights` (..., N) must not be negative or all zero (Kabsch 1976; the sign correction excludes reflections).
     """
     p = np.asarray(p, dtype=np.float64)
     q = np.asarray(q, dtype=np.float64)
@@ -86,10 +86,10 @@ def kabsch(p: np.ndarray, q: np.ndarray, weights: np.ndarray | None = None) -> n
 
 
 def minimal_models(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float, n_models: int) -> np.ndarray:
-    """Motions (M, 4, 4) of random triples of point pairs that are consistent with a rigid motion, M <= n_models.
+    """Motions (M, 4, 4) of random triples of point pairs that are consistent with a rigid motion; M <= n_models.
 
     A triple is rejected without a fit if it is nearly collinear, or if the length of a side changes by more than
-    ``2 eps``, because a rigid motion preserves lengths.
+    ``2 eps``. A rigid motion preserves lengths.
     """
     n = len(p)
     if n < 3:
@@ -126,7 +126,7 @@ class MotionCluster:
 
 
 def ransac(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float) -> MotionCluster | None:
-    """The motion with the most pairs within ``eps`` metres, refitted to them; None if no motion has three."""
+    """The motion with most pairs within ``eps`` metres, refitted to these pairs; None if there are fewer than 3."""
     models = minimal_models(rng, p, q, eps, 300)
     if not len(models):
         return None
@@ -135,7 +135,7 @@ def ransac(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float) -
 
 
 def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionCluster | None:
-    """Two rounds of least squares on the inliers among all matches; None if there are fewer than three."""
+    """Two rounds of least squares on the inliers among all matches; None if there are fewer than three inliers."""
     inliers = np.flatnonzero(residuals(T[None], p, q)[:, 0] < eps)
     for _ in range(2):
         if len(inliers) < 3:
@@ -149,7 +149,7 @@ def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionClu
 
 
 def refine_robust(T: np.ndarray, p: np.ndarray, q: np.ndarray, scale: float) -> np.ndarray:
-    """Reweighted least squares from ``T``: Geman-McClure weights (1 + r^2 / scale^2)^-2, scale in metres."""
+    """Reweighted least squares from ``T``, with Geman-McClure weights (1 + r^2 / scale^2)^-2 (scale in metres)."""
     for _ in range(10):
         squared = ((move_points(T, p) - q) ** 2).sum(axis=-1)
         weights = (1.0 + squared / scale**2) ** -2
@@ -180,8 +180,8 @@ def jlinkage(
 
     Returns
     -------
-    list of MotionCluster, most inliers first (ties: smaller rms). A motion is left out if one with more inliers
-    explains more than half of its inliers.
+    list of MotionCluster, with most inliers first (ties: smaller rms). A motion is omitted if a motion with more
+    inliers explains more than half of its inliers.
     """
     p = np.ascontiguousarray(p, dtype=np.float64)
     q = np.ascontiguousarray(q, dtype=np.float64)

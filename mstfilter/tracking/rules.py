@@ -1,7 +1,7 @@
-"""Motion rules: the rigid motion of one object in a clip.
+"""Motion rules, which estimate the rigid motion of one object in a clip.
 
-A rule works in two stages. `candidates` computes motions once per distinct segment, shared by all hypotheses;
-`choose` selects one of them per particle, possibly at random.
+A rule has two stages. `candidates` computes motions once per distinct segment, for all hypotheses. `choose` selects
+one motion per particle, possibly at random.
 
 ================  ===========================================================================
 `PaperRule`       paper, Algorithm 2: SIFT if it has more than 5 inliers, else ICP if its error
@@ -11,8 +11,8 @@ A rule works in two stages. `candidates` computes motions once per distinct segm
 `MstRule`         candidates from flow, registration and SIFT, ranked by one robust residual
 ================  ===========================================================================
 
-`MstRule` combines several estimators because each fails on some objects: flow on plain surfaces, registration on
-rotations of symmetric objects, SIFT without texture.
+`MstRule` combines several estimators because each of them fails on some objects: flow on plain surfaces, registration
+on rotations of symmetric objects, SIFT without texture.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _check_candidate(one: Candidate) -> None:
 
 
 def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | None:
-    """That a candidate moves the object farther than the workspace is wide; None if none does."""
+    """The fault that a candidate moves the object by more than the width of the workspace; None if none does."""
     if not len(track.segment.support):
         return None
     grid, centre = track.clip.grid, track.points.mean(axis=0)
@@ -117,17 +117,17 @@ def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | Non
 
 
 class MotionRule(Checked, ABC):
-    """Decides the motion of an object."""
+    """Estimates the motion of an object."""
 
     @returns(_check_candidates)
     @abstractmethod
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """Possible motions of a segment, at least one. Computed once for all hypotheses."""
+        """Possible motions of a segment, at least one. The method is called once for all hypotheses."""
 
     @returns(_check_choice)
     @abstractmethod
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
-        """The motion of the object in one particle; `rng` belongs to this particle."""
+        """The motion of the object in one particle. `rng` is the generator of this particle."""
 
 
 def _sift_motions(
@@ -157,12 +157,12 @@ class PaperRule(MotionRule):
     Parameters
     ----------
     min_inliers : int
-        SIFT is accepted with more inliers than this.
+        SIFT is accepted if it has more inliers than this number.
     max_error : float
-        Metres; ICP is accepted with a smaller root mean square distance. The published 1 mm is below the noise of a
-        depth camera at 0.7 m, so ICP is almost never accepted.
+        Largest root mean square distance in metres at which ICP is accepted. The published value of 1 mm is below the
+        noise of a depth camera at 0.7 m, so ICP is almost never accepted.
     registration : Registration
-        Performs the ICP. The paper does not state its initial motion; here it aligns the centroids.
+        Performs the ICP. The paper does not state the initial motion. Here the initial motion aligns the centroids.
     """
 
     min_inliers: int = 5
@@ -192,7 +192,7 @@ _ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10
 
 @dataclass(frozen=True)
 class AuthorsRule(MotionRule):
-    """The rule of the authors' program: a random choice of SIFT and ICP.
+    """The rule of the authors' program, a random choice between SIFT and ICP.
 
     A drawn cluster of n matches is used with probability clip(0.1 n - 0.25, 0.1, 0.9). ICP is accepted up to a mean
     squared distance of 0.002 m^2 (4.5 cm rms).
@@ -200,7 +200,7 @@ class AuthorsRule(MotionRule):
     Parameters
     ----------
     registration : Registration
-        Performs the ICP, from the identity.
+        Performs the ICP, starting from the identity.
     """
 
     registration: Registration = field(default_factory=lambda: SmallGicp("ICP", 20))
@@ -227,23 +227,25 @@ class AuthorsRule(MotionRule):
 
 @dataclass(frozen=True)
 class MstRule(MotionRule):
-    """Candidates from flow, registration and SIFT, ranked by `MotionResidual`; rest is preferred.
+    """Candidates from flow, registration and SIFT, ranked by `MotionResidual`. No motion is preferred.
 
     Parameters
     ----------
     select : "map" or "sample"
-        Take the candidate with the best score, or draw one with probability ~ exp(-n_eff S / 2) for each particle.
+        Take the candidate with the best score ("best"), or draw one with probability proportional to exp(-n_eff S /
+        2) for each particle ("sample").
     n_eff : float
         Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring
-        pixels are correlated, so it is much smaller than the number of pixels.
+        pixels are correlated, so this number is much smaller than the number of pixels.
     use_flow, use_icp, use_sift : bool
-        Estimators that are used.
+        Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame and added as further candidates.
+        Number of best candidates that are refined against the whole last frame. These motions are candidates too.
     search_above : float
-        If every score is larger, the object is searched for around its last position. Negative values disable it.
+        If every score is larger than this value, the object is searched for around its last position. Disabled if
+        negative.
     max_score : float
-        The image refutes a motion with this score or a larger one. Default: that of a motion out of the image.
+        A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
         Aligns the surfaces of the segment before and after.
     """
@@ -261,7 +263,7 @@ class MstRule(MotionRule):
     registration: Registration = field(default_factory=SmallGicp)
 
     def candidates(self, rng: np.random.Generator, track: Track) -> tuple[Candidate, ...]:
-        """Scored motions that the image does not refute, the identity first."""
+        """Scored motions that the image does not refute, with the identity first."""
         rest = Candidate("identity", IDENTITY.T, score=self.residual.score(track, np.eye(4)) - _REST_BONUS)
         if not len(track.segment.support):
             return (rest,)
@@ -290,7 +292,7 @@ class MstRule(MotionRule):
         return candidates[int(rng.choice(len(candidates), p=weights / weights.sum()))]
 
     def _estimates(self, rng: np.random.Generator, track: Track) -> Iterator[_Estimate]:
-        """Motions from every estimator, then each of them refined by registration."""
+        """Motions from every estimator, then the same motions refined by registration."""
         starts: list[tuple[str, np.ndarray, int, float]] = []  # kind, initial motion, support, reach in metres
         if self.use_flow:
             p, q = track.flow_pairs
@@ -313,7 +315,7 @@ class MstRule(MotionRule):
                     yield kind, result.T, support
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
-        """Search a grid of shifts on the table and three rotations; refine the two best shifts of each rotation."""
+        """Search a grid of shifts on the table and three rotations, and refine the two best shifts of each."""
         n = round(_SEARCH_RADIUS / _SEARCH_STEP)
         shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
         shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]

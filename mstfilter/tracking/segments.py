@@ -1,13 +1,13 @@
-"""Tracked segments: the visible part of each object, the data about its motion, and the test for rest.
+"""Tracked segments: the visible part of each object, the data about its motion, and the test for objects at rest.
 
 Hypotheses share most of their objects, so there are far fewer distinct segments than hypotheses times objects. The
-key of a `Segment` is the hash of its projected mask and of its voxels; segments with equal keys are tracked once.
+key of a `Segment` is the hash of its projected mask and of its voxels. Segments with equal keys are tracked once.
 
 >>> segments = segments_of(hypothesis, clip.before)                       # doctest: +SKIP
 >>> track = Track(segments[label], clip, DenseFlow().track(clip))         # doctest: +SKIP
 >>> StaticTest().rests(track)                                             # doctest: +SKIP
 
-A `Track` joins a segment with the flow and the features of the clip: the data of the motion rules.
+A `Track` combines a segment with the flow and the features of the clip, which are the data of the motion rules.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Segment:
 
 
 def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
-    """The segments of a hypothesis in a frame, by label; hidden objects have none.
+    """The segments of a hypothesis in a frame, by label. Hidden objects have no segment.
 
     The support contains the pixels above the table where measured and rendered depth differ by less than two voxels.
     """
@@ -89,14 +89,14 @@ class Track:
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """The support in the first frame, (H, W)."""
+        """The support in the first frame, (H, W) bool."""
         image = np.zeros(self.clip.before.depth.shape, bool)
         image.ravel()[self.segment.support] = True
         return read_only(image)
 
     @cached_property
     def target_mask(self) -> np.ndarray:
-        """The support in the last frame according to the tracker of masks, or else to the flow, (H, W)."""
+        """The support in the last frame (H, W) bool, from the mask tracker or else from the flow."""
         if self.followed is not None:
             return self.followed & self.clip.after.valid
         return self.flow.warp(self.mask.astype(np.uint8)) > 0
@@ -131,7 +131,7 @@ class Track:
         return read_only(before.points[v, u][keep]), read_only(q[keep])
 
     def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[np.ndarray, np.ndarray]:
-        """World points of SIFT matches that start in the mask and, if `in_target`, end near the target mask."""
+        """World points of SIFT matches that start in the mask and, with `in_target`, end near the target mask."""
         last = None
         if in_target:
             last = cv2.dilate(self.target_mask.astype(np.uint8), np.ones((11, 11), np.uint8)) > 0
@@ -140,7 +140,7 @@ class Track:
         return matches.p[chosen], matches.q[chosen]
 
     def sample(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """At most n points of the support, evenly spaced, and their slightly blurred colours, (n, 3) each."""
+        """At most n points of the support, evenly spaced, and their slightly blurred colours, both (n, 3)."""
         chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
         chosen = chosen[chosen >= 0]
         colours = smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support[chosen]]
@@ -167,18 +167,17 @@ class MaskTracker(Checked, ABC):
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame, one for each of the masks (H, W) bool of the first frame.
 
-        A mask without pixels says that the object is lost. Masks may overlap, and the result for one mask should not
-        depend on the others.
+        An empty mask states that the object is lost. Masks may overlap. Results for masks should be independent.
         """
 
 
 @dataclass(frozen=True)
 class StaticTest:
-    """Tests whether an object rested. Objects that pass keep the identity exactly.
+    """Tests whether an object was at rest. Objects that pass this test keep their voxels exactly.
 
-    Tracking damages objects at rest: labels leak between touching objects of equal look, and the registration of
-    symmetric objects drifts. Objects whose pixels are unchanged are therefore not tracked. If `enabled` is False,
-    every object is tracked (the published algorithms).
+    Tracking damages objects at rest: labels leak between touching objects that look the same, and the registration of
+    symmetric objects drifts. So objects whose pixels are unchanged are not tracked. If `enabled` is False, every
+    object is tracked (the published algorithms).
     """
 
     enabled: bool = True

@@ -1,10 +1,10 @@
-"""The motion model of MST: every hypothesis follows the video from one pause to the next (paper IV-C).
+"""The motion model of MST: every hypothesis is moved from one pause to the next (paper IV-C).
 
 >>> moved = TrackingTransition().predict(rng, population, clip)      # doctest: +SKIP
 >>> moved.notes["motions"]                                           # doctest: +SKIP
 {'static': 52, 'icp': 9, ...}
 
-Optical flow follows the visible part of each object, a rule decides on a rigid motion, and a `Warp` moves the voxels.
+Optical flow tracks the visible part of each object, a rule chooses a rigid motion, and a `Warp` moves the voxels.
 Flow and features are computed once per clip. A segment that several hypotheses share is tracked once.
 """
 
@@ -42,7 +42,7 @@ class WarpResult:
 
 
 class _Claim(NamedTuple):
-    """Voxels of an object before they are assigned: flat indices (N,) and their depths inside it (N,)."""
+    """Voxels of an object before the assignment: flat indices (N,) and their depths inside the object (N,)."""
 
     record: ObjectRecord
     voxels: np.ndarray
@@ -56,16 +56,16 @@ class Warp(Bounded):
     Parameters
     ----------
     method : "smooth" or "splat"
-        "smooth": every voxel x takes the value of a smoothed signed distance of the object's source at T^-1 x, and
-        the object keeps its number of voxels. The source is the occupancy of the object after its last change other
-        than a motion. Here T is the product of all motions since then, so the shape does not degrade with the number
-        of motions. On 481 true motions of simulated objects of 50-3000 voxels, the mean Jaccard index with the true
-        voxels is .877. The method "splat", as in the authors' program, moves voxel centres forward and rounds; it
-        loses 3-14 % of the voxels per step.
+        With "smooth", every voxel x takes the value of a smoothed signed distance of the object's source at T^-1 x.
+        The object keeps its number of voxels. The source is the occupancy of the object after its last change other
+        than a motion. T is the product of all motions since then, so the shape does not degrade with the number of
+        motions. On 481 true motions of simulated objects of 50-3000 voxels, the mean Jaccard index with the true
+        voxels is .877. The method "splat", as in the authors' program, moves voxel centres forward and rounds them.
+        The method loses 3-14 % of the voxels per step.
     collisions : "deepest" or "label"
-        Which object gets a voxel that several cover. With "deepest", it is the one in which the voxel is deepest,
-        then the one with the smaller residual. With "label", it is the one with the higher label, as in the authors'
-        program.
+        Rule for a voxel that several objects cover. With "deepest", the voxel goes to the object in which it is
+        deepest, then to the object with the smaller residual. With "label", the voxel goes to the object with the
+        higher label, as in the authors' program.
     """
 
     method: Literal["smooth", "splat"] = "smooth"
@@ -77,10 +77,10 @@ class Warp(Bounded):
         motions: Mapping[int, RigidTransform],
         residuals: Mapping[int, float] | None = None,
     ) -> WarpResult:
-        """Move objects; if all motions are the identity, the result contains the same hypothesis object.
+        """Move objects. If all motions are the identity, the result contains the same hypothesis object.
 
-        `motions` maps labels to motions in world metres; objects without one do not move. `residuals` of the motions
-        decide ties.
+        `motions` maps labels to motions in world metres. Objects without an entry do not move. The `residuals` break
+        ties.
         """
         matrices = {k: T.as_matrix() for k, T in motions.items()}
         moving = {k: T for k, T in matrices.items() if not np.array_equal(T, np.eye(4))}
@@ -133,7 +133,7 @@ class Warp(Bounded):
         return index, depth, record.moved(RigidTransform.from_matrix(T), crop)
 
     def _assign(self, labels: np.ndarray, claims: list[_Claim], residuals: Mapping[int, float]) -> int:
-        """Assign every voxel of `claims` to one object; returns the number of contested voxels."""
+        """Assign every voxel of `claims` to one object. Returns the number of voxels that several objects cover."""
         index = np.concatenate([c.voxels for c in claims])
         if not len(index):
             return 0
@@ -155,10 +155,10 @@ class Warp(Bounded):
 def _moved_occupancy(
     before: Occupancy, labels: np.ndarray, kept: Sequence[ObjectRecord], moving: Container[int], grid: VoxelGrid
 ) -> Occupancy:
-    """The occupancy after a motion, for the labels (X, Y, Z) and objects after it; `moving` are those that moved.
+    """The occupancy after a motion, for the new labels (X, Y, Z) and objects. `moving` are the objects that moved.
 
-    The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label:
-    these have a probability of at least one half, and no other voxel has more.
+    The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label.
+    Labelled voxels have a probability of at least one half, and other voxels at most one half.
     """
     still = np.isin(before.owner, [r.label for r in kept if r.label not in moving])
     still &= (labels == 0) | (labels == before.owner)
@@ -181,7 +181,7 @@ def _moved_occupancy(
 
 
 def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Claim]) -> list[_Claim]:
-    """The voxels that resting objects share with moved objects."""
+    """The voxels that objects at rest share with moved objects."""
     claimed = np.unique(np.concatenate([c.voxels for c in claims]))
     holder = labels.ravel()[claimed]
     resting = []
@@ -194,7 +194,7 @@ def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Cl
 
 
 def _depth_inside(crop: Crop) -> np.ndarray:
-    """Distance of each voxel of a crop to the nearest free voxel centre, in voxels. Free outside the crop."""
+    """Distance of each voxel of a crop to the nearest free voxel centre, in voxels. The outside is free."""
     return distance_transform_edt(np.pad(crop.occupied, 1))[1:-1, 1:-1, 1:-1]
 
 
@@ -211,7 +211,7 @@ def _moved_box(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, 
 
 
 def _pull(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels (N, 3), also outside the grid, of the source moved by T, as many as it has, and their depth inside."""
+    """Voxels (N, 3) of the source moved by T, also outside the grid, and their depth inside; N does not change."""
     index, at_source = _moved_box(crop, T, grid)
     cell = np.rint(at_source - 0.5).astype(np.int64)
     turned = np.abs(T[:3, :3] - np.rint(T[:3, :3])).max()
@@ -244,7 +244,7 @@ def _push(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True)
 class IdentityTransition(Transition):
-    """The prediction is the previous population: a baseline for tracking."""
+    """The prediction equals the previous population: a baseline for tracking."""
 
     properly_weighted: ClassVar[bool] = False
 
@@ -254,12 +254,12 @@ class IdentityTransition(Transition):
 
 @dataclass(frozen=True)
 class TrackingTransition(Transition):
-    """Move hypotheses by tracking their objects through the clip.
+    """Moves hypotheses by tracking their objects through the clip.
 
     Parameters
     ----------
     rule : MotionRule
-        Decides the rigid motion of each object.
+        Estimates the rigid motion of each object.
     flow : DenseFlow
         Dense flow through the clip.
     static : StaticTest
@@ -267,9 +267,9 @@ class TrackingTransition(Transition):
     warp : Warp
         Moves the voxels.
     tracker : MaskTracker, optional
-        Follows the masks of objects that do not rest to the last frame. Default: the flow does.
+        Tracks the masks of moving objects to the last frame. By default, the flow is used instead.
     min_support : int
-        Smallest number of pixels of an object that agree with the depth image; objects with fewer are not tracked.
+        Smallest number of pixels of an object that agree with the depth image. Objects with fewer are not tracked.
     """
 
     rule: MotionRule = field(default_factory=MstRule)
@@ -282,7 +282,7 @@ class TrackingTransition(Transition):
     properly_weighted: ClassVar[bool] = False
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Clip | None) -> Population:
-        """Move all hypotheses; weights do not change.
+        """Move all hypotheses; the weights do not change.
 
         Notes
         -----
@@ -293,8 +293,8 @@ class TrackingTransition(Transition):
         - ``segments``: number of distinct segments;
         - ``voxels_left`` (the grid), ``voxels_contested`` and ``objects_dropped``.
 
-        An object is *invisible* if it is hidden in the first frame, *unsupported* if the depth image disagrees with
-        it, *lost* if it is not found in the last frame. Objects of these three kinds keep their position.
+        *Invisible* objects are hidden in the first frame, and *unsupported* objects disagree with the depth image.
+        *Lost* objects are not found in the last frame. Objects of these three kinds keep their position.
         """
         particles: tuple[Hypothesis, ...] = tuple(population.particles)
         if observation is None or len(observation.frames) < 2:
@@ -331,7 +331,7 @@ class TrackingTransition(Transition):
         segments: dict[int, Segment],
         cache: dict[bytes, tuple[str, tuple[Candidate, ...]]],
     ) -> tuple[str, Candidate]:
-        """Kind (see `predict`) and motion of an object of one particle, whose random stream is `stream`."""
+        """Kind (see `predict`) and motion of an object of one particle, with the random stream `stream`."""
         kind, candidates = cache[segments[label].key] if label in segments else ("invisible", ())
         if not candidates:
             return kind, IDENTITY
@@ -341,7 +341,7 @@ class TrackingTransition(Transition):
     def _track_all(
         self, rng: np.random.Generator, clip: Clip, segments: list[dict[int, Segment]]
     ) -> dict[bytes, tuple[str, tuple[Candidate, ...]]]:
-        """Kind and candidate motions of each distinct segment, by its key; no candidate means no motion."""
+        """Kind and candidate motions of each distinct segment, by its key. An empty list means no motion."""
         tracks = self.flow.track(clip)
         found: dict[bytes, tuple[str, tuple[Candidate, ...]]] = {}
         moving: list[Track] = []

@@ -36,8 +36,8 @@ class Program:
     """A model given as a function, and its filters with `n` particles.
 
     ``model(previous, observation)`` calls `sample` and `observe`, and returns None or a mapping of further values to
-    keep. A model or guide with a further parameter ``t`` gets the index of the step, one with ``u`` the input that
-    `WithInput` gives. The methods take further fields of `ParticleFilter` by name, such as ``resampler``.
+    keep. If the model or guide also has a parameter ``t``, it gets the index of the step. A parameter ``u`` gets the
+    input of `WithInput`. The methods accept other fields of `ParticleFilter` by name, such as ``resampler``.
     """
 
     model: Model
@@ -49,14 +49,14 @@ class Program:
             )
 
     def bootstrap(self, n: int, **components: Any) -> ParticleFilter:
-        """Bootstrap filter: draws from the model, weights by the observations."""
+        """Bootstrap filter, which draws from the model and weights by the observations."""
         return self._filter(None, n, components)
 
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
-        """Guided filter.
+        """Guided filter, which draws from the guide.
 
         The guide is a program that draws every site of the model, by name, given the observation. If the observation
-        is missing, the model draws.
+        is missing, particles are drawn from the model.
         """
         return self._filter(guide, n, components)
 
@@ -77,7 +77,7 @@ class _ProgramStep(Component):
 
     @cached_property
     def schedule(self) -> Schedule:
-        """Which steps are checked."""
+        """The steps that are checked."""
         return Schedule.of(self.model, self.guide)
 
     def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
@@ -107,7 +107,7 @@ class _ProgramStep(Component):
 
 @dataclass(frozen=True)
 class ProgramInitial(_ProgramStep, Proposal):
-    """First step of a program: draws, by the guide if there is one, and weights."""
+    """First step of a program. Draws values, from the guide if there is one, and weights them."""
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         return self._advance(rng, None, observation, n)
@@ -115,7 +115,7 @@ class ProgramInitial(_ProgramStep, Proposal):
 
 @dataclass(frozen=True)
 class ProgramTransition(_ProgramStep, Transition):
-    """A step of a program: draws, by the guide if there is one, and weights."""
+    """A step of a program. Draws values, from the guide if there is one, and weights them."""
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         return self._advance(rng, population, observation, len(population))
@@ -124,7 +124,7 @@ class ProgramTransition(_ProgramStep, Transition):
 def program_step(
     rng: np.random.Generator, model: Model, guide: Model | None, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Particles, drawn by the guide if there is one, and gains of the log weights."""
+    """Particles, drawn from the guide if there is one, and the changes of the log weights."""
     if guide is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
     proposed = GuideHandler(rng, n)
@@ -135,14 +135,14 @@ def program_step(
 def run_program(
     model: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Run a program, or its guide, over n particles; the handler decides the values of the sites.
+    """Run a program, or its guide, over n particles. The handler determines the values of the sites.
 
     Returns
     -------
     particles : mapping of arrays (n, ...)
         Values of the sites, and the values that the program returned.
     gain : (n,) float64
-        Added to the log weights.
+        Change of the log weights.
     """
     run = _run_once(model, handler, previous, observation, n)
     return _values_of(run), run.gain
@@ -210,7 +210,7 @@ _RAW_ERRORS = {
 
 
 def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
-    """The error of a program with its place and a hint; the same error if it is not one of Python, numpy or scipy."""
+    """The error of a program with its place and a hint. Only errors of Python, numpy or scipy are changed."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
     place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
     if frames:
@@ -261,7 +261,7 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
 
 
 def _equal(a: Any, b: Any) -> bool:
-    """Whether two arrays are equal, NaN to NaN."""
+    """Whether two arrays are equal, where NaN equals NaN."""
     a, b = np.asarray(a), np.asarray(b)
     return a is b or (a.shape == b.shape and bool(np.all((a == b) | ((a != a) & (b != b)))))
 

@@ -1,9 +1,9 @@
-"""Checks that a program treats its particles independently, and that it draws by `sample` only.
+"""Checks that a program treats its particles independently and draws only by `sample`.
 
-A program processes all particles in one pass, so it may mix them by mistake (``x.mean()``, ``previous["x"][0]``),
-draw from another generator, or keep values between steps. Such a program runs, and its weights are wrong. `Guard`
-checks some steps, of each kind the first and the second, then the 9th, 66th, 515th, ... (8^k + k, which also finds a
-fault of every third step):
+A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
+``previous["x"][0]``), draw from another generator, or keep values between steps. A program with this fault runs
+without an error, but its weights are wrong. `Guard` checks some steps of each kind: the first and the second, then
+the 9th, 66th, 515th, ... (8^k + k, which also detects a fault of every third step):
 
 1. The first two steps run again with the same random numbers. All values and log weights must equal those of the
    first run.
@@ -63,7 +63,7 @@ class Guard:
         self.fresh = {id(f): _copy(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
-        """Particles and gain of the log weights, as ``step()`` returns them; InputError if a check fails."""
+        """Particles and change of the log weights, as returned by ``step()``. Raises InputError if a check fails."""
         with recorded() as runs:
             particles, gain = step()
         if self.count <= 2:
@@ -95,7 +95,7 @@ class Guard:
 
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
-        """Compare some particles in a run with the same particles in a run of their own."""
+        """Compare some particles in a run with the same particles in a separate run."""
         if any(call.ambiguous for call in whole.calls or ()):
             rows = rows[:1]
         few, rows = self._run_alone(run, whole, rows)
@@ -112,7 +112,7 @@ class Guard:
             _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
 
     def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> tuple[ProgramRun, np.ndarray]:
-        """A run of some particles, and their rows: repeated to n rows if the program needs n particles."""
+        """A run of some particles, and their rows, repeated to n rows if the program needs n particles."""
         with recorded() as runs:
             try:
                 few = self._run_again(run, whole, rows)
@@ -171,7 +171,7 @@ class Guard:
 
 
 class Schedule(Counter[Any]):
-    """Numbers of the steps of a model and its guide, by kind; those with the same functions share it."""
+    """Numbers of the steps of a model and its guide, by kind. Programs with the same functions share them."""
 
     @classmethod
     def of(cls, model: Any, guide: Any) -> Schedule:
@@ -184,7 +184,7 @@ class Schedule(Counter[Any]):
     def guard(
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
     ) -> Guard | None:
-        """A guard if the next step is to be checked."""
+        """A guard if the next step must be checked."""
         shape = observation.shape if type(observation) is np.ndarray else None
         kind = (past is None, observation is None, guide is None, shape)
         self[kind] += 1
@@ -195,7 +195,7 @@ _SCHEDULES: dict[tuple[Any, ...], tuple[Schedule, list[Any]]] = {}
 
 
 def _parts(function: Any) -> list[Any]:
-    """The code of a function, and the values of its closure and defaults but the numbers.
+    """The code of a function, and the values of its closure and defaults except numbers.
 
     The models of many parameter values, as in PMMH, have the same parts.
     """
@@ -217,7 +217,7 @@ def _copy(function: Any) -> Any:
 
 
 def _check_returned(run: ProgramRun) -> None:
-    """Raise if a returned value is NaN, after an invalid operation; NaN that the program writes is a mark."""
+    """Raise if a returned value is NaN after an invalid operation. A NaN that the program writes is allowed."""
     for name, value in run.returned.items():
         if np.asarray(value).dtype.kind == "f" and np.isnan(value).any():
             n = int(np.isnan(value).reshape(run.n, -1).any(axis=1).sum())
@@ -228,7 +228,7 @@ def _check_returned(run: ProgramRun) -> None:
 
 
 def _groups(run: ProgramRun) -> list[np.ndarray]:
-    """Two groups of particles to run alone, of small and of large values, each with some of every branch."""
+    """Two groups of particles to run alone, of small and of large values, with particles of every branch."""
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
     column = np.arange(run.n) if numbers is None else numbers.reshape(run.n, -1)[:, 0]
     order, size = np.argsort(column), max(run.n // 3, 1)
@@ -236,7 +236,7 @@ def _groups(run: ProgramRun) -> list[np.ndarray]:
 
 
 def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
-    """Some rows of a part of the particles; at least two, since one row might be broadcast."""
+    """Some rows of a part of the particles. There are at least two, since one row might be broadcast."""
     rows = list(part[[len(part) // 2, 0, len(part) // 4]])
     for call in run.calls or ():
         if call.rows is not None and len(rows) < 8:
@@ -259,7 +259,7 @@ def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> Any:
-    """Size of the differences between particles, the unit of rounding errors."""
+    """Size of the differences between particles, used as the unit of rounding errors."""
     if values.dtype.kind != "f":
         return 0.0
     finite = values[np.isfinite(values)]
@@ -289,8 +289,8 @@ def _first_call_that_differs(one: list[ProgramRun], two: list[ProgramRun]) -> st
 def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
     """Raise if the shape of an event depends on the number of particles.
 
-    A vector with as many entries as there are particles looks like one number for each of them. An array (n, n) made
-    from (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
+    A vector with as many entries as there are particles looks like one number per particle. An array (n, n) made from
+    (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
     """
     calls = alone.calls or []
     for k, found in enumerate(whole.calls or ()):
@@ -306,7 +306,7 @@ def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
 
 
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
-    """Raise unless particles have the same distributions in a call of all and alone."""
+    """Raise unless particles have the same distributions in a call of all particles and alone."""
     position = call.positions(rows)
     here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
     among = call.densities(call.value)
@@ -357,11 +357,13 @@ _KNOWN: set[type] = set()
 
 
 def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
-    """Raise if draws of a user's distribution of numbers do not have its density; once for each class.
+    """Raise if draws of a user's distribution of numbers do not have its density.
 
-    The distribution function is the integral of the density between sorted draws. Its distance from the uniform
-    distribution is below .12 for 1000 draws of the true law, with a false alarm of 1e-12 (Dvoretzky, Kiefer,
-    Wolfowitz).
+    The density is checked once for each class.
+
+    The distribution function is the integral of the density between sorted draws. The distance of this integral from
+    the uniform distribution is below .12 for 1000 draws of the true distribution, with a false-alarm rate of 1e-12
+    (Dvoretzky, Kiefer, Wolfowitz).
     """
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:

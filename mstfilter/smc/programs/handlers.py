@@ -1,4 +1,4 @@
-"""Handlers decide the values of the sites of a program.
+"""Handlers, which determine the values of the sites of a program.
 
 A value is a draw, a replayed draw of a guide, or given.
 """
@@ -32,14 +32,14 @@ class Site(NamedTuple):
 
 
 class SiteHandler(ABC):
-    """Decides the values of sites.
+    """Determines the values of sites.
 
     Attributes
     ----------
     observes : bool
         Whether the program may observe.
     draws : bool
-        Whether the values are new, and not given.
+        Whether the values are new rather than given.
     strict : bool
         Whether a log density of NaN or +inf is an error.
     """
@@ -50,10 +50,10 @@ class SiteHandler(ABC):
 
     @abstractmethod
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
-        """Values (size, ...) of a site and what they add to the log weights (None: nothing)."""
+        """Values (size, ...) of a site, and the change of the log weights (None: no change)."""
 
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
-        """End a pass, in which the sites have the given values."""
+        """End a pass in which the sites have the given values."""
 
 
 class SampleHandler(SiteHandler):
@@ -67,7 +67,7 @@ class SampleHandler(SiteHandler):
 
 
 class GuideHandler(SiteHandler):
-    """Draws every site for n particles, and keeps values and log densities for a `ReplayHandler`."""
+    """Draws every site for n particles, and stores values and log densities for a `ReplayHandler`."""
 
     observes = False
 
@@ -169,7 +169,7 @@ class CopyHandler(SiteHandler):
 
 
 class ScoreHandler(SiteHandler):
-    """Takes given values of each site, weights them by their density, and keeps the sites.
+    """Takes given values of each site, weights them by their density, and records the sites.
 
     With `strict`, a log density of NaN or +inf is an error.
     """

@@ -32,7 +32,7 @@ def recorded() -> Iterator[list[ProgramRun]]:
 
 
 def sample(name: str, distribution: Any) -> Any:
-    """A random value of the step, kept in the particle under `name`.
+    """A random value of the step, stored in the particle under `name`.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ def sample(name: str, distribution: Any) -> Any:
 def observe(name: str, distribution: Any, value: Any) -> None:
     """Weight the particles by the probability of an observed value; None is a missing value and has no effect.
 
-    `distribution` is that of the observation given the particle. The value has its event shape; or it is one for each
-    particle, of shape ``(n, *event_shape)``, such as the reading that the particle assigns to an object. `name` is
-    used in messages.
+    `distribution` is the distribution of the observation given the particle. The value has the event shape of the
+    distribution. Or the value is one value for each particle, of shape ``(n, *event_shape)``, such as the reading
+    that the particle assigns to an object. `name` is used in messages.
     """
     _current().observe(name, distribution, value)
 
@@ -69,11 +69,11 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     probs : (k,) or (n, k) array_like
         Probabilities of the k branches.
     branches : sequence of callables
-        Each is called once with the rows of `args` that belong to its particles, and may `sample`, `observe` and
-        `switch`. A site with the same name in several branches is one array; the value is NaN (0 for integers) for
-        particles that did not reach the site. A branch is also called if it has no particles.
+        Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
+        `observe` and `switch`. A site with the same name in several branches is one array. The value is NaN (0 for
+        integers) for particles that did not reach the site. A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Split by rows. Values shared by all particles, such as the observation, come by closure.
+        Arguments that are split by rows. Values shared by all particles are passed by closure.
 
     Returns
     -------
@@ -108,13 +108,13 @@ class Call(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether an observed value is an event, or one for each particle; a number is an event of shape (1,)."""
+        """Whether an observed value is one event, or one for each particle; a number is an event of shape (1,)."""
         event, value = self.event, self.observed
         return value in (None, event, (1, *event), (self.size, *event)) or (value == () and event == (1,))
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the axis of the particles may be an axis of the event, or the reverse."""
+        """Whether the axis of the particles might be an axis of the event, or the reverse."""
         return self.size > 1 and (self.size in self.event or self.observed == (self.size, *self.event))
 
     def shape_error(self, prefix: str = "") -> InputError:
@@ -139,7 +139,7 @@ class Call(NamedTuple):
         return np.arange(self.size) if self.rows is None else self.rows
 
     def positions(self, rows: np.ndarray) -> np.ndarray:
-        """(k,) positions of some particles among those of the call; -1 for one that does not reach it."""
+        """(k,) positions of some particles among those of the call; -1 for a particle that does not reach it."""
         if self.rows is None:
             return rows
         if not self.size:
@@ -188,7 +188,7 @@ class ProgramRun:
         return self.n if self._rows is None else len(self._rows)
 
     def returns(self, name: str, value: np.ndarray) -> None:
-        """Keep the shape of a returned value."""
+        """Store the shape of a returned value."""
         self._last = ("returned", name, "")
         self._note(event=value.shape[1:])
 
@@ -267,7 +267,7 @@ class ProgramRun:
         return merged
 
     def _note(self, **fields: Any) -> None:
-        """Keep the present call if calls are recorded."""
+        """Record the present call if calls are recorded."""
         if self.calls is not None:
             k = sum(call.what == self.what for call in self.calls)
             self.calls.append(Call(self.what, k, self._rows, self._size, **fields))
@@ -351,7 +351,7 @@ def _check_rows(argument: Any, size: int, k: int) -> None:
 
 
 def _blank(value: np.ndarray, n: int) -> np.ndarray:
-    """(n, ...) values of a site that was not reached: NaN for floats, else 0."""
+    """(n, ...) values of a site that was not reached: NaN for floats, and else 0."""
     fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
     return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 

@@ -136,7 +136,7 @@ class TransitionContract(ScaleContract, ExactContract):
     def _moves(self, component: Any, inputs: dict[str, Any], seed: int = 0) -> np.ndarray:
         """(300, n, d + 1) results of 300 calls: coordinates, and the change of the log weight.
 
-        They are rounded, since the order of a sum changes its last bits.
+        The results are rounded, since the order of a sum changes its last bits.
         """
         given, moves = inputs["population"], []
         for k in range(300):
@@ -338,7 +338,7 @@ class UpdateContract(ScaleContract, ExactContract):
 
 
 class RejuvenationContract(ExactContract):
-    """The contract of every `Rejuvenation`. Its one statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Rejuvenation`. The only statistical test has a false-alarm rate of at most 1e-6.
 
     That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
     population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and y_t, and
