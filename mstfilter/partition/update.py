@@ -9,24 +9,28 @@ an object are estimated again from everything that was observed of it.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. The visible surface is tested, too: A_j is the share of it that the frame shows at its place.
-   A_j^lambda is used as the probability that prediction j *holds*: that it shows the present scene. A predicted object
-   is *refuted*, and leaves the prediction, if less than `least_agreement` of its own visible surface is at its place.
-2. **Partitions.** A sample partitions the readings by its segments, a prediction by the objects that lie at the
-   readings. All of them together say how likely two readings belong to one object, and partitions of the image are
-   drawn by these odds (`mstfilter.partition.cells`). In different parts of the image, a drawn partition can follow
-   different samples and predictions. The paper crosses each sample with each prediction.
-3. **Association.** Each partition is combined with a prediction j, drawn in proportion to w_j Q_j^lambda. Segments
-   and predicted objects form a *conflict graph*, in whose *components* segments continue predicted objects; the rules
-   are in `mstfilter.partition.association`. Of an object that is split, at most one segment continues it. The other
-   segments are new objects. The paper draws which conflicts end in a merge; here the partition decides.
-4. **Occluded objects.** A predicted object without conflict has no or very few readings. It stays in a candidate with
+   A_j^lambda is used as the probability that prediction j *holds*: that it shows the present scene. A predicted
+   object is *refuted*, and leaves the prediction, if less than `least_agreement` of its own visible surface is at its
+   place.
+2. **Partitions.** A sample groups the readings by its segments. A prediction groups the readings by the objects that
+   lie at the readings. All samples and predictions together give the odds that two readings belong to one object.
+   Partitions of the image are drawn by these odds (`mstfilter.partition.cells`). A drawn partition can agree with
+   different samples and predictions in different parts of the image. The paper crosses each sample with each
+   prediction.
+3. **Association.** Each partition is paired with a prediction j, which is drawn in proportion to w_j Q_j^lambda.
+   Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
+   predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an object that
+   is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the partition
+   determines the merges.
+4. **Occluded objects.** A predicted object without conflict has no readings or very few. It stays in a candidate with
    probability (A_j q)^lambda, where q is the share of its own voxels that the frame does not observe as free. A_j
    says whether the prediction can be trusted at all, and q whether this object is still there.
-5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). It is
-   completed from its readings in this frame and from the views of the objects that it continues; an occluded object
-   from its views alone. The completer drops views that the frame refutes. An object without any voxel is removed.
-   Evidence is remembered, guesses are not: no voxel that was guessed at an earlier pause is carried on. The exception
-   are occluded objects without views, which a completer without memory makes: they keep what free space leaves.
+5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). A
+   visible object is completed from its readings in this frame and from the views of the objects that it continues. An
+   occluded object is completed from its views only. The completer drops views that the frame refutes. An object
+   without any voxel is removed. Observations are kept, and completions are not: no voxel from a completion at an
+   earlier pause is used again. The exception is an occluded object without views, which occurs if the completer does
+   not use views. The object keeps its voxels outside free space.
 
 At the first pause the candidates are the samples, so every segment is a new object. Hypotheses have no objects that
 no frame has shown.
@@ -116,7 +120,7 @@ class PartitionUpdate(Update):
         Terms whose sum is the log weight of a candidate. Without terms, all candidates have equal weights, since they
         are drawn from the distribution that they approximate.
     quality_exponent : float
-        lambda, of Q, A and q. With 0 every prediction holds, and every occluded object stays.
+        lambda, of Q, A and q. With 0, every prediction holds, and every occluded object is kept.
     n_candidates : int
         Number of candidates after the first pause. 0 means one for each predicted hypothesis, or four with evidence.
     reach : float
@@ -190,7 +194,7 @@ class PartitionUpdate(Update):
     def _predictions(
         self, predicted: Population, projected: Population, readings: Readings, frame: Frame
     ) -> list[Prediction]:
-        """What the last frame says about each prediction."""
+        """The evidence about each prediction in the last frame."""
         columns = predicted.particles, projected.particles, predicted.weights.tolist()
         return [self._prediction(*one, readings, frame) for one in zip(*columns, strict=True)]
 
