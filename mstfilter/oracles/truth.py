@@ -22,7 +22,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.fields import bound_to
 from mstfilter.registry import nested_components
-from mstfilter.scene import Frame, Recording, foreground
+from mstfilter.scene import Frame, Recording
 
 Need = Literal["voxels", "instance", "poses"]
 _WORDS: dict[Need, str] = {"voxels": "true voxels", "instance": "instance image", "poses": "true poses"}
@@ -83,6 +83,8 @@ class RecordingTruth:
     @cached_property
     def _pauses(self) -> dict[bytes, int]:
         """The first pause with each frame, by the key of the frame."""
+        from mstfilter.scene import foreground  # needs cv2, which the registry does not
+
         frames = self.recording.frames
         found = {}
         for t, index in reversed(list(enumerate(self.recording.pauses))):
