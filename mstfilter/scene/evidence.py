@@ -18,7 +18,6 @@ from numbers import Real
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from mstfilter.errors import InputError
 from mstfilter.fields import Bounds, NonNegativeFloat
@@ -28,7 +27,7 @@ from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import scaled_area
 from mstfilter.scene.frame import Clip, Frame, depth_sigma
 from mstfilter.scene.geometry import frame_geometry
-from mstfilter.scene.rendering import Rendering, render_hypothesis
+from mstfilter.scene.rendering import render_hypothesis
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _SMALLEST_QUALITY = 1e-3
@@ -144,8 +143,8 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
     """Share of the visible surface of each object that a frame shows at its place, and that of all objects together.
 
     Of the pixels that would show an object, those with a reading nearer than its surface say nothing, since something
-    stands in front. Neither do those at its outline, where a voxel covers more than the object. The surface is at its
-    place if the reading is not behind it by more than a voxel and three standard deviations of the sensor.
+    stands in front. The surface is at its place if the reading is not behind it by more than a voxel and three
+    standard deviations of the sensor.
 
     Returns
     -------
@@ -155,7 +154,7 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
         That of all objects; 1 if the frame says nothing about them.
     """
     rendered = render_hypothesis(hypothesis, frame.camera)
-    would_show = frame.valid & _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])
+    would_show = frame.valid & (rendered.labels > 0)
     labels, depth = rendered.labels[would_show], rendered.depth[would_show]
     behind = frame.depth[would_show] - depth
     tolerance = hypothesis.grid.voxel_size + 3 * depth_sigma(depth)
@@ -165,15 +164,6 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
     enough = asked >= scaled_area(_LEAST_PIXELS, frame.depth.size)
     of_objects = np.divide(agrees, asked, out=np.full(n, np.nan), where=enough & (asked > 0))
     return of_objects, float(agrees.sum() / asked.sum()) if asked.any() else 1.0
-
-
-def _interior(rendered: Rendering, size: float) -> np.ndarray:
-    """Pixels (H, W) bool a voxel away from the outline of their object; a voxel has `size` / depth pixels."""
-    shown = rendered.labels > 0
-    if not shown.any():
-        return shown
-    width = 2 * max(1, round(size / float(np.median(rendered.depth[shown])))) + 1
-    return shown & (minimum_filter(rendered.labels, width) == maximum_filter(rendered.labels, width))
 
 
 class Evidence(Checked, ABC):

@@ -11,7 +11,7 @@ from scipy.special import expit
 from mstfilter.completion import Completion, Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.partition import PairEvidence, PartitionUpdate, Readings
-from mstfilter.scene import Clip, Hypothesis, Occupancy, surface_agreement
+from mstfilter.scene import Clip, Hypothesis, Occupancy
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
 from tests.completion.test_completion import masks_of
@@ -83,20 +83,19 @@ def test_hidden_objects_stay_until_the_frame_sees_through_them():
 
 def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often():
     n = 100
-    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly(), mend=False, least_agreement=0.0)
+    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly())
     labels = TWO.astype(np.uint16)
     in_the_air = np.zeros(labels.shape, bool)
-    in_the_air[4:12, 4:12, -2:] = True
+    in_the_air[4:18, 4:19, -4:] = True
     labels[in_the_air & (labels == 0)] = 3
     past = Hypothesis.from_labels(labels, GRID)
     blind = frame_of(TWO, noise=0)
     depth = np.where(masks_of(TWO, blind)[1], np.nan, blind.depth)
     hidden = Clip([type(blind)(blind.rgb, depth, blind.camera)], GRID, 1)
-    left, _ = update.free_space.project(past, hidden.after)
+    left, quality = update.free_space.project(past, hidden.after)
     own = (left.labels == 2).sum() / (labels == 2).sum()
-    _, agreement = surface_agreement(past, hidden.after)
-    expected = (agreement * own) ** update.quality_exponent
-    assert 0.2 < expected < 0.6 and agreement * own > expected + 0.2 and own > 0.9
+    expected = (quality * own) ** update.quality_exponent
+    assert 0.3 < expected < 0.6 and quality * own > expected + 0.2 and own > 0.9
     found = step(update, hidden, sample_of(hidden, masks_of(TWO, blind)[:1]), past).particles
     share = np.mean([past.record(2).id in {record.id for record in one.objects} for one in found])
     assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
@@ -104,7 +103,7 @@ def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often()
 
 def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_through():
     """Objects with their probabilities."""
-    update, clip = PartitionUpdate(n_views=0, mend=False), clip_of(TWO)
+    update, clip = PartitionUpdate(n_views=0), clip_of(TWO)
     state = step(update, clip, sample_of(clip, masks_of(TWO, clip.after))).particles[0]
     assert not any(record.views for record in state.objects)
     p = np.where(state.labels > 0, 0.8, 0).astype(np.float16)
