@@ -24,10 +24,8 @@ from mstfilter.fields import Bounds, NonNegativeFloat
 from mstfilter.results import Checked, check_array, check_list, check_pair, check_type, describe_value, returns
 from mstfilter.scene.arrays import component_key, read_only
 from mstfilter.scene.cache import memo
-from mstfilter.scene.camera import scaled_area
 from mstfilter.scene.frame import Clip, Frame, depth_sigma
 from mstfilter.scene.geometry import frame_geometry
-from mstfilter.scene.rendering import render_hypothesis
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _SMALLEST_QUALITY = 1e-3
@@ -134,36 +132,6 @@ class FreeSpace(Projection):
 def log_quality(quality: np.ndarray) -> np.ndarray:
     """log max(Q, 1e-3) (n,) of qualities Q (n,). The bound keeps all weights positive."""
     return np.log(np.maximum(quality, _SMALLEST_QUALITY))
-
-
-_LEAST_PIXELS = 30  # of an object in an image of 640 x 480 pixels that the agreement of its surface is computed from
-
-
-def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray, float]:
-    """Share of the visible surface of each object that a frame shows at its place, and that of all objects together.
-
-    Of the pixels that would show an object, those with a reading nearer than its surface say nothing, since something
-    stands in front. The surface is at its place if the reading is not behind it by more than a voxel and three
-    standard deviations of the sensor.
-
-    Returns
-    -------
-    of_objects : (k,) ndarray
-        By label. NaN if the frame says too little about an object, and for label 0.
-    of_scene : float
-        That of all objects; 1 if the frame says nothing about them.
-    """
-    rendered = render_hypothesis(hypothesis, frame.camera)
-    would_show = frame.valid & (rendered.labels > 0)
-    labels, depth = rendered.labels[would_show], rendered.depth[would_show]
-    behind = frame.depth[would_show] - depth
-    tolerance = hypothesis.grid.voxel_size + 3 * depth_sigma(depth)
-    n = int(hypothesis.labels.max(initial=0)) + 1
-    agrees = np.bincount(labels[np.abs(behind) <= tolerance], minlength=n)
-    asked = agrees + np.bincount(labels[behind > tolerance], minlength=n)
-    enough = asked >= scaled_area(_LEAST_PIXELS, frame.depth.size)
-    of_objects = np.divide(agrees, asked, out=np.full(n, np.nan), where=enough & (asked > 0))
-    return of_objects, float(agrees.sum() / asked.sum()) if asked.any() else 1.0
 
 
 class Evidence(Checked, ABC):
