@@ -83,7 +83,7 @@ def test_hidden_objects_stay_until_the_frame_sees_through_them():
 
 def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often():
     n = 100
-    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly())
+    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly(), mend=False)
     labels = TWO.astype(np.uint16)
     in_the_air = np.zeros(labels.shape, bool)
     in_the_air[4:18, 4:19, -4:] = True
@@ -103,7 +103,7 @@ def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often()
 
 def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_through():
     """Objects with their probabilities."""
-    update, clip = PartitionUpdate(n_views=0), clip_of(TWO)
+    update, clip = PartitionUpdate(n_views=0, mend=False), clip_of(TWO)
     state = step(update, clip, sample_of(clip, masks_of(TWO, clip.after))).particles[0]
     assert not any(record.views for record in state.objects)
     p = np.where(state.labels > 0, 0.8, 0).astype(np.float16)
