@@ -223,6 +223,7 @@ def partition_filter(world: Miniature, n: int, completer: TableCompleter, pairs:
         completer=completer,  # type: ignore[arg-type]
         free_space=DepthFreeSpace(),
         pairs=pairs,
+        mend=False,
         occupied_log_odds=0.0,  # the table is calibrated
         reach=0.0,
     )

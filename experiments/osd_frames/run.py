@@ -28,7 +28,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mstfilter.files import write_csv
 from mstfilter.forecasts import ForecastTable, Recalibration
-from mstfilter.scene import Camera, Frame, foreground
+from mstfilter.scene import Camera, Frame, foreground, readings_above_table
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import (
     BorderTree,
@@ -108,7 +108,7 @@ class Case:
     def asked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of flat pixels (m,) above the table, near each other, and whether one object has both."""
         rng = np.random.default_rng(int(self.name[5:]))
-        asked = self.trees[COLOUR_WEIGHTS[0]][1].object_pixels & ~self.ignored
+        asked = readings_above_table(self.frame) & ~self.ignored
         v, u = np.nonzero(asked)
         k = rng.integers(0, len(v), N_QUESTIONS)
         row, column = v[k] + rng.integers(-40, 41, N_QUESTIONS), u[k] + rng.integers(-40, 41, N_QUESTIONS)
@@ -199,7 +199,7 @@ def without_labels(tree: Tree) -> Tree:
 
 def components(case: Case, step: float = np.inf) -> np.ndarray:
     """Floor: 4-connected components above the table; neighbours whose depth differs by `step` m are not joined."""
-    own = case.trees[COLOUR_WEIGHTS[0]][1].object_pixels
+    own = readings_above_table(case.frame)
     index = np.arange(own.size).reshape(own.shape)
     depth = np.where(own, case.frame.depth, 0)
     links = []

@@ -5,8 +5,8 @@
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading
 
 Depth decides where it is measured: a reading on the table never belongs to an object. Readings above the table are
-noise of the sensor unless they form a region. Dark and shiny surfaces and glare have no readings, and there colour
-decides: a pixel without a reading belongs to an object if its colour is not that of the table around it. The table is
+noise of the sensor unless they form a region. Dark and shiny surfaces and glare have no readings. There colour
+decides: a pixel belongs to an object if its colour is not that of the table around it. The table is
 z = 0 if the camera has a pose, else the plane that contains the most readings.
 """
 

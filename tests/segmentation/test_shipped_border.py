@@ -45,5 +45,5 @@ def test_size_and_card():
     sizes = [path.stat().st_size for name in ("border", "completion") for path in (models_folder() / name).iterdir()]
     assert sum(sizes) < 8e6
     card = (models_folder() / "border/README.md").read_text()
-    for part in ("mstfilter train border", "MIT", "not trained on", "Limits"):
+    for part in ("mstfilter train border", "MIT", "not used in training", "Limits"):
         assert part in card

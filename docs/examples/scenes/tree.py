@@ -29,7 +29,10 @@ class MyTree(TreeBuilder):
     power: float = 1.5
     builder: TreeBuilder = field(default_factory=UcmTree)
 
-    def build(self, boundary: np.ndarray, frame: Frame | None = None) -> Tree:
-        """The tree of a boundary map (H, W): parents of nodes, leaves of pixels, P(boundary) of merges."""
-        tree = self.builder.build(boundary, frame)
+    def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
+        """The tree of a boundary map (H, W): parents of nodes, leaves of pixels, P(boundary) of merges.
+
+        `pixels` (H, W) bool are those of objects; by default all above the table.
+        """
+        tree = self.builder.build(boundary, frame, pixels)
         return Tree(tree.parent, tree.leaves, tree.start**self.power)
