@@ -22,7 +22,7 @@ from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera, scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.geometry import fit_support_plane, table_residual
+from mstfilter.scene.geometry import BASELINE, fit_support_plane, table_residual
 from mstfilter.scene.voxels import VoxelGrid
 
 #: Readings up to this much above the table are table, in sensor disparity units.
@@ -38,6 +38,7 @@ _TABLE_NEAR = 0.1  # share of table in these surroundings
 _COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the table; 1 % of its pixels are above
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
 _ON_TABLE = 0.4  # share of table around a region without readings
+_STEP, _SHADOW = 0.02, 1.2  # metres; largest width of a shadow, in that by geometry
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: estimated readings are at least this much nearer than the table
 
@@ -134,9 +135,28 @@ def _on_table(frame: Frame) -> np.ndarray:
 
 
 def _without_readings(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) bool without a reading that do not show the robot."""
-    missing = ~np.isfinite(frame.depth)
+    """Pixels (H, W) bool without a reading that do not show the robot and are not in a shadow of the projector."""
+    missing = ~np.isfinite(frame.depth) & ~_shadows(frame)
     return missing if frame.robot_mask is None else missing & ~frame.robot_mask
+
+
+def _shadows(frame: Frame) -> np.ndarray:
+    """Pixels (H, W) bool that the projector of the sensor does not light, since a nearer surface stands beside them.
+
+    The gap between readings at depths z1 < z2 in a row is then at most f b (1 / z1 - 1 / z2) pixels wide.
+    """
+    columns = np.broadcast_to(np.arange(frame.camera.width), frame.valid.shape)
+    last = np.maximum.accumulate(np.where(frame.valid, columns, -1), axis=1)
+    after = np.where(frame.valid, columns, frame.camera.width)[:, ::-1]
+    following = np.minimum.accumulate(after, axis=1)[:, ::-1]
+    between = ~frame.valid & (last >= 0) & (following < frame.camera.width)
+    rows, at = np.nonzero(between)
+    first, second = last[rows, at], following[rows, at]
+    z1, z2 = frame.depth[rows, first], frame.depth[rows, second]
+    widest = frame.camera.K[0, 0] * BASELINE * np.abs(1 / z1 - 1 / z2)
+    shadow = np.zeros(frame.valid.shape, bool)
+    shadow[rows, at] = (np.abs(z1 - z2) > _STEP) & (second - first - 1 <= _SHADOW * widest + 2)
+    return shadow
 
 
 def _silent(frame: Frame) -> np.ndarray:

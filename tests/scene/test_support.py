@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -83,3 +84,21 @@ def test_measured_depth_stays_and_estimates_are_above_the_table(seed, missing, n
     assert not (found.pixels & measured & ~readings_above_table(holed, GRID)).any()
     assert np.isfinite(found.frame.depth[found.pixels]).all()
     assert (found.frame.points[..., 2][found.pixels & ~measured] > 0).all()
+
+
+def test_a_shadow_of_the_projector_is_no_object():
+    """A strip beside a near object, as wide as the geometry says, has the colour of a farther object."""
+    frame = frame_of(TWO, width=640, noise=0.3)
+    rows, columns = np.nonzero(SEEN == 1)
+    row, edge = int(np.median(rows)), int(columns.max())
+    near, far = frame.depth[row, edge - 3], frame.depth[row, edge + 20]
+    width = int(frame.camera.K[0, 0] * 0.075 * (1 / near - 1 / far))
+    assert width >= 3
+    holes = np.zeros(SEEN.shape, bool)
+    for r in np.unique(rows):
+        right = columns[rows == r].max()
+        holes[r, right + 1 : right + 1 + width] = True
+    shadow = foreground(without(frame, holes, (20, 20, 200)), GRID)
+    assert shadow.pixels[holes].mean() < 0.2
+    wide = cv2.dilate(holes.astype(np.uint8), np.ones((1, 31), np.uint8)) > 0
+    assert foreground(without(frame, wide & (SEEN != 1), (20, 20, 200)), GRID).pixels[holes].mean() > 0.8
