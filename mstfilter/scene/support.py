@@ -39,6 +39,7 @@ _COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the t
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
 _ON_TABLE = 0.4  # share of table around a region without readings
 _STEP, _SHADOW = 0.02, 1.2  # metres; largest width of a shadow, in that by geometry
+_EDGE = 9  # pixels around the end of a gap that may have cast a shadow
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: estimated readings are at least this much nearer than the table
 
@@ -143,7 +144,7 @@ def _without_readings(frame: Frame) -> np.ndarray:
 def _shadows(frame: Frame) -> np.ndarray:
     """Pixels (H, W) bool that the projector of the sensor does not light, since a nearer surface stands beside them.
 
-    The gap between readings at depths z1 < z2 in a row is then at most f b (1 / z1 - 1 / z2) pixels wide.
+    The gap in a row between depths z1 < z2 is then at most f b (1 / z1 - 1 / z2) pixels wide.
     """
     columns = np.broadcast_to(np.arange(frame.camera.width), frame.valid.shape)
     last = np.maximum.accumulate(np.where(frame.valid, columns, -1), axis=1)
@@ -152,10 +153,13 @@ def _shadows(frame: Frame) -> np.ndarray:
     between = ~frame.valid & (last >= 0) & (following < frame.camera.width)
     rows, at = np.nonzero(between)
     first, second = last[rows, at], following[rows, at]
-    z1, z2 = frame.depth[rows, first], frame.depth[rows, second]
-    widest = frame.camera.K[0, 0] * BASELINE * np.abs(1 / z1 - 1 / z2)
+    far = np.maximum(frame.depth[rows, first], frame.depth[rows, second])
+    # The edge that casts the shadow can be a few pixels away from the gap.
+    beside = ndimage.minimum_filter1d(np.where(frame.valid, frame.depth, np.inf), _EDGE, axis=1)
+    near = np.minimum(beside[rows, first], beside[rows, second])
+    widest = frame.camera.K[0, 0] * BASELINE * (1 / near - 1 / far)
     shadow = np.zeros(frame.valid.shape, bool)
-    shadow[rows, at] = (np.abs(z1 - z2) > _STEP) & (second - first - 1 <= _SHADOW * widest + 2)
+    shadow[rows, at] = (far - near > _STEP) & (second - first - 1 <= _SHADOW * widest + 2)
     return shadow
 
 
