@@ -123,7 +123,7 @@ class Completer(Checked, ABC):
 
     @property
     def weights_key(self) -> str:
-        """Key of the contents of trained weights; empty if there are none."""
+        """A hash of the trained weights; empty if there are none."""
         return ""
 
     @returns(lambda self, found, rng, seen: check_probabilities(found, seen.surface.shape))

@@ -45,7 +45,7 @@ class Architecture(ABC):
 
     The weights of the network are in the folder of a model (`mstfilter.trained`).
 
-    The file The file ``model.toml`` of the folder has the name of the class as `architecture`.
+    The file ``model.toml`` of the folder has the name of the class as `architecture`.
     """
 
     @abstractmethod

@@ -97,7 +97,7 @@ class ModeFilter(Bounded):
         return out
 
     def _window_counts(self, hit: np.ndarray) -> np.ndarray:
-        """Number (X, Y, Z) int32 of True cells in the window of each cell. Cells beyond the array are False."""
+        """For each cell, how many cells in its window are True, (X, Y, Z) int32. Cells beyond the array are False."""
         count = hit.astype(np.int32)
         for axis in range(3):
             count = _window_sums(count.swapaxes(0, axis), self.window).swapaxes(0, axis)

@@ -128,7 +128,7 @@ class CrossoverUpdate(Update):
     crossover : Crossover
         Makes one hypothesis from two.
     eta : int
-        Number of candidates of each pair.
+        Number of candidates that are made from each pair.
     quality_exponent : float
         Exponent lambda of Q in the weight.
     """

@@ -107,7 +107,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return bound_to(self, _shapes=found, other=other)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """The visible surface. `complete_each` adds the shape of the mask."""
+        """The visible surface of the object. `complete_each` adds the voxels of the external shape."""
         return seen.surface.astype(np.float32)
 
     def complete_each(

@@ -89,7 +89,7 @@ class PauseTruth:
 
 @dataclass(frozen=True)
 class PauseScore:
-    """Quality at one pause in one form of weighted coverage."""
+    """Quality at one pause, measured by one variant of weighted coverage."""
 
     pause: int
     where: str

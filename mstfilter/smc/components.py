@@ -3,7 +3,7 @@
 >>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
 >>> transition = Branching(Dynamics(model), branches=4)
 
-A trigger decides when to resample. A size decides the number of particles:
+A trigger decides when to resample. A size component decides the number of particles:
 
 >>> import numpy as np
 >>> from mstfilter.smc import Bins, Kld, Population

@@ -21,7 +21,7 @@ class PopulationContract(Contract):
     returns = Population
 
     def check_parents(self, result: Population, name: str, n: int) -> None:
-        """Assert that the parents of a name, if there are some, are indices of `n` particles or -1."""
+        """Assert that the parents called `name`, if there are some, are indices of `n` particles, or -1 for none."""
         index = result.parents.get(name, np.array([-1]))
         wrong = index[(index < -1) | (index >= n)]
         assert not len(wrong), f'parents "{name}" contain {wrong[0]}, and there were {n} particles'
