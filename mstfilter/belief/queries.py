@@ -9,17 +9,17 @@
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
 Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
-compares them, and renaming them changes no result. Probabilities of voxels also use the probabilities of each
-hypothesis (`Hypothesis.occupancy`). Queries of segmentations and actions use only the labels. Voxels are integer
-indices (x, y, z); `Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
-shape, or voxels (..., 3). Entropy and information are in nats; divide by log 2 for bits.
+compares them, and renaming them changes no result. Probabilities of voxels also use how sure a hypothesis is of each
+(`Hypothesis.occupancy`); queries of segmentations and actions use the labels. Voxels are integer indices (x, y, z);
+`Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
+shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
 
-**Information.** Every action (look from a camera, push) has one outcome under each hypothesis. The expected
-information of an action is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
-weights summed over equal outcomes. The expected information is at most `partition_entropy()`, which is at most log n.
-The expected information measures only differences between the hypotheses. Errors that all of them share have no
-effect. Outcomes that differ in one voxel are different. With `tolerance` (in voxels or pixels), outcomes that differ
-by much less than the tolerance count as equal (formula in `mstfilter.belief.information`).
+**Information.** Every action (look from a camera, push) has one outcome under each hypothesis. Its
+expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
+weights summed over equal outcomes, at most `partition_entropy()`, which is at most log n. It measures only what the
+hypotheses disagree on; errors that all of them share do not appear. Outcomes that differ in one voxel are different.
+With `tolerance` (in voxels or pixels), outcomes that differ by much less than it count as equal (formula in
+`mstfilter.belief.information`).
 """
 
 from __future__ import annotations
@@ -191,9 +191,9 @@ class Belief:
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
-        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))``. B: both voxels are occupied. S: both voxels
-        belong to the same object. ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not
-        included: H(B, S) = H(B) + H(S | B).
+        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
+        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included:
+        H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
         for axis in range(3):

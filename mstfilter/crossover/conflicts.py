@@ -86,8 +86,7 @@ class ConflictGraph:
         return components_in_conflict(self.networkx())
 
     def by_label(self, side: int, values: np.ndarray) -> np.ndarray:
-        """Values (n,) of the vertices as a table (65536,) over the labels of a side; 0 for labels without an
-        object."""
+        """Values (n,) of the vertices as a table (65536,) over the labels of a side; 0 for labels without object."""
         table = np.zeros(MAX_LABEL + 1, values.dtype)
         of_side = self.side == side
         table[self.label[of_side]] = values[of_side]
@@ -126,8 +125,7 @@ class OccupiedVoxels:
         return out
 
     def objects(self, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Label, voxels and position of the first voxel (k,) of the objects of a side. In a position, x is
-        fastest."""
+        """Label, voxels and position of the first voxel (k,) of the objects of a side; x is fastest in a position."""
         position = np.ravel_multi_index(np.unravel_index(self.at, self.shape), self.shape, order="F")
         labels = self.labels[side]
         sizes = np.bincount(labels, minlength=1)

@@ -145,8 +145,7 @@ class CrossoverUpdate(Update):
     ) -> Population:
         """The candidates of all pairs, which are built on access.
 
-        Without a prediction, the result is the proposed samples. Without a proposal, the result is the refined
-        predictions.
+        Without a prediction, the result is the proposed samples. Without a proposal, it is the refined predictions.
         """
         if predicted is None:
             return union(None, proposed)

@@ -293,7 +293,7 @@ class Bag(VideoFormat):
     colour : str
         Colour topic. By default, the only colour topic.
     depth : str
-        Depth topic. By default, the only one that is registered to colour.
+        Depth topic. Default: the only one that is registered to colour.
     registered : bool
         Treat depth as registered to colour even if its frame_id or camera matrix differs.
     """

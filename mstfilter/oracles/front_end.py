@@ -83,7 +83,7 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def boundary(self, frame: Frame) -> np.ndarray:
-        """(H, W) float32. The frame must be at a pause."""
+        """(H, W) float32; the frame must be at a pause."""
         import cv2
 
         image = self.truth.instance(self.truth.pause_of(frame))

@@ -76,8 +76,7 @@ class Overlaps:
 
     @cached_property
     def main_object(self) -> np.ndarray:
-        """The predicted object (segments + 1,) with most readings of each segment; 0 for a segment without readings
-        of objects."""
+        """The predicted object (segments + 1,) with most readings of each segment; 0 for a segment without any."""
         main = self.shared[:, 1:].argmax(axis=1) + 1 if self.shared.shape[1] > 1 else np.zeros(len(self.shared), int)
         return np.where(self.shared[:, 1:].any(axis=1), main, 0)
 

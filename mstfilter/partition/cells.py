@@ -156,8 +156,7 @@ class Cells:
         return found
 
     def _partitions_of(self, cells: np.ndarray) -> list[np.ndarray]:
-        """Partitions (k,) of some cells (k,) by the samples, and by the predictions, each completed by each
-        sample."""
+        """Partitions (k,) of some cells (k,) by the samples, and by the predictions, completed by each sample."""
         labels = self.samples[:, cells]
         # A cell without a segment is a part by itself.
         samples = np.unique(np.where(labels > 0, labels, -1 - np.arange(len(cells))), axis=0)

@@ -17,7 +17,7 @@ Layout::
     compare/without-past     run folders of other filters on the same recording, if asked for
 
 A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one. The arrays ``particles/...``
+holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
 are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same bytes in all files except seconds.json.
 """
 

@@ -161,8 +161,7 @@ class DiskCache:
 
 
 def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
-    """Arrays of a value, named by their path in it: ``0.labels`` is the field `labels` of the first item of a
-    tuple."""
+    """Arrays of a value, named by their path in it: ``0.labels`` is field `labels` of the first item of a tuple."""
     if value is None:
         return {}
     if isinstance(value, np.ndarray):

@@ -89,8 +89,7 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
 
 
 def report_findings(findings: Iterable[Finding], where: str) -> None:
-    """Raise the first finding that stops a run as InputError, or warn of all findings. `where` names the
-    recording."""
+    """Raise the first finding that stops a run as InputError, or warn of all; `where` names the recording."""
     for finding in findings:
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)

@@ -181,7 +181,8 @@ class Recording:
 
         Raises
         ------
-        InputError If the arrays cannot be used, or `examine` finds that hypotheses cannot be correct.
+        InputError
+            If the arrays cannot be used, or `examine` finds that hypotheses cannot be correct.
         """
         if depth is None:
             raise InputError(

@@ -123,8 +123,8 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
 
-    Concave curvature is the largest eigenvalue of the Hessian, and convex curvature is minus the smallest. `resize`
-    is the image width / 640.
+    Concave curvature is the largest eigenvalue of the Hessian, convex curvature minus the smallest. `resize` is the
+    image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

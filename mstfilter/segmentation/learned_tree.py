@@ -271,7 +271,7 @@ class Agglomeration:
 class MergedTree(TreeBuilder):
     """Best-first merging of watershed regions by learned log odds.
 
-    The table is one leaf, with all else that is no object. Only the root merges the table with other regions.
+    The table is one leaf, with all else that is no object. Only the root merges it with other regions.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
@@ -300,8 +300,7 @@ class MergedTree(TreeBuilder):
         return measure_regions(leaves, frame, boundary, self.look(frame))
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
-        """Build the tree. `odds` are the log odds of each merge. `start` is the maximum of the probabilities of all
-        merges below."""
+        """Build the tree. `odds` are the log odds of each merge, `start` the maximum of their probabilities below."""
         if frame is None:
             raise InputError(
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
@@ -380,8 +379,8 @@ class BorderTree(MergedTree):
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
     """The tree of a list of merges. Merge k creates node n_regions + k. A root joins the remaining regions.
 
-    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge consists of its two nodes and its
-    log odds.
+    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is its two nodes and its log
+    odds.
     """
     if n_regions == 1:
         return Tree(np.zeros(1, np.int64), image, np.zeros(1), np.zeros(1))

@@ -7,7 +7,7 @@
 There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. If
 several objects of a hypothesis contain a voxel, one of them gets it. Each hypothesis is resolved separately.
 
-An An `ObjectRule` decides which regions of a cut are objects:
+An `ObjectRule` decides which regions of a cut are objects:
 
 >>> labels = ObjectRule().label_image(tree, cut, frame)      # (H, W): 0 background, k + 1 for node k of the cut
 """
@@ -65,9 +65,9 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its readings are on the table, behind it or outside the workspace. A region is
-    also background if fewer than `min_points` readings remain. The fields are for an image of 640 x 480 pixels, and
-    are scaled by the area of the image.
+    A region is background if most of its readings are on the table, behind it or outside the workspace, or if fewer
+    than `min_points` readings remain. These are for an image of 640 x 480 pixels, and scaled by the area of the
+    image.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class ObjectRule:
         return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
-        """Test every node of a tree. Without a grid, the workspace is all space above the table."""
+        """Test every node of a tree. Without a grid the workspace is everything above the table."""
         found = self.foreground(frame, grid)
         pixels, frame = found.pixels, found.frame
         readings = tree.accumulate_pixels(frame.valid)
@@ -172,8 +172,7 @@ class TreeCutProposal(Proposal):
         return replace(self, boundary=self.boundary.at(clip)) if isinstance(self.boundary, ClipBoundary) else self
 
     def label_image(self, frame: Frame, grid: VoxelGrid | None = None, cut: np.ndarray | None = None) -> np.ndarray:
-        """(H, W) int32 segments of a cut: 0 is background, and k + 1 its k-th node. The default is the optimal
-        cut."""
+        """(H, W) int32 segments of a cut, 0 background, k + 1 its k-th node; the optimal cut by default."""
         tree, w = self.tree_of(frame, grid)
         return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame, grid)
 

@@ -94,14 +94,14 @@ class Tree:
 
     @cached_property
     def end(self) -> np.ndarray:
-        """(N,) `start` of the parent, which is P(boundary) of the merge that absorbs the node, or 1 for the root."""
+        """(N,) `start` of the parent: P(boundary) of the merge that absorbs the node, or 1 for the root."""
         end = self.start[self.parent]
         end[self.root] = 1.0
         return read_only(end)
 
     @cached_property
     def children(self) -> tuple[tuple[int, ...], ...]:
-        """Children of every node in ascending order, as They are Python integers, which are fast in loops."""
+        """Children of every node in ascending order, as Python integers, which are fast in loops."""
         found: list[list[int]] = [[] for _ in range(self.n_nodes)]
         for node, parent in enumerate(self.parent[:-1].tolist()):
             found[parent].append(node)
@@ -269,7 +269,7 @@ def linkage_tree(
 
     `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` returns the strength of the borders between
     the watershed regions. By default the strength is the mean weight of the edges of a border. `arcs` (E,) is the
-    border of each edge, or -1 within a region. Returns Returns None if there is only one region.
+    border of each edge, or -1 within a region. Returns None if there is only one region.
     """
     import higra as hg
 

@@ -2,16 +2,14 @@
 
 `mstfilter.smc.run_many` uses this module where possible.
 
-The components are called once per step with the particles of all runs, as one population of R n particles. One call
-for all runs is possible if the `batched` of each component is True (stated by its author) or None (tried; models of
-`StateSpaceModel.of`, programs). A component gets no axis of runs. A component must treat each row independently, and
-take the shape of its draws from its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the
-rows of each run from the stream of this run.
+The components are called once per step with the particles of all runs, as one population of R n particles. This is
+done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
+programs). A component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its
+arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
 
-The results are checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number of runs changes, some
-runs are compared with a call for that run alone. If the results differ, a component that states ``batched=True``
-raises InputError. Otherwise, or if they differ only by rounding, `NotTogether` states the reason, and the runs must
-be made one by one.
+This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
+compared with a call for that run alone. If they differ, a component that states ``batched=True`` raises InputError.
+Otherwise, and if they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
 """
 
 from __future__ import annotations
@@ -215,7 +213,7 @@ class _Sweep:
         return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(self.filter.n)), particles)
 
     def alone(self, t: int, slot: str, row: int) -> Population:
-        """The result of a component for one run. Raises LostRunError, or `NotTogether` for another error."""
+        """What a component returns for one run; LostRunError, or `NotTogether` if it raises another error."""
         y, u = self.given[t]
         component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = self.key(t, slot, row).generator() if component.draws else None

@@ -5,13 +5,13 @@
 >>> state, _ = load_state(path)                                      # later, or in another process
 >>> state, infos = filter.run(observations[state.t:], state)
 
-The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
-renamed. So a process that is killed leaves the state of a complete step. All draws depend on the seed and the step
-only, so a continued run equals an uninterrupted one. The file does not know the filter and the observations: the
+The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
+renamed, so that a process that is killed leaves the state of a complete step. All draws depend on the seed and the
+step only, so a continued run equals an uninterrupted one. The file does not know the filter and the observations: the
 caller gives the same ones.
 
-`ArrayCodec` stores particles that are arrays or mappings of arrays. Other particles need a `Codec`. Reading a file
-never imports code.
+`ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another kind need a `Codec`; stored
+data never import code.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The quality of the estimates of a run: Monte Carlo variances from the run itself, and distances of populations.
+"""How good the estimates of a run are: Monte Carlo variances from the run itself, and distances of populations.
 
 >>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error

@@ -16,7 +16,8 @@ distribution of another library, write a `Distribution` whose `sample` draws by 
 
 A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
 `Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves evaluate
-values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a move rejects.
+values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
+move rejects.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def _entry(name: str, given: np.ndarray, t: int = 0, u: Any = None) -> np.ndarra
 
 
 def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
-    """B u (d,). It is computed without BLAS, whose rounding depends on the number of rows."""
+    """B u (d,). Without BLAS, whose rounding depends on the number of rows."""
     u = vector_of("the input", u, B.shape[1])
     return (B * u[..., None, :]).sum(axis=-1)
 

@@ -2,7 +2,7 @@
 
 >>> Cluster("tcp://head:8786").run(jobs, tell)
 
-This module neither starts nor stops the scheduler and its workers. All machines must see the study folder and the
+The scheduler and its workers are neither started nor stopped here. All machines must see the study folder and the
 cache under the same paths and have the same code of mstfilter. If a worker dies, the scheduler gives its jobs to
 other workers; a job whose workers died more often than its ``allowed-failures`` (3) has failed. A job that exceeds
 its time limit ends the process of its worker, which the worker's nanny starts again. Without workers, the jobs wait.

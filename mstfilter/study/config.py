@@ -166,7 +166,7 @@ class ArmRequest:
     reported_only: bool  #: reported, but not part of the comparisons
 
     def config(self) -> dict[str, Any]:
-        """The configuration of this arm. Unknown names of components raise InputError."""
+        """The configuration of this arm of the study. Unknown names of components raise InputError."""
         return load_config(self.preset, self.overrides)
 
 

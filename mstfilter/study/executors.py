@@ -41,8 +41,8 @@ class Executor(Bounded, ABC):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
-        Jobs are started in this order when workers are free. Jobs of one ``share`` are given to the same worker if
-        possible. `tell` is called in the calling thread. An exception in `tell` stops all jobs.
+        Jobs are started in this order when workers are free. Jobs of one ``share`` go to the same worker if possible.
+        `tell` is called in the calling thread. An exception that it raises stops all jobs.
         """
 
 
@@ -98,8 +98,7 @@ class _LocalRun:
         return [self._outcomes[k] for k in range(len(self._jobs))]
 
     def _next_job(self, worker: _Worker) -> int | None:
-        """The next job of a worker: from its last share, or else from a share of no other worker, or else the
-        first."""
+        """The next job of a worker: of its last share, else of a share that no other worker has, else the first."""
         other_shares = {share for other, share in self._share_of.items() if other is not worker}
 
         def rank(k: int) -> tuple[bool, bool]:

@@ -96,8 +96,8 @@ class Plan:
 def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after those of the arm. A comma makes a grid. Raises InputError if an arm is
-    invalid, two arms are equal, there are no runs, or a recording cannot be read.
+    `overrides` are applied to every arm after those of the arm; a comma makes a grid. Raises InputError if an arm is
+    invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()
