@@ -257,7 +257,7 @@ class Registry:
 
 
 def settings(overrides: Iterable[str], config: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Apply changes, written as ``path=value``, to a configuration. Without one, return them as a nested dictionary."""
+    """Apply changes (``path=value``) to a configuration. Without one, return them as a nested dictionary."""
     return merged(config or {}, *map(_nested, overrides))
 
 

@@ -177,7 +177,7 @@ class RunNumbers:
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
-    """The numerical results of a run folder. Without `beliefs`, the log losses are omitted, since they take the most time."""
+    """The numerical results of a run folder. Without `beliefs`, log losses are omitted, which take most of the time."""
     description = run.description
     times = description["recording"]["times"]
     steps = []

@@ -285,7 +285,7 @@ class MetropolisHastingsCuts(CutSampler):
     Parameters
     ----------
     sigma2 : float
-        s2 relative to the squared value of the optimal cut, without unit.It is not used with a temperature.
+        s2 relative to the squared value of the optimal cut, without unit. It is not used with a temperature.
     burn_in : int
         Steps before the first sample of each chain, in addition to `thinning`.
     thinning : int

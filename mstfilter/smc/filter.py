@@ -139,7 +139,7 @@ class ParticleFilter(AtStep):
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
     def step(self, state: State, observation: Any) -> tuple[State, Info]:
-        """Process one observation, or None if it is missing. If it is missing, the proposal and the update are skipped.
+        """Process one observation. If it is missing (None), the proposal and the update are skipped.
 
         To give an input too, pass ``WithInput(observation, u)``.
 

@@ -206,7 +206,8 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     """Pixels (H, W) with the same content in the first and last frame.
 
     Depth differs by less than four standard deviations of the difference. Slightly blurred colour differs by at most
-    12 grey levels in every channel after exposure matching. Pixels that show the robot or have no depth count as changed.
+    12 grey levels in every channel after exposure matching. Pixels that show the robot or have no depth count as
+    changed.
     """
     change = np.abs(smooth_colour(first) - matched_colour(last, first)).max(axis=2)
     return same_depth(first, last) & (change <= 12.0)
