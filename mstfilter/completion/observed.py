@@ -5,9 +5,9 @@
 >>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
 
 **Earlier frames.** When an object moves, its views move with it. Values of a view are read at the nearest voxel. The
-surface of an object, the space behind the surface and the free space around it remain evidence about its shape. Other objects, and
-the space that they hide, are not evidence, since they may have moved. The latest frame takes precedence where it
-measures the object's surface.
+surface of an object, the space behind the surface and the free space around it remain evidence about its shape. Other
+objects, and the space that they hide, are not evidence, since they may have moved. The latest frame takes precedence
+where it measures the object's surface.
 """
 
 from __future__ import annotations

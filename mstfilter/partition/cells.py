@@ -16,8 +16,8 @@ of the predictions. The log odds of "one object" are
         + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
 
 where R is the probability that a prediction is valid, and W <= R the weight of the predictions that explain both
-cells. The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`. The coefficients were fitted
-in `experiments/partition_fit`.
+cells. The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`. The odds of the image are
+taken as they are. The coefficients of the predictions were fitted in `experiments/partition_fit`.
 
 The alternatives of a component are the partitions that the samples and the predictions give it. If a prediction does
 not explain a cell, each sample in turn determines which predicted object the cell joins. Every mixture of the
@@ -303,10 +303,10 @@ class PairTerms(NamedTuple):
 class PairEvidence(PairOdds):
     """Log odds from the shares of the samples and of the predictions in which two cells belong to one object."""
 
-    image_only_constant: float = -0.78
-    image_only: float = 0.64
-    constant: float = -0.87
-    image: float = 0.51
+    image_only_constant: float = 0.0
+    image_only: float = 1.0
+    constant: float = 0.0
+    image: float = 1.0
     prediction: float = 0.62
     prediction_constant: float = 0.96
 

@@ -171,7 +171,7 @@ class PartitionUpdate(Update):
         return self._weigh(built, observation, np.zeros(n), parents, projected.notes)
 
     def _mended(self, clip: Clip) -> Clip:
-        """The last frame of a clip, with estimates of missing readings of objects. Free space is only measured."""
+        """The last frame, with estimates of missing readings of objects. Free-space projection does not use them."""
         return Clip((foreground(clip.after, clip.grid).frame,), clip.grid, clip.index) if self.mend else clip
 
     # 1. Free-space projection -----------------------------------------------------------------------------------

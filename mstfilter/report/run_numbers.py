@@ -177,7 +177,7 @@ class RunNumbers:
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
-    """The numerical results of a run folder. Without `beliefs`, log losses are omitted, which take most of the time."""
+    """The numerical results of a run folder. Without `beliefs`, log losses are omitted, which take the most time."""
     description = run.description
     times = description["recording"]["times"]
     steps = []

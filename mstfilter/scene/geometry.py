@@ -71,7 +71,7 @@ def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray,
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
 
 
-BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity only
+BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity
 _FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of disparity only
 
 

@@ -38,7 +38,7 @@ _TABLE_NEAR = 0.1  # share of table in these surroundings
 _COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the table; 1 % of its pixels are above
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
 _ON_TABLE = 0.4  # share of table around a region without readings
-_STEP, _SHADOW = 0.02, 1.2  # metres; largest width of a shadow, in that by geometry
+_STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: estimated readings are at least this much nearer than the table
@@ -112,7 +112,12 @@ def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
     measured = _regions_of_readings(frame, grid)
     pixels = _joined(frame, measured, _silent(frame))
     depth = _with_estimates(frame, pixels)
-    return Foreground(read_only(pixels), frame if depth is None else replace(frame, depth=depth))
+    if depth is None:
+        return Foreground(read_only(pixels), frame)
+    if grid is not None:
+        pixels &= frame.valid | grid.contains(grid.index_of(posed_camera(frame).unproject(depth)))
+    pixels &= np.isfinite(depth)
+    return Foreground(read_only(pixels), replace(frame, depth=np.where(pixels, depth, frame.depth)))
 
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
@@ -144,21 +149,22 @@ def _without_readings(frame: Frame) -> np.ndarray:
 def _shadows(frame: Frame) -> np.ndarray:
     """Pixels (H, W) bool that the projector of the sensor does not light, since a nearer surface stands beside them.
 
-    The gap in a row between depths z1 < z2 is then at most f b (1 / z1 - 1 / z2) pixels wide.
+    The gap in a row between depths z1 < z2 is then at most f b (1 / z1 - 1 / z2) pixels wide, where
+    b is the baseline of a Kinect. The side of the projector is not used.
     """
-    columns = np.broadcast_to(np.arange(frame.camera.width), frame.valid.shape)
-    last = np.maximum.accumulate(np.where(frame.valid, columns, -1), axis=1)
-    after = np.where(frame.valid, columns, frame.camera.width)[:, ::-1]
-    following = np.minimum.accumulate(after, axis=1)[:, ::-1]
-    between = ~frame.valid & (last >= 0) & (following < frame.camera.width)
+    read = np.isfinite(frame.depth)  # also of the robot, which casts shadows
+    columns = np.broadcast_to(np.arange(frame.camera.width), read.shape)
+    last = np.maximum.accumulate(np.where(read, columns, -1), axis=1)
+    following = np.minimum.accumulate(np.where(read, columns, frame.camera.width)[:, ::-1], axis=1)[:, ::-1]
+    between = ~read & (last >= 0) & (following < frame.camera.width)
     rows, at = np.nonzero(between)
     first, second = last[rows, at], following[rows, at]
     far = np.maximum(frame.depth[rows, first], frame.depth[rows, second])
-    # The edge that casts the shadow can be a few pixels away from the gap.
-    beside = ndimage.minimum_filter1d(np.where(frame.valid, frame.depth, np.inf), _EDGE, axis=1)
+    # The edge that casts the shadow can be a few pixels away from the gap. A single near reading is noise.
+    beside = ndimage.rank_filter(np.where(read, frame.depth, np.inf), rank=1, size=(1, _EDGE))
     near = np.minimum(beside[rows, first], beside[rows, second])
     widest = frame.camera.K[0, 0] * BASELINE * (1 / near - 1 / far)
-    shadow = np.zeros(frame.valid.shape, bool)
+    shadow = np.zeros(read.shape, bool)
     shadow[rows, at] = (far - near > _STEP) & (second - first - 1 <= _SHADOW * widest + 2)
     return shadow
 
@@ -233,27 +239,22 @@ def _ellipse(radius: float) -> np.ndarray:
 def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
     """Depth (H, W) with estimates at pixels of objects without a reading; None if all of them have one.
 
-    An estimate is the nearest reading of the object in the image, but not behind the table. An object without
-    readings stands upright where its lowest pixels see the table.
+    An estimate is the nearest reading of the object in the image, but not behind the table. An object with fewer than
+    ten readings gets one depth: that of the nearest part of the table that its pixels hide.
     """
     if not (pixels & ~frame.valid).any():
         return None
     camera = posed_camera(frame)
     down = camera.rays() @ camera.pose.as_matrix()[2, :3]
-    with np.errstate(divide="ignore"):
-        table = np.where(down < 0, -camera.position[2] / down, np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_table = -camera.position[2] / down
+    table = np.where((down < 0) & (to_table > 2 * _STANDS), to_table, np.inf)
     depth = np.array(frame.depth)
     regions, _ = ndimage.label(pixels)
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
         inside = regions[box] == k
         known, missing = inside & frame.valid[box], inside & ~frame.valid[box]
         if missing.any():
-            found = fill_from_nearest(depth[box], ~known) if known.sum() >= _FEW else _at_base(table[box], inside)
+            found = fill_from_nearest(depth[box], ~known) if known.sum() >= _FEW else table[box][inside].min()
             depth[box][missing] = np.minimum(found, table[box] - _STANDS)[missing]
     return depth
-
-
-def _at_base(table: np.ndarray, inside: np.ndarray) -> float:
-    """Depth of the table (h, w) at the lowest pixels inside."""
-    lowest = np.flatnonzero(inside.any(axis=1))[-1]
-    return float(np.median(table[lowest][inside[lowest]]))

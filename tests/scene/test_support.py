@@ -59,9 +59,32 @@ def test_an_object_without_readings_is_found_by_its_colour(part):
 def test_a_hole_in_the_table_is_no_object():
     frame = frame_of(TWO, width=640, noise=0.3)
     holes = np.zeros(SEEN.shape, bool)
-    holes[380:420, 300:360] = True  # on the table, before the objects
-    assert not foreground(without(frame, holes), GRID).pixels[holes].any()
+    holes[320:350, 290:330] = True  # on the table, before the objects
+    assert not SEEN[holes].any() and not foreground(without(frame, holes), GRID).pixels[holes].any()
     assert foreground(without(frame, holes, (20, 20, 20)), GRID).pixels[holes].mean() > 0.9
+
+
+def test_pixels_outside_the_workspace_are_no_objects():
+    frame = frame_of(TWO, width=640, noise=0.3)
+    holes = np.zeros(SEEN.shape, bool)
+    holes[400:440, 300:360] = True
+    dark = without(frame, holes, (20, 20, 20))
+    assert foreground(dark).pixels[holes].mean() > 0.9 and not foreground(dark, GRID).pixels[holes].any()
+
+
+def test_a_single_near_reading_and_the_robot_cast_the_shadows_that_they_cast():
+    frame = frame_of(TWO, width=640, noise=0.3)
+    holes = np.zeros(SEEN.shape, bool)
+    holes[300:340, 280:320] = True
+    dark = without(frame, holes, (20, 20, 20))
+    flying = np.array(dark.depth)
+    flying[300:340, 322] = 0.45
+    assert foreground(Frame(dark.rgb, flying, dark.camera), GRID).pixels[holes].mean() > 0.9
+    robot, strip = np.zeros(SEEN.shape, bool), np.zeros(SEEN.shape, bool)
+    robot[300:340, 250:280], strip[300:340, 280:296] = True, True
+    arm = np.where(robot, 0.6, without(frame, strip).depth).astype(np.float32)
+    shaded = without(frame, strip, (90, 80, 70)).rgb
+    assert not foreground(Frame(shaded, arm, frame.camera, robot), GRID).pixels[strip].any()
 
 
 def test_empty_margins_of_registered_depth_are_no_objects():
