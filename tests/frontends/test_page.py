@@ -45,7 +45,7 @@ def test_all_pauses_are_checked_before_a_run(tmp_path):
 
 
 def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch, capsys):
-    """Quality of the estimate at the last pause, against each alternative alone, completed in the same way."""
+    """Mean quality of the estimate of three seeds at the last pause, against each alternative, completed likewise."""
     monkeypatch.chdir(tmp_path)
     recording = mstfilter.open_recording(cached_recording("demo", 0, n_actions=1))
     true = bind_truth(TrueMasks(), recording)
@@ -66,4 +66,6 @@ def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch,
         ).proposal
         (hypothesis,) = proposal.sample(np.random.default_rng(0), clip, 1).particles
         alone.append(mstfilter.weighted_coverage(hypothesis.labels, truth))
-    assert mstfilter.weighted_coverage(given["belief"].estimate().labels, truth) > max(alone)
+    runs = [given["filter"].run(recording.clips(), seed)[0] for seed in (0, 1, 2)]
+    estimates = [mstfilter.Belief(state.population).estimate().labels for state in runs]
+    assert np.mean([mstfilter.weighted_coverage(labels, truth) for labels in estimates]) > max(alone)
