@@ -23,7 +23,7 @@ def samples(tmp_path_factory) -> CompletionSamples:
 
 
 def test_better_than_extrusion_on_new_scenes(samples):
-    """About 40 masks of each of three scenes; on the 50 test scenes of the card the difference is of a similar size."""
+    """About 40 masks of each of three scenes. On the 50 test scenes of the card the difference is of similar size."""
     boxes = [samples.box(k) for k in range(len(samples))]
     p = np.stack(NetworkCompleter().fill_many([np.random.default_rng(0)] * len(boxes), boxes))
     p[Seen.FREE.among(samples.bits)] = 0
