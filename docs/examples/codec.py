@@ -45,7 +45,7 @@ def example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
 
 
 if __name__ == "__main__":
-    # In a run: filter.run(observations, checkpoint="run.npz", codec=MyCodec())
+    # In a run: save_state("run.npz", state, MyCodec())
     particles = example(np.random.default_rng(0), 4)[0].particles
     arrays = MyCodec().encode(particles)
     print(arrays, MyCodec().decode(arrays) == particles)

@@ -23,8 +23,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from measures import segment_f
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from mstfilter.files import write_csv
 from mstfilter.forecasts import ForecastTable, Recalibration
@@ -44,6 +42,7 @@ from mstfilter.segmentation import (
     Tree,
     TreeBuilder,
     UcmTree,
+    connected_pixels,
     optimal_cut,
 )
 from mstfilter.segmentation.tree import merge_tree, prune
@@ -200,15 +199,12 @@ def without_labels(tree: Tree) -> Tree:
 def components(case: Case, step: float = np.inf) -> np.ndarray:
     """Floor: 4-connected components above the table; neighbours whose depth differs by `step` m are not joined."""
     own = readings_above_table(case.frame)
-    index = np.arange(own.size).reshape(own.shape)
     depth = np.where(own, case.frame.depth, 0)
-    links = []
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        joined = own[a] & own[b] & (np.abs(depth[a] - depth[b]) < step)
-        links.append((index[a][joined], index[b][joined]))
-    rows, columns = (np.concatenate(x) for x in zip(*links, strict=True))
-    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(own.size, own.size))
-    label = connected_components(graph, directed=False)[1].reshape(own.shape) + 1
+
+    def joined(a: tuple[slice, ...] | slice, b: tuple[slice, ...] | slice) -> np.ndarray:
+        return own[a] & own[b] & (np.abs(depth[a] - depth[b]) < step)
+
+    label = connected_pixels(joined(np.s_[:, :-1], np.s_[:, 1:]), joined(np.s_[:-1], np.s_[1:])) + 1
     label[~own] = 0
     sizes = np.bincount(label.ravel())
     label[sizes[label] < RULE.min_points] = 0

@@ -12,14 +12,14 @@ floors.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mstfilter.completion import Completer, Extrude
 from mstfilter.scene import Clip, Frame, Hypothesis, scaled_area
 from mstfilter.scoring import connected_components, one_blob
-from mstfilter.segmentation import ObjectRule, TreeCutProposal, complete_segments, hypothesis_of
+from mstfilter.segmentation import ObjectRule, TreeCutProposal, complete_segments, connected_pixels, hypothesis_of
 from mstfilter.smc import Population, Proposal, child
 
 _MIN_VOXELS = 8  # smallest component of the occupied space
@@ -109,19 +109,13 @@ class ImageComponents(Floor):
 
     def label_image(self, frame: Frame, own: np.ndarray) -> np.ndarray:
         """Components (H, W) int32, numbered from 1, of the pixels `own` (H, W) bool; 0 elsewhere."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
 
-        pixel = np.arange(own.size).reshape(own.shape)
-        first, second = [], []
-        for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        def joined(a: Any, b: Any) -> np.ndarray:
             with np.errstate(invalid="ignore"):
-                joined = own[a] & own[b] & (np.abs(frame.depth[a] - frame.depth[b]) <= _MAX_STEP)
-            first.append(pixel[a][joined])
-            second.append(pixel[b][joined])
-        edges = np.concatenate(first), np.concatenate(second)
-        graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(own.size, own.size))
-        part = connected_components(graph, directed=False)[1].reshape(own.shape)
+                near: np.ndarray = np.abs(frame.depth[a] - frame.depth[b]) <= _MAX_STEP
+            return own[a] & own[b] & near
+
+        part = connected_pixels(joined(np.s_[:, :-1], np.s_[:, 1:]), joined(np.s_[:-1], np.s_[1:]))
         return _largest(np.where(own, part + 1, 0), scaled_area(self.objects.min_points, own.size)).astype(np.int32)
 
 

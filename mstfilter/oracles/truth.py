@@ -83,22 +83,29 @@ class RecordingTruth:
     @cached_property
     def _pauses(self) -> dict[bytes, int]:
         """The first pause with each frame, by the key of the frame."""
+        frames = self.recording.frames
+        return {frames[index].key: t for t, index in reversed(list(enumerate(self.recording.pauses)))}
+
+    @cached_property
+    def _mended(self) -> dict[bytes, int]:
+        """The same for frames with estimated depth."""
         from mstfilter.scene import foreground  # needs cv2, which the registry does not
 
-        frames = self.recording.frames
-        found = {}
-        for t, index in reversed(list(enumerate(self.recording.pauses))):
-            found[frames[index].key] = found[foreground(frames[index], self.recording.grid).frame.key] = t
-        return found
+        recording = self.recording
+        pauses = reversed(list(enumerate(recording.pauses)))
+        return {foreground(recording.frames[index], recording.grid).frame.key: t for t, index in pauses}
 
     def pause_of(self, frame: Frame) -> int:
         """The pause at which a frame was taken, found by its content."""
-        if frame.key not in self._pauses:
+        found = self._pauses.get(frame.key)
+        if found is None:
+            found = self._mended.get(frame.key)
+        if found is None:
             raise InputError(
                 f"a frame is none of the {len(self.recording.pauses)} pauses of recording {self.recording.name}",
                 "components that use the truth need the recording to which they are bound",
             )
-        return self._pauses[frame.key]
+        return found
 
 
 class UsesTruth:

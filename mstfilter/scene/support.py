@@ -109,8 +109,8 @@ def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
 
 
 def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
-    measured = _regions_of_readings(frame, grid)
-    pixels = _joined(frame, measured, _silent(frame))
+    measured, table, missing = _regions_of_readings(frame, grid), _on_table(frame), _without_readings(frame)
+    pixels = _joined(measured, _silent(frame, table, missing), table, missing)
     depth = _with_estimates(frame, pixels)
     if depth is None:
         return Foreground(read_only(pixels), frame)
@@ -169,9 +169,9 @@ def _shadows(frame: Frame) -> np.ndarray:
     return shadow
 
 
-def _silent(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) bool without a reading, and with another colour than the table around them."""
-    width, table = frame.camera.width, _on_table(frame)
+def _silent(frame: Frame, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """The missing pixels (H, W) bool with another colour than the table (H, W) bool around them."""
+    width = frame.camera.width
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, width)))
     share = _surroundings(table.astype(np.float32), width)
@@ -179,7 +179,7 @@ def _silent(frame: Frame) -> np.ndarray:
     mean = _surroundings(lab * table[..., None], width) / n
     variance = np.maximum(_surroundings(lab**2 * table[..., None], width) / n - mean**2, 0) + _COLOUR_NOISE
     other = (((lab - mean) ** 2 / variance).sum(axis=-1) > _COLOUR_DISTANCE) & (share > _TABLE_NEAR)
-    silent = (_without_readings(frame) & other & _measured_part(frame)).astype(np.uint8)
+    silent = (missing & other & _measured_part(frame)).astype(np.uint8)
     return cv2.morphologyEx(silent, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
@@ -202,14 +202,16 @@ def _surroundings(image: np.ndarray, width: int) -> np.ndarray:
     return cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
 
 
-def _joined(frame: Frame, measured: np.ndarray, silent: np.ndarray) -> np.ndarray:
-    """Readings of objects, and the regions without readings that touch them or stand on the table by themselves."""
+def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Readings of objects, and the regions without readings that touch them or stand on the table by themselves.
+
+    All images are (H, W) bool. Small gaps of missing readings are closed.
+    """
     either = (measured | silent).astype(np.uint8)
-    closed = cv2.morphologyEx(either, cv2.MORPH_CLOSE, _ellipse(scaled_length(2, frame.camera.width))) > 0
-    regions, n = ndimage.label(closed & (measured | _without_readings(frame)))
+    closed = cv2.morphologyEx(either, cv2.MORPH_CLOSE, _ellipse(scaled_length(2, measured.shape[1]))) > 0
+    regions, n = ndimage.label(closed & (measured | missing))
     kept = np.zeros(n + 1, bool)
     kept[regions[measured]] = True
-    table = _on_table(frame)
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
         kept[k] |= not kept[k] and _stands_alone(regions, k, box, table)
     kept[0] = False

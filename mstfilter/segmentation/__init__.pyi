@@ -35,5 +35,6 @@ from mstfilter.segmentation.regions import (
     REGION as REGION,
     Regions as Regions,
     SeenBorders as SeenBorders,
+    connected_pixels as connected_pixels,
 )
 from mstfilter.segmentation.tree import Tree as Tree, TreeBuilder as TreeBuilder, UcmTree as UcmTree

@@ -92,7 +92,8 @@ def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
     Each connected part of a leaf is a leaf. Parts of a few pixels join the nearest larger one.
     """
-    parts = _connected(np.where(pixels, leaves + 1, 0))
+    image = np.where(pixels, leaves + 1, 0)
+    parts = connected_pixels(image[:, :-1] == image[:, 1:], image[:-1] == image[1:])
     sizes = np.bincount(parts[pixels], minlength=int(parts.max()) + 1)
     large = sizes >= scaled_area(_SMALLEST_LEAF, pixels.size)
     if large.any():
@@ -105,16 +106,17 @@ def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return np.where(pixels, numbers[parts], 0)
 
 
-def _connected(image: np.ndarray) -> np.ndarray:
-    """Number (H, W) of the connected part of equal values of an image (H, W) int."""
-    pixel = np.arange(image.size).reshape(image.shape)
-    pairs = [
-        (pixel[a][image[a] == image[b]], pixel[b][image[a] == image[b]])
-        for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
-    ]
-    edges = np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
-    graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(image.size, image.size))
-    return np.asarray(connected_components(graph, directed=False)[1].reshape(image.shape))
+def connected_pixels(right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Number (H, W) of the connected part of each pixel of an image.
+
+    `right` (H, W - 1) and `down` (H - 1, W) bool say whether a pixel is joined to its right or its lower neighbour.
+    """
+    shape = len(right), down.shape[1]
+    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
+    first = np.concatenate([pixel[:, :-1][right], pixel[:-1][down]])
+    second = np.concatenate([pixel[:, 1:][right], pixel[1:][down]])
+    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(pixel.size, pixel.size))
+    return np.asarray(connected_components(graph, directed=False)[1].reshape(shape))
 
 
 def measure_regions(

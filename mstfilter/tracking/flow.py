@@ -24,11 +24,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from mstfilter.fields import Bounded
-from mstfilter.scene import Clip, Frame, memo
+from mstfilter.scene import Clip, Frame, fill_from_nearest, memo
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
 _PRESETS = ("ultrafast", "fast", "medium")
@@ -226,8 +225,7 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     finite = np.isfinite(frame.depth)
     rows, columns = np.divmod(np.arange(height * width), width)
     if finite.any():
-        nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
-        place = frame.camera.unproject(frame.depth[tuple(nearest)]).reshape(-1, 3) / 0.012
+        place = frame.camera.unproject(fill_from_nearest(frame.depth, ~finite)).reshape(-1, 3) / 0.012
     else:
         place = np.stack([columns, rows], axis=1) / 6.0
     colour = smooth_colour(frame).reshape(-1, 3) / 20.0
