@@ -96,7 +96,7 @@ class NetworkCompleter(Completer, UsesFiles):
             index = np.indices(p.shape).reshape(3, -1).T + low
             at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
             p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
-        return replace(finish(low, seen, p, one.key), views=one.views)
+        return replace(finish(low, seen, p, one.key, seen), views=one.views)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return self.fill_many([rng], [seen])[0]

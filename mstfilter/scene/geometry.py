@@ -190,21 +190,26 @@ def table_residual(frame: Frame) -> np.ndarray:
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 
 _BORDER = 0.03  # metres: a wall may stand at the border of the visible table
+_MARGIN = 0.05  # metres of the workspace around the visible table
+_LEAST_SIDE, _LARGEST_SIDE = 1.0, 2.0  # metres
 
 
 def workspace(frame: Frame) -> VoxelGrid:
-    """A grid of 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table, which is at z = 0.
+    """A grid in voxels of 1 cm around the visible part of the table, which is at z = 0.
 
-    The grid is centred on the readings more than 1 cm above the table, or on the table if there are fewer than 200.
-    Readings beside the visible table, for example on a wall behind it, are ignored.
+    The grid is .5 m high, and each side is 1 to 2 m long. Where the table is shorter or longer, the grid is centred on
+    the readings more than 1 cm above the table, as far as it covers as much of the table as possible. Readings beside
+    the visible table, for example on a wall behind it, are ignored.
     """
-    voxel_size, shape = 0.01, (100, 100, 50)
+    voxel_size, height = 0.01, 50
     points = frame.points[frame.valid]
-    table = points[np.abs(points[:, 2]) < _MIN_HEIGHT]
-    raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < shape[2] * voxel_size)]
+    table = points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2]
+    raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < height * voxel_size), :2]
     if len(table):
-        low, high = np.percentile(table[:, :2], (1, 99), axis=0)
-        raised = raised[((raised[:, :2] > low + _BORDER) & (raised[:, :2] < high - _BORDER)).all(axis=1)]
+        low, high = np.percentile(table, (1, 99), axis=0)
+        raised = raised[((raised > low + _BORDER) & (raised < high - _BORDER)).all(axis=1)]
+    elif len(raised):
+        low, high = np.percentile(raised, (2, 98), axis=0)
     chosen = raised if len(raised) >= 200 else table
     if len(chosen) == 0:
         raise InputError(
@@ -212,6 +217,8 @@ def workspace(frame: Frame) -> VoxelGrid:
             "check the pose (z is up, the table is at z = 0) and the depth scale",
             "or give the grid: VoxelGrid(origin, voxel_size, shape)",
         )
-    low, high = np.percentile(chosen[:, :2], (2, 98), axis=0)
-    corner = np.round((low + high) / 2 / voxel_size) * voxel_size - np.array(shape[:2]) * voxel_size / 2
-    return VoxelGrid(np.append(corner, 0.0), voxel_size, shape)
+    side = np.clip(np.ceil((high - low + 2 * _MARGIN) * 10) / 10, _LEAST_SIDE, _LARGEST_SIDE)
+    reach = np.sort([low - _MARGIN + side / 2, high + _MARGIN - side / 2], axis=0)  # of the centre
+    centre = np.clip(np.percentile(chosen, (2, 98), axis=0).mean(axis=0), *reach)
+    origin = np.round((centre - side / 2) / voxel_size) * voxel_size
+    return VoxelGrid(np.append(origin, 0.0), voxel_size, (*np.round(side / voxel_size).astype(int).tolist(), height))

@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from scipy import ndimage
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import spsolve
 
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
@@ -38,6 +40,8 @@ _TABLE_NEAR = 0.1  # share of table in these surroundings
 _COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the table; 1 % of its pixels are above
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
 _ON_TABLE = 0.4  # share of table around a region without readings
+_ENCLOSED, _FEW_AROUND = 0.55, 0.1  # share of the readings around a region that enclose it; least share of readings
+_SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare, standard deviations above the table
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
@@ -110,7 +114,7 @@ def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
 
 def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
     measured, table, missing = _regions_of_readings(frame, grid), _on_table(frame), _without_readings(frame)
-    pixels = _joined(measured, _silent(frame, table, missing), table, missing)
+    pixels = _joined(measured, _silent(frame, measured, table, missing), table, missing)
     depth = _with_estimates(frame, pixels)
     if depth is None:
         return Foreground(read_only(pixels), frame)
@@ -169,18 +173,53 @@ def _shadows(frame: Frame) -> np.ndarray:
     return shadow
 
 
-def _silent(frame: Frame, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """The missing pixels (H, W) bool with another colour than the table (H, W) bool around them."""
-    width = frame.camera.width
+def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """The missing pixels (H, W) bool that belong to objects by their colour or by their outline.
+
+    The colour of the table is that of the table around a pixel. Where there is none, it is that of the whole table, and
+    the pixels belong to an object if its readings (H, W) bool `measured` enclose them. A solid gap in the table that
+    is no glare belongs to an object of any colour, for example to a glass.
+    """
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
-    lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, width)))
-    share = _surroundings(table.astype(np.float32), width)
+    lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
+    near, brightness, distance = _compared_with_table(lab, table)
+    searched = missing & _measured_part(frame)
+    other = _opened(searched & (distance > _COLOUR_DISTANCE), 1)
+    enclosed = _enclosed(other & ~near, measured, frame.valid)
+    gaps = _opened(searched & (brightness < _GLARE), scaled_length(_SOLID, frame.camera.width))
+    return (other & near) | enclosed | _enclosed(gaps, table, frame.valid)
+
+
+def _compared_with_table(lab: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether table is near (H, W) bool, and how the colour of each pixel (H, W, 3) differs from that of the table.
+
+    The difference is that of brightness in standard deviations, and the squared Mahalanobis distance, both (H, W).
+    """
+    share = _surroundings(table.astype(np.float32), table.shape[1])
+    near = share > _TABLE_NEAR
     n = np.maximum(share, 1e-6)[..., None]
-    mean = _surroundings(lab * table[..., None], width) / n
-    variance = np.maximum(_surroundings(lab**2 * table[..., None], width) / n - mean**2, 0) + _COLOUR_NOISE
-    other = (((lab - mean) ** 2 / variance).sum(axis=-1) > _COLOUR_DISTANCE) & (share > _TABLE_NEAR)
-    silent = (missing & other & _measured_part(frame)).astype(np.uint8)
-    return cv2.morphologyEx(silent, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    mean = _surroundings(lab * table[..., None], table.shape[1]) / n
+    variance = np.maximum(_surroundings(lab**2 * table[..., None], table.shape[1]) / n - mean**2, 0) + _COLOUR_NOISE
+    if table.any():
+        mean[~near], variance[~near] = lab[table].mean(axis=0), lab[table].var(axis=0) + _COLOUR_NOISE
+    deviation = (lab - mean) / np.sqrt(variance)
+    return near, deviation[..., 0], (deviation**2).sum(axis=-1)
+
+
+def _opened(pixels: np.ndarray, radius: float) -> np.ndarray:
+    return cv2.morphologyEx(pixels.astype(np.uint8), cv2.MORPH_OPEN, _ellipse(radius)) > 0
+
+
+def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The regions of pixels (H, W) bool of which most readings around them are readings `by` (H, W) bool."""
+    regions, n = ndimage.label(pixels)
+    kept = np.zeros(n + 1, bool)
+    for k, box in enumerate(ndimage.find_objects(regions), start=1):
+        ring, around = _ring(regions, k, box)
+        read = ring & valid[around]
+        kept[k] = read.sum() > _FEW_AROUND * ring.sum() and by[around][read].mean() >= _ENCLOSED
+    kept[0] = False
+    return np.asarray(kept[regions])
 
 
 def _measured_part(frame: Frame) -> np.ndarray:
@@ -221,16 +260,26 @@ def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing
 def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: np.ndarray) -> bool:
     """Whether region `k` of an image (H, W), which has no readings, is large enough and surrounded by the table."""
     height, width = regions.shape
-    reach = max(1, round(scaled_length(4, width)))
     rows, columns = box
     if (regions[box] == k).sum() < scaled_area(_SMALLEST_DARK, regions.size):
         return False
+    reach = _reach(width)
     if min(rows.start, columns.start, height - rows.stop, width - columns.stop) < reach:
         return False  # the sensor has no readings at the rim of the image
-    around = (slice(rows.start - reach, rows.stop + reach), slice(columns.start - reach, columns.stop + reach))
-    inside = regions[around] == k
-    ring = (cv2.dilate(inside.astype(np.uint8), _ellipse(reach)) > 0) & ~inside
+    ring, around = _ring(regions, k, box)
     return bool(table[around][ring].mean() >= _ON_TABLE)
+
+
+def _ring(regions: np.ndarray, k: int, box: tuple[slice, slice]) -> tuple[np.ndarray, tuple[slice, slice]]:
+    """The pixels (h, w) bool around region `k` of an image, and the part of the image that they lie in."""
+    reach = _reach(regions.shape[1])
+    rows, columns = (slice(max(0, side.start - reach), side.stop + reach) for side in box)
+    inside = regions[rows, columns] == k
+    return (cv2.dilate(inside.astype(np.uint8), _ellipse(reach)) > 0) & ~inside, (rows, columns)
+
+
+def _reach(width: int) -> int:
+    return max(1, round(scaled_length(4, width)))
 
 
 def _ellipse(radius: float) -> np.ndarray:
@@ -241,8 +290,9 @@ def _ellipse(radius: float) -> np.ndarray:
 def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
     """Depth (H, W) with estimates at pixels of objects without a reading; None if all of them have one.
 
-    An estimate is the nearest reading of the object in the image, but not behind the table. An object with fewer than
-    ten readings gets one depth: that of the nearest part of the table that its pixels hide.
+    The inverse of depth is interpolated between the readings of the object: it is a harmonic function, so that it is
+    exact on a plane. No estimate is behind the table. An object with fewer than ten readings gets one depth: that of
+    the nearest part of the table that its pixels hide.
     """
     if not (pixels & ~frame.valid).any():
         return None
@@ -257,6 +307,36 @@ def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
         inside = regions[box] == k
         known, missing = inside & frame.valid[box], inside & ~frame.valid[box]
         if missing.any():
-            found = fill_from_nearest(depth[box], ~known) if known.sum() >= _FEW else table[box][inside].min()
-            depth[box][missing] = np.minimum(found, table[box] - _STANDS)[missing]
+            found = _interpolated(depth[box], known, missing) if known.sum() >= _FEW else table[box][inside].min()
+            depth[box][missing] = np.minimum(found, table[box][missing] - _STANDS)
     return depth
+
+
+def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Depth (n,) at missing pixels whose inverse is the mean of its neighbours (Laplace's equation).
+
+    `known` and `missing` (H, W) bool are the pixels of one connected region. Its outline has no other condition.
+    """
+    number = np.full(depth.shape, -1)
+    number[missing] = np.arange(np.count_nonzero(missing))
+    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float64)
+    used = known | missing
+    pairs = [
+        (np.argwhere(missing & _moved(used, step)), step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0))
+    ]
+    here = np.concatenate([at for at, _ in pairs])
+    there = np.concatenate([at + step for at, step in pairs])
+    own, other = number[tuple(here.T)], number[tuple(there.T)]
+    n = int(number.max()) + 1
+    inner = other >= 0
+    neighbours = coo_array((np.ones(inner.sum()), (own[inner], other[inner])), shape=(n, n))
+    given = np.bincount(own, weights=inverse[tuple(there.T)], minlength=n)
+    laplacian = (diags_array(np.bincount(own, minlength=n).astype(float)) - neighbours).tocsc()
+    return np.asarray(1 / spsolve(laplacian, given))
+
+
+def _moved(pixels: np.ndarray, step: tuple[int, int]) -> np.ndarray:
+    """Whether the neighbour of each pixel at a step (rows, columns) is one of the pixels (H, W) bool."""
+    rows, columns = step
+    padded = np.pad(pixels, 1)
+    return np.asarray(padded[1 + rows : 1 + rows + len(pixels), 1 + columns : 1 + columns + pixels.shape[1]])
