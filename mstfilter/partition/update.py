@@ -8,8 +8,10 @@ voxels, which are crossed. In this update, both are partitions of the depth read
 an object are estimated again from everything that was observed of it.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
-   observe as free. Q_j^lambda is used as the probability that prediction j *holds*, which means that it shows the
-   present scene.
+   observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j that the frame
+   shows at its place. A_j^lambda is used as the probability that prediction j *holds*, which means that it shows the
+   present scene. A predicted object is *refuted* and leaves the prediction if less than `least_agreement` of its
+   visible surface is at its place.
 2. **Partitions.** A sample groups the readings by its segments. A prediction groups the readings by the objects that
    lie at the readings. All samples and predictions together give the odds that two readings belong to one object.
    Partitions of the image are drawn by these odds (`mstfilter.partition.cells`). A drawn partition can agree with
@@ -21,7 +23,7 @@ an object are estimated again from everything that was observed of it.
    is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the partition
    determines the merges.
 4. **Occluded objects.** A predicted object without conflict has no readings or very few. It stays in a candidate with
-   probability (Q_j q)^lambda, where q is the share of its own voxels that the frame does not observe as free. Q_j
+   probability (A_j q)^lambda, where q is the share of its own voxels that the frame does not observe as free. A_j
    says whether the prediction can be trusted at all, and q whether this object is still there.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). A
    visible object is completed from its readings in this frame and from the views of the objects that it continues. An
@@ -51,6 +53,7 @@ from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
 from mstfilter.scene import (
     Clip,
     Evidence,
+    Frame,
     FreeSpace,
     Hypothesis,
     ObjectRecord,
@@ -59,6 +62,7 @@ from mstfilter.scene import (
     check_grids,
     foreground,
     log_quality,
+    surface_agreement,
 )
 from mstfilter.smc import Population, Systematic, Update, child
 
@@ -70,8 +74,9 @@ class Prediction:
     hypothesis: Hypothesis
     refined: Hypothesis  #: without the voxels that the frame observes as free
     weight: float  #: w_j, normalised
-    holds: float  #: probability that it holds, Q^lambda
-    objects: np.ndarray  #: (m,) its object at each reading, 0 is none
+    holds: float  #: probability that it holds, A^lambda
+    objects: np.ndarray  #: (m,) its object at each reading, 0 is none or a refuted object
+    refuted: frozenset[int]  #: labels of the objects that the frame does not show at their places
 
     def shares_left(self) -> dict[int, float]:
         """The share q of each object's voxels that the frame does not observe as free, by label."""
@@ -115,7 +120,7 @@ class PartitionUpdate(Update):
         Terms whose sum is the log weight of a candidate. Without terms, all candidates have equal weights, since they
         are drawn from the distribution that they approximate.
     quality_exponent : float
-        lambda. With 0, every prediction holds, and every occluded object is kept.
+        lambda, the exponent of Q, A and q. With 0, every prediction holds, and every occluded object is kept.
     n_candidates : int
         Number of candidates after the first pause. 0 means one for each predicted hypothesis, or four with evidence.
     reach : float
@@ -126,6 +131,9 @@ class PartitionUpdate(Update):
         Smallest probability of an occupied voxel.
     mend : bool
         Whether missing readings of objects are estimated, as in `ObjectRule`.
+    least_agreement : float
+        Least share of the visible surface of a predicted object that the frame shows at its place. With 0, no object
+        is refuted.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -139,6 +147,7 @@ class PartitionUpdate(Update):
     n_views: NonNegativeInt = 4
     threshold: Share = 0.5
     mend: bool = True
+    least_agreement: Share = 0.7
 
     properly_weighted: ClassVar[bool] = False
 
@@ -158,7 +167,7 @@ class PartitionUpdate(Update):
         projected = self._project(predicted, observation)
         if proposed is None:
             return projected
-        predictions = self._predictions(predicted, projected, readings)
+        predictions = self._predictions(predicted, projected, readings, observation.after)
         n = self.n_candidates or (4 if self.evidence else 1) * len(predicted)
         drawn = Systematic().select(child(rng, "predicted"), projected.log_weights, n)[0]
         partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, clip, n)
@@ -182,14 +191,22 @@ class PartitionUpdate(Update):
         log_weights = predicted.log_weights + self.quality_exponent * log_quality(quality)
         return Population(refined, log_weights, predicted.parents, {"quality": quality.tolist()})
 
-    def _predictions(self, predicted: Population, projected: Population, readings: Readings) -> list[Prediction]:
+    def _predictions(
+        self, predicted: Population, projected: Population, readings: Readings, frame: Frame
+    ) -> list[Prediction]:
         """The evidence about each prediction in the last frame."""
-        holds = np.exp(self.quality_exponent * log_quality(np.array(projected.notes["quality"])))
-        columns = predicted.particles, projected.particles, predicted.weights.tolist(), holds.tolist()
-        return [
-            Prediction(hypothesis, refined, weight, p, readings.labels(hypothesis.labels, self.reach))
-            for hypothesis, refined, weight, p in zip(*columns, strict=True)
-        ]
+        columns = predicted.particles, projected.particles, predicted.weights.tolist()
+        return [self._prediction(*one, readings, frame) for one in zip(*columns, strict=True)]
+
+    def _prediction(
+        self, hypothesis: Hypothesis, refined: Hypothesis, weight: float, readings: Readings, frame: Frame
+    ) -> Prediction:
+        of_objects, of_scene = surface_agreement(hypothesis, frame)
+        refuted = np.flatnonzero(of_objects < self.least_agreement)  # NaN, unknown, is not refuted
+        objects = readings.labels(hypothesis.labels, self.reach)
+        objects[np.isin(objects, refuted)] = 0
+        holds = of_scene**self.quality_exponent
+        return Prediction(hypothesis, refined, weight, holds, objects, frozenset(refuted.tolist()))
 
     # 2. Partitions of the image ---------------------------------------------------------------------------------
 
@@ -229,7 +246,7 @@ class PartitionUpdate(Update):
         return [
             SceneObject(no_readings, (record,), prediction.remaining(record, self.threshold))
             for record in prediction.hypothesis.objects
-            if record.label not in overlaps.visible
+            if record.label not in overlaps.visible | prediction.refuted
             and rng.random() < prediction.holds * q[record.label] ** self.quality_exponent
         ]
 

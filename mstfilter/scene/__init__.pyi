@@ -23,6 +23,7 @@ from mstfilter.scene.evidence import (
     NoFreeSpace as NoFreeSpace,
     Projection as Projection,
     log_quality as log_quality,
+    surface_agreement as surface_agreement,
 )
 from mstfilter.scene.frame import (
     Clip as Clip,

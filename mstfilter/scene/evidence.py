@@ -18,14 +18,18 @@ from numbers import Real
 from typing import Annotated, Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from mstfilter.errors import InputError
 from mstfilter.fields import Bounds, NonNegativeFloat
 from mstfilter.results import Checked, check_array, check_list, check_pair, check_type, describe_value, returns
 from mstfilter.scene.arrays import component_key, read_only
 from mstfilter.scene.cache import memo
+from mstfilter.scene.camera import scaled_area
 from mstfilter.scene.frame import Clip, Frame, depth_sigma
 from mstfilter.scene.geometry import frame_geometry
+from mstfilter.scene.rendering import Rendering, render_hypothesis
+from mstfilter.scene.support import foreground
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _SMALLEST_QUALITY = 1e-3
@@ -132,6 +136,52 @@ class FreeSpace(Projection):
 def log_quality(quality: np.ndarray) -> np.ndarray:
     """log max(Q, 1e-3) (n,) of qualities Q (n,). The bound keeps all weights positive."""
     return np.log(np.maximum(quality, _SMALLEST_QUALITY))
+
+
+_LEAST_PIXELS = 30  # in an image of 640 x 480 pixels: an object with fewer of them is not tested
+
+
+def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray, float]:
+    """Share of the visible surface of each object that a frame shows at its place, and that of all objects together.
+
+    The test uses the pixels that would show an object, without the outline, where a voxel can cover more than the
+    object. A pixel with a reading in front of the surface is not used, since another object may stand there. At the
+    others, the surface is at its place if the pixel belongs to an object (`foreground`) and its reading is at most a
+    voxel and three standard deviations of the sensor behind the surface. A pixel without a reading that belongs to no
+    object counts half.
+
+    Returns
+    -------
+    of_objects : (k,) ndarray
+        Share of each label. NaN for label 0 and for objects with too few of these pixels.
+    of_scene : float
+        Share of all objects together. 1 if no pixel can be used.
+    """
+    rendered, found = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid)
+    would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])
+    if frame.robot_mask is not None:
+        would_show &= ~frame.robot_mask
+    labels, depth = rendered.labels[would_show], rendered.depth[would_show]
+    tolerance = hypothesis.grid.voxel_size + 3 * depth_sigma(depth)
+    with np.errstate(invalid="ignore"):
+        behind = found.frame.depth[would_show] - depth
+        at_its_place = found.pixels[would_show] & (behind <= tolerance)
+        used = ~(behind < -tolerance)
+    agrees = np.where(np.isnan(behind), 0.5, at_its_place)[used]
+    n = int(hypothesis.labels.max(initial=0)) + 1
+    total, pixels = np.bincount(labels[used], agrees, n), np.bincount(labels[used], minlength=n)
+    enough = pixels >= max(1.0, scaled_area(_LEAST_PIXELS, frame.depth.size))
+    of_objects = np.divide(total, pixels, out=np.full(n, np.nan), where=enough)
+    return of_objects, float(agrees.mean()) if len(agrees) else 1.0
+
+
+def _interior(rendered: Rendering, size: float) -> np.ndarray:
+    """Pixels (H, W) bool half a voxel away from the outline of their object; a voxel has `size` / depth pixels."""
+    shown = rendered.labels > 0
+    if not shown.any():
+        return shown
+    width = 2 * max(1, round(size / 2 / float(np.median(rendered.depth[shown])))) + 1
+    return shown & (minimum_filter(rendered.labels, width) == maximum_filter(rendered.labels, width))
 
 
 class Evidence(Checked, ABC):
