@@ -106,7 +106,7 @@ def test_quality(tmp_path, capsys):
     code, out, err = call("quality", tmp_path / "run", recording, "--csv", tmp_path / "q.csv", capsys=capsys)
     assert code == 0, err
     out, belief = out.split("\n\n")
-    scores = ["log_loss", "base_rate", "brier", "calibration_error", "energy"]
+    scores = ["log_loss", "base_rate", "brier", "calibration_error"]
     lines, columns = out.splitlines(), ["mean", "weighted", "best", "top", "estimate", "one_blob", "components"]
     assert lines[0].split() == ["pause", "form", "n", *columns]
     assert len(lines) == 1 + 3 * 3 + 3

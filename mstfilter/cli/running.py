@@ -225,7 +225,7 @@ def quality(
         print(f"{'all':<7}{form:<9}{'':>4}" + _numbers([row for row in rows if row.form == form], names, 12))
     if rows[0].brier == rows[0].brier:
         print("\nthe weighted set, asked whether two voxels belong to one object (lower is better)")
-        scores = ("log_loss", "base_rate", "brier", "calibration_error", "energy")
+        scores = ("log_loss", "base_rate", "brier", "calibration_error")
         these = [row for row in rows if row.form == forms[0]]
         print(f"{'pause':<7}" + "".join(f"{name:>19}" for name in scores))
         for row in these:

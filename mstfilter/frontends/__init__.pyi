@@ -1,6 +1,5 @@
 from mstfilter.frontends.completions import ExternalCompletion as ExternalCompletion, read_shapes as read_shapes
 from mstfilter.frontends.mask_files import (
-    MaskRegion as MaskRegion,
     PauseMasks as PauseMasks,
     read_masks as read_masks,
     write_masks as write_masks,

@@ -39,8 +39,6 @@ _TABLES = {
         ("log_loss", "as it comes"),
         ("calibration_error", "calibration error"),
         ("brier", "Brier"),
-        ("energy", "energy score"),
-        ("energy_floor", "baseline: energy with noise"),
         ("diversity", "diversity"),
     ),
     "Objects and volume": (

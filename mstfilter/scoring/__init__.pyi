@@ -3,7 +3,6 @@ from mstfilter.scoring.log_loss import (
     NO_COUNTS as NO_COUNTS,
     BeliefScore as BeliefScore,
     FittedForecasts as FittedForecasts,
-    answer_distances as answer_distances,
     forecast_table as forecast_table,
     leave_one_out as leave_one_out,
     score_belief as score_belief,

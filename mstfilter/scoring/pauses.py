@@ -8,8 +8,8 @@ the hypotheses, the weighted mean, the maximum, and the values of two hypotheses
 least expected loss. The row also has two floors: the occupied voxels of the same hypotheses as one blob, and as
 connected components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in
 the image. Pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the
-weighted set: Brier score, log loss, log loss of the base rate, calibration error and energy score (`score_belief`),
-which are the same for all forms.
+weighted set: Brier score, log loss, log loss of the base rate and calibration error (`score_belief`), which are the
+same for all forms.
 
 `measure_pause` computes all metrics of a pause, for the tables of a study.
 """
@@ -105,7 +105,6 @@ class PauseScore:
     brier: float = float("nan")
     log_loss: float = float("nan")
     calibration_error: float = float("nan")
-    energy: float = float("nan")
     base_rate: float = float("nan")
 
 
@@ -179,7 +178,7 @@ def measure_pause(
     -------
     row : dict
         Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
-        ``qualities`` and ``energy_noise`` are lists, which tables leave out.
+        ``qualities`` is a list, which tables leave out.
     counts : (r, 1001, 2) int32, or None without ground truth
         As in `BeliefScore`.
     """
@@ -226,8 +225,7 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
     belief = {}
     if truth.questions is not None:
         scores = score_belief(truth.questions, estimate.hypotheses, w, true)
-        belief = {name: scores.row[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
-        belief["base_rate"] = scores.base_rate_loss
+        belief = {**scores.row, "base_rate": scores.base_rate_loss}
     best_guess, where = least_loss(found, w), "volume" if truth.camera is None else "image"
     rows = []
     for form in FORMS:
