@@ -218,7 +218,6 @@ KINDS = {
     "checkpoint": Kind(_write_checkpoint, _read_checkpoint),
     "cache": Kind(_write_cache, _read_cache),
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
-    "bop": Kind(_layout("bop"), _reader("bop")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),
     "bag": Kind(_bag("bag"), _read_bag),
     "mcap": Kind(_bag("mcap"), _read_bag),

@@ -21,9 +21,9 @@ import pytest
 
 from mstfilter.cli import main
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.reading import read_arrays
 from mstfilter.report import write_report
 from mstfilter.scene import DiskCache, read_rgb
-from mstfilter.scoring import read_truth
 from mstfilter.simulation import cached_recording
 from mstfilter.smc import run_many
 from mstfilter.trained import open_model, write_model
@@ -113,7 +113,7 @@ def test_an_array_is_not_unpacked_if_it_is_too_large(tmp_path, monkeypatch, shap
     monkeypatch.setattr("mstfilter.reading.MAX_FILE", 2**20)
     (tmp_path / "a.npz").write_bytes(hostile.bomb(shape, gigabytes=gigabytes))
     with limits(megabytes=200), pytest.raises(InputError, match="does not fit|at most 1048576 are read"):
-        read_truth(tmp_path / "a.npz")
+        read_arrays(tmp_path / "a.npz", "volumes")
 
 
 @pytest.mark.parametrize("name", ["pipe", "/dev/zero", "loop", "folder"])
@@ -297,14 +297,3 @@ def test_a_cached_recording_that_was_edited_is_simulated_again(tmp_path):
     with pytest.warns(InputWarning, match=r"depth/000000\.png has changed"):
         assert cached_recording("s1", 0, tmp_path, **small) == folder
     assert depth.read_bytes() == before
-
-
-def test_a_scheduler_on_another_host_needs_tls():
-    pytest.importorskip("distributed")
-    from mstfilter.study import Cluster
-
-    for address, warned in (("tcp://head:8786", True), ("tls://head:8786", False), ("tcp://127.0.0.1:1", False)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            Cluster(address)._warn_without_tls()
-        assert [("TLS" in str(w.message)) for w in caught] == [True] * warned

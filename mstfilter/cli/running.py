@@ -198,8 +198,8 @@ def convert(
 
 @app.command()
 def quality(
-    run: Annotated[Path, typer.Argument(help="Run folder, or label volumes (.npz or .npy).")],
-    truth: Annotated[Path, typer.Argument(help="Recording with ground truth, or its voxels.npz.")],
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    truth: Annotated[Path, typer.Argument(help="Recording with ground truth.")],
     csv: Annotated[Path | None, typer.Option(help="Also write the table into this file.")] = None,
     format: FormatOption = "",
     option: Options = None,
@@ -208,12 +208,10 @@ def quality(
     if csv is not None:
         check_output(csv)
     from mstfilter.runs import RunFolder
-    from mstfilter.scoring import read_estimates, read_truth, score_pauses
+    from mstfilter.scoring import read_truth, score_pauses
 
-    volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
-    known = truth if volumes else read_source(truth, format, option, "")
-    estimates = RunFolder.open(run).estimates() if run.is_dir() else read_estimates(run)
-    rows = score_pauses(estimates, read_truth(known))
+    known = read_truth(read_source(truth, format, option, ""))
+    rows = score_pauses(RunFolder.open(run).estimates(), known)
     if csv is not None:
         write_csv(csv, [asdict(row) for row in rows], float_format=".6f")
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")

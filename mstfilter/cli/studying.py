@@ -22,9 +22,6 @@ def study(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,
-    scheduler: Annotated[
-        str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT. Default: processes of this machine.")
-    ] = "",
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the small form that the table `smoke` of the file describes.")
     ] = False,
@@ -34,17 +31,12 @@ def study(
 
     wanted = load_study(config, smoke=smoke)
     check_arm_names(wanted, overrides or ())  # before any large library is imported
-    from mstfilter.study import Executor, Local, run_study
+    from mstfilter.study import Local, run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
     check_output(folder, folder=True, empty=False)
-    executor: Executor = Local(workers, folder / "logs")
-    if scheduler:
-        from mstfilter.study import Cluster
-
-        executor = Cluster(scheduler)
     with study_bars() as progress:
-        result = run_study(wanted, folder, executor, overrides or (), progress=progress)
+        result = run_study(wanted, folder, Local(workers, folder / "logs"), overrides or (), progress=progress)
     print(f"study       {folder}")
     print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
     _print_summary(result.folder.summary())

@@ -8,7 +8,6 @@ from mstfilter.frontends.mask_proposal import (
     MaskProposal as MaskProposal,
     write_automatic_masks as write_automatic_masks,
 )
-from mstfilter.frontends.mask_trackers import Sam2Tracker as Sam2Tracker
 from mstfilter.frontends.mask_trees import (
     mask_tree as mask_tree,
     nested_masks as nested_masks,

@@ -18,7 +18,6 @@ from mstfilter.scoring.pauses import (
     PauseScore as PauseScore,
     PauseTruth as PauseTruth,
     measure_pause as measure_pause,
-    read_estimates as read_estimates,
     read_truth as read_truth,
     score_pauses as score_pauses,
 )

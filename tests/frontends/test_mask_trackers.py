@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.frontends import Sam2Tracker
 from mstfilter.registry import load_file
 from mstfilter.resources import models_folder
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, read_rgb, render
@@ -24,10 +23,12 @@ from tests.segmentation.scenes import GRID
 torch = pytest.importorskip("torch")
 functional = pytest.importorskip("torch.nn.functional")
 
-siammask, network_file = (
-    load_file(models_folder() / "published" / name) for name in ("siammask.py", "siammask_network.py")
+siammask, network_file, sam2 = (
+    load_file(models_folder() / "published" / f"{name}.py")
+    for name in ("siammask", "siammask_network", "sam2_tracker")
 )
 SiamMaskTracker, SiamMaskNetwork = siammask.SiamMaskTracker, network_file.SiamMaskNetwork
+Sam2Tracker = sam2.Sam2Tracker
 
 
 def branches() -> dict[str, tuple[int, ...]]:
