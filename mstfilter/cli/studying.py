@@ -56,33 +56,15 @@ def _print_summary(summary: Any) -> None:
 
     from mstfilter.study import ENDPOINTS, title_of
 
-    if not summary.metrics or "quality" not in summary.names:
-        return
-    endpoints = [name for name in ENDPOINTS if name in summary.names]
-    columns = [
-        text
-        for name in endpoints
-        for text in (f"{title_of(name)}, t >= 1", "95 %", f"arm - {summary.reference}", "95 %")
-    ]
-    table = Table("family", "arm", "n", *columns, "s a step")
+    table = Table("metric, t >= 1", "family", "arm", "n", "mean", "95 %", f"arm - {summary.reference}", "95 %")
     compared = {(one.metric, one.family, one.arm): one.difference for one in summary.differences}
-    for family in summary.families:
-        for arm in summary.arms:
-            main, seconds = summary.metric(family, arm), summary.metric(family, arm, "core_seconds")
-            if main is None:
-                continue
-            cells = []
-            for name in endpoints:
-                metric, d = summary.metric(family, arm, name), compared.get((name, family, arm))
-                cells += ["", ""] if metric is None else [f"{metric.mean:.3f}", _range(*metric.interval)]
-                cells += (
-                    ["", ""]
-                    if d is None
-                    else ["–" if d.mean != d.mean else f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
-                )
-            spent = "" if seconds is None else f"{seconds.mean:.2f}"
-            table.add_row(family, arm, str(len(main.by_scene)), *cells, spent)
-    Console(width=None if sys.stdout.isatty() else 180).print(table)
+    for one in (one for name in ENDPOINTS for one in summary.metrics if one.name == name):
+        d = compared.get((one.name, one.family, one.arm))
+        cells = ["", ""] if d is None else [f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
+        numbers = str(len(one.by_scene)), f"{one.mean:.3f}", _range(*one.interval)
+        table.add_row(title_of(one.name), one.family, one.arm, *numbers, *cells)
+    if table.row_count:
+        Console(width=None if sys.stdout.isatty() else 180).print(table)
 
 
 def _range(low: float, high: float, sign: str = "") -> str:
