@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +13,7 @@ from mstfilter.cli import main
 from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder
 from tests.conftest import REPOSITORY
-from tests.runs.test_run import content
 from tests.scene.test_recording import FAULTS, write
-from tests.study.test_failures import BROKEN, wait_for
 
 HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")
 
@@ -160,10 +157,6 @@ def test_an_interrupted_command_says_what_it_keeps(command, message, tmp_path, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_of_study_names_the_table(capsys):
-    assert "table `smoke`" in " ".join(call("study", "--help", capsys=capsys)[1].replace("│", " ").split())
-
-
 def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     arguments = ("run", recording, "n=1", "n_proposed=1", "--compare", "--no-report", "--out", tmp_path / "run")
     code, _, _ = call(*arguments, capsys=capsys)
@@ -174,25 +167,6 @@ def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     completers = [run.description["config"]["proposal"]["completer"]["component"] for run in compared.values()]
     assert completers == ["network", "network"]  # that of the update of `mst`, whose samples are surfaces
     assert all(run.description["config"]["transition"]["component"] == "identity" for run in compared.values())
-
-
-def test_one_hypothesis_is_singular(recording, tmp_path, capsys):
-    arguments = ("run", recording, "--preset", "floor_one_blob", "n=1", "n_proposed=1", "--no-report")
-    assert "1 hypothesis of 1 object," in call(*arguments, "--out", tmp_path / "run", capsys=capsys)[1]
-
-
-def test_unknown_commands_are_usage_errors(capsys):
-    code, _, err = call("florp", capsys=capsys)
-    assert code == 2
-    assert "florp" in err
-
-
-def test_shells_complete_commands():
-    """What the function of bash calls, which `--install-completion` installs."""
-    question = {"_MSTFILTER_COMPLETE": "complete_bash", "COMP_WORDS": "mstfilter si", "COMP_CWORD": "1"}
-    command = [sys.executable, "-m", "mstfilter"]
-    done = subprocess.run(command, env={**os.environ, **question}, capture_output=True, text=True, timeout=600)
-    assert done.stdout.split() == ["simulate"]
 
 
 def test_list_shows_components_and_fields(capsys):
@@ -252,26 +226,6 @@ def test_what_the_presets_need(preset, blocked, two_pauses, tmp_path):
         return
     assert done.returncode == 0, done.stderr
     assert preset == "mst" or "<html" in (tmp_path / "run" / "report.html").read_text()
-
-
-def test_a_run_that_was_killed_is_resumed(recording, tmp_path, capsys):
-    """The process is killed in its second step; the same command ends with the bytes of an undisturbed run."""
-    marker = tmp_path / "marker"
-    hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
-    arguments = ["run", recording, "n=3", *hangs, "--no-report"]
-    command = [sys.executable, "-m", "mstfilter", *arguments]
-    part = tmp_path / "part"
-    process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    wait_for(marker, process)
-    process.kill()
-    process.wait()
-    assert RunFolder.open(part).n_pauses == 1
-    assert not (part / "metrics.csv").exists()
-    subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=600)
-    assert call(*arguments, "--out", tmp_path / "whole", capsys=capsys)[0] == 0
-    whole, resumed = content(tmp_path / "whole"), content(part)
-    assert whole.keys() == resumed.keys()
-    assert [k for k in whole if whole[k] != resumed[k]] == []
 
 
 USER_FILE = """

@@ -124,7 +124,6 @@ def report(
     run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
     export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
-    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply or obj.")] = "ply",
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
@@ -142,7 +141,7 @@ def report(
 
     print(f"report      {write_report(run, out)}")
     if export is not None:
-        export_run(run, export, mesh_format)
+        export_run(run, export)
         print(f"hypotheses  {export}")
 
 

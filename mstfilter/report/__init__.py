@@ -2,7 +2,7 @@
 
 >>> from mstfilter.report import export_run, write_report, write_study_report
 >>> write_report("runs/demo")                                        # doctest: +SKIP
->>> export_run("runs/demo", "out", "obj")                            # doctest: +SKIP
+>>> export_run("runs/demo", "out")                                   # doctest: +SKIP
 >>> write_study_report("studies/first")                              # doctest: +SKIP
 
 `overlay` and `voxel_picture` draw a hypothesis. `assign_identities` gives an object the same colour in all pictures

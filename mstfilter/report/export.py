@@ -1,7 +1,6 @@
 """Export of hypotheses for other programs: meshes, label images and a table of objects. open3d writes the meshes.
 
 >>> export_run("runs/demo", "out")                         # PLY meshes
->>> export_run("runs/demo", "out", mesh_format="obj")
 >>> export_mesh(hypothesis, "scene.obj")                   # one hypothesis
 
 Layout of an exported run::
@@ -23,15 +22,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice
+from mstfilter.errors import InputError
 from mstfilter.files import atomic_path, write_csv, writing
 from mstfilter.open3d_import import import_open3d
 from mstfilter.report.identities import assign_identities
 from mstfilter.report.pictures import Colour, colour, hexadecimal
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Hypothesis, project, write_image
-
-MESH_FORMATS = ("ply", "obj")
 
 # Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
 _CORNERS = {
@@ -84,13 +81,11 @@ def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, 
     return path
 
 
-def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply") -> list[Path]:
+def export_run(run: RunFolder | str | Path, out: str | Path) -> list[Path]:
     """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, in the layout above.
 
-    Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
-    imported. `mesh_format` is "ply" or "obj".
+    Returns the files. Raises InputError if the folder cannot be written, or open3d cannot be imported.
     """
-    check_choice("mesh_format", mesh_format, MESH_FORMATS)
     import_open3d()  # a missing library is reported before anything is written
     run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     identities = assign_identities(run)
@@ -106,7 +101,7 @@ def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = 
             write_image(image, project(hypothesis, camera))
             paths.append(image)
             if hypothesis.objects:
-                paths.append(export_mesh(hypothesis, image.with_suffix(f".{mesh_format}"), colours))
+                paths.append(export_mesh(hypothesis, image.with_suffix(".ply"), colours))
             for record in hypothesis.objects:
                 rows.append(
                     {

@@ -60,12 +60,6 @@ def test_quality_over_time_is_a_complete_file(tmp_path):
     assert "the study has no arm 'mine'" in wrong
 
 
-def test_the_licence_of_the_r1_data_names_its_owner():
-    licence = (FOLDER / "results/LICENSE-R1").read_text()
-    assert "Copyright (c) 2020 The Autonomous Robotic Manipulation Lab" in licence
-    assert "Permission is hereby granted" in licence
-
-
 def test_figures_use_tuning_seeds():
     assert all(script(name).SEED < 100 for name in ("teaser", "sampled_cuts"))
 

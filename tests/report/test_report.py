@@ -95,16 +95,6 @@ def test_text_of_the_user_is_escaped(finished):
     assert "<b>odd & named</b>" in page.text
 
 
-def test_the_page_does_not_depend_on_the_place_of_the_folder(finished, tmp_path):
-    run, path = finished
-    moved = tmp_path / "elsewhere"
-    shutil.copytree(run.path, moved)
-    (moved / "report.html").unlink()
-    again = write_report(str(moved), tmp_path / "deep" / "page.html")
-    assert again.read_bytes() == path.read_bytes()
-    assert [p.name for p in again.parent.iterdir()] == ["page.html"]
-
-
 def test_only_times_differ_between_equal_runs(finished, tmp_path):
     _run, path = finished
     again = make_run(tmp_path / "again")
