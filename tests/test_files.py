@@ -106,15 +106,6 @@ def test_a_lock_is_released_and_leaves_no_files(tmp_path):
         pass
 
 
-def test_a_writer_in_the_same_process_is_another_writer(recording, tmp_path):
-    with RecordingWriter(tmp_path / "a", recording.frames[0].camera) as writer:
-        with pytest.raises(InputError, match="another process"):
-            save_recording(recording, tmp_path / "a")
-        writer.add_frame(recording.frames[0].rgb, recording.frames[0].depth, 0.0, "static")
-    assert len(open_recording(tmp_path / "a")) == 1
-    assert names(tmp_path) == ["a"]
-
-
 @pytest.mark.parametrize("existing", ["refuse", "keep", "replace"])
 def test_a_folder_that_was_made_meanwhile(tmp_path, existing):
     raised = pytest.raises(InputError, match="made meanwhile") if existing == "refuse" else nullcontext()

@@ -18,7 +18,6 @@ from miniature_filters import (
     rank_uniformity,
     state_statistics,
     state_weights,
-    total_variation,
 )
 from miniature_mst import (
     CutProposal,
@@ -69,26 +68,6 @@ def test_the_evidence_is_unbiased(name, world):
         ratio = np.exp([filter.run(observations, seed)[0].log_evidence - exact for seed in range(80)])
         assert ratio.std() < 0.5
         assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
-
-
-@pytest.mark.parametrize("name", PROPER)
-@ids
-def test_proper_filters_converge(name, world):
-    """The distance falls like 1 / sqrt(n) once n is large: 16 times the particles, a quarter of it (0.4 allowed).
-
-    The median over twelve data sets is compared: the mean depends on a few with weights that vary much.
-    """
-    sizes, distances = (1000, 16_000), []
-    for n in sizes:
-        tv = []
-        for seed in range(12):
-            _, observations = world.simulate(np.random.default_rng(seed), 3)
-            state, _ = PROPER[name](world, n).run(observations, seed)
-            exact = exact_filter(world, observations).posterior[-1]
-            tv.append(total_variation(state_weights(world, state.population), exact))
-        distances.append(np.median(tv))
-    assert distances[1] < 0.4 * distances[0]
-    assert distances[1] < 0.15
 
 
 def test_a_guided_move_is_an_importance_draw_of_the_motion_model():
