@@ -46,11 +46,9 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     assert "pause 1     3 hypotheses" in out
     assert RunFolder.open(run).description["seed"] == 4
     assert not (run / "report.html").exists()
-    code, out, err = call("report", run, "--out", tmp_path / "r.html", "--export", tmp_path / "x", capsys=capsys)
+    code, out, err = call("report", run, "--out", tmp_path / "r.html", capsys=capsys)
     assert code == 0, err
     assert "<html" in (tmp_path / "r.html").read_text()
-    assert list((tmp_path / "x").rglob("*.ply"))
-    assert list((tmp_path / "x").rglob("*.png"))
 
 
 PLACES = {
@@ -66,7 +64,6 @@ WRITERS = {
     "study": ("none.toml", "--out"),
     "train": ("border", "--out"),
     "report": ("none", "--out"),
-    "report, meshes": ("none", "--export"),
     "view": ("none", "--out"),
     "quality": ("none", "none", "--csv"),
 }

@@ -22,7 +22,6 @@ from mstfilter.cli.root import (
     read_source,
     safe_name,
 )
-from mstfilter.errors import InputError
 from mstfilter.files import atomic_folder, check_output, locked, write_csv
 from mstfilter.report.progress import progress_bar
 
@@ -123,26 +122,18 @@ def simulate_(
 def report(
     run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
-    export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
         check_output(out)
-    if export is not None:
-        check_output(export, folder=True, empty=False)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 
-        if export is not None:
-            raise InputError(f"{run} is a study, only runs can be exported", f"export one of {run / 'runs'}")
         print(f"report      {write_study_report(run, out)}")
         return
-    from mstfilter.report import export_run, write_report
+    from mstfilter.report import write_report
 
     print(f"report      {write_report(run, out)}")
-    if export is not None:
-        export_run(run, export)
-        print(f"hypotheses  {export}")
 
 
 @app.command()

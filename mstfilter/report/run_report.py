@@ -39,7 +39,7 @@ from mstfilter.scoring import (
 def write_report(
     run: RunFolder | str | Path, out: str | Path | None = None, numbers: RunNumbers | None = None
 ) -> Path:
-    """Write the report of a run, finished or not, as HTML. Default: By default, ``report.html`` in the run folder.
+    """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
 
     `numbers` are those of `read_numbers`, if they are already known. Returns the file. Raises InputError if the
     folder is not a run folder, or the file cannot be written.
