@@ -85,12 +85,12 @@ def test_commands_run(here, command, capsys):
         shutil.rmtree(here / words[2])
     if words[0] == "run":
         words += ["--no-report", "n=2"]
-    if words[0] in ("quality", "report"):
+    if words[0] == "quality":
         call("run", words[1].replace("run", "table"), "--out", words[1], "--no-report", "n=2", capsys=capsys)
     code, out, err = call(*words, capsys=capsys)
     assert code == 0, err
     assert words[0] != "convert" or re.search(r"pauses +\d+ of \d+ frames: ", out)
-    made = {"convert": f"{words[2]}/manifest.json", "view": words[-1], "report": "meshes"} if len(words) > 2 else {}
+    made = {"convert": f"{words[2]}/manifest.json", "view": words[-1]} if len(words) > 2 else {}
     assert (here / made.get(words[0], ".")).exists()
 
 
