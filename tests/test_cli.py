@@ -13,7 +13,7 @@ from mstfilter.cli import main
 from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder
 from tests.conftest import REPOSITORY
-from tests.scene.test_recording import FAULTS, write
+from tests.scene.test_recording import write
 
 HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")
 
@@ -81,16 +81,6 @@ def test_an_output_that_cannot_be_written_is_an_error_before_any_work(tmp_path, 
     assert (code, printed) == (2, "") and err.startswith("error: cannot write") and PLACES[place] in err, err
     assert "hint: choose another place" in err
     assert {path.name for path in tmp_path.iterdir()} == {"file", "study.toml"}
-
-
-@pytest.mark.parametrize("fault", ["truncated PNG", "not JSON"])
-def test_bad_recordings_are_one_clear_error(recording, tmp_path, capsys, fault):
-    """One line `error:`, exit code 2, no traceback, no half-written run folder."""
-    FAULTS[fault][0](recording)
-    code, out, err = call("run", recording, "--out", tmp_path / "run", capsys=capsys)
-    assert (code, out) == (2, "") and not (tmp_path / "run").exists()
-    lines = [line for line in err.splitlines() if line.strip()]
-    assert lines[0].startswith("error: ") and all(line.startswith("hint: ") for line in lines[1:]), err
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Which format it is, its options, and a reader of the user's own."""
+"""Which format it is, and its options."""
 
 from __future__ import annotations
 
@@ -84,33 +84,6 @@ def test_options_reach_the_reader(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             open_recording(path, options=wrong)
-
-
-def test_a_reader_of_ones_own(tmp_path):
-    """A layout of the user's own: one class in a file, named like any component."""
-    rgb, depth, _ = layouts.video((0, 2))
-    np.savez(tmp_path / "mine.npz", rgb=rgb, depth=depth.astype(np.float32))
-    (tmp_path / "mine.py").write_text(
-        "from dataclasses import dataclass\n"
-        "import numpy as np\n"
-        "from mstfilter.formats import RecordingFormat\n"
-        "from mstfilter.scene.recording import Recording\n"
-        "@dataclass(frozen=True)\n"
-        "class Mine(RecordingFormat):\n"
-        "    '''Arrays in one file.'''\n"
-        "    f: float = 1.0\n"
-        "    @classmethod\n"
-        "    def detects(cls, path):\n"
-        "        return path.suffix == '.npz'\n"
-        "    def open(self, path):\n"
-        "        data = np.load(path)\n"
-        "        K = np.array([[self.f, 0, 79.5], [0, self.f, 59.5], [0, 0, 1]])\n"
-        "        return Recording.from_arrays(data['rgb'], data['depth'], K, name='mine')\n"
-    )
-    recording = open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", ["f=131"])
-    assert (recording.name, len(recording)) == ("mine", 2)
-    with pytest.raises(InputError, match="which is not loaded here"):
-        open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)
 
 
 def test_label_images_beside_pairs_are_true_instances(tmp_path):
