@@ -156,16 +156,6 @@ def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     assert all(run.description["config"]["transition"]["component"] == "identity" for run in compared.values())
 
 
-def test_list_shows_components_and_fields(capsys):
-    code, out, _ = call("list", "resamplers", capsys=capsys)
-    assert code == 0
-    assert "systematic" in out
-    assert "keep_weights" in out
-    assert "scheme=multinomial" in out
-    code, out, _ = call("list", capsys=capsys)
-    assert {"presets:", "families:", "transition:", "sampler:"} <= set(out.splitlines())
-
-
 def python(code, *arguments):
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, timeout=600

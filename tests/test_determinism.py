@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 
 import numpy as np
@@ -14,7 +13,6 @@ from mstfilter.presets import load_config
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Frame, render, scene_cache
 from tests import hostile
-from tests.conftest import REPOSITORY
 from tests.report.runs import recording
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -74,20 +72,6 @@ def test_a_matplotlibrc_of_the_user_does_not_change_a_figure():
         {"font.size": 33, "axes.facecolor": "red", "lines.linewidth": 9, "path.sketch": (1, 100, 2)}
     ):
         assert drawn() == expected
-
-
-def test_text_is_read_and_written_with_an_encoding():
-    """Ruff's rule PLW1514 finds `open`; it does not know the type of most paths."""
-    calls = [
-        f"{file.name}:{node.lineno}"
-        for file in (REPOSITORY / "mstfilter").rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call)
-        and getattr(node.func, "attr", "") in ("read_text", "write_text")
-        and len(node.args) < 2
-        and "encoding" not in [keyword.arg for keyword in node.keywords]
-    ]
-    assert calls == []
 
 
 @pytest.mark.parametrize(
