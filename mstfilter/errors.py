@@ -166,7 +166,6 @@ _PACKAGES = {
     "pytest": "'mstfilter[check]'",
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
-    "dask.distributed": "'mstfilter[dask]'",
     "xarray": "'mstfilter[xarray]'",
 }
 

@@ -1,4 +1,4 @@
-"""Scores of forecasts: Brier score, log loss, calibration, recalibration, energy score.
+"""Scores of forecasts: Brier score, log loss, calibration, recalibration.
 
 A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. The
 table has how often each value of p was given, and how often the event then occurred. Tables can be pooled.
@@ -11,14 +11,8 @@ table has how often each value of p was given, and how often the event then occu
 >>> fit(np.array([0.2, 0.9])).tolist()
 [0.5, 0.999]
 
-A forecast of a vector, a segmentation, or any other object is a weighted set. The energy score needs only distances:
-
->>> distances = np.array([[0.0, 1.0], [1.0, 0.0]])  # between the two members of the set
->>> energy_score([0.0, 1.0], distances, [0.5, 0.5])
-0.25
-
 A score is proper if no other forecast has a lower expected score than the true distribution. Brier score and log loss
-are proper. The energy score is proper if the distance is of negative type (`is_negative_type`).
+are proper.
 """
 
 from __future__ import annotations
@@ -186,55 +180,3 @@ class Recalibration:
     def log_loss(self, table: ForecastTable) -> float:
         """Mean log loss in nats of the forecasts of a table after recalibration."""
         return table.with_forecasts(self(table.p)).log_loss()
-
-
-def energy_score(to_outcome: ArrayLike, between: ArrayLike, weights: ArrayLike | None = None) -> float:
-    """Energy score of a weighted set (Gneiting and Raftery 2007, section 4.3); lower is better.
-
-    ``ES = sum_i w_i d(x_i, y) - 1/2 sum_ij w_i w_j d(x_i, x_j)``
-
-    Parameters
-    ----------
-    to_outcome : (n,) float
-        Distances d(x_i, y) of the members to the outcome.
-    between : (n, n) float
-        Distances d(x_i, x_j).
-    weights : (n,) float, optional
-        Sum 1. By default, weights are equal.
-
-    Notes
-    -----
-    The score is proper if the distance is of negative type; see `is_negative_type`.
-    """
-    d, D = np.asarray(to_outcome, dtype=np.float64), np.asarray(between, dtype=np.float64)
-    n = len(d)
-    if d.ndim != 1 or D.shape != (n, n):
-        raise InputError(f"distances have shapes {d.shape} and {D.shape}, expected (n,) and (n, n)")
-    w = np.full(n, 1 / n) if weights is None else np.asarray(weights, dtype=np.float64)
-    if w.shape != (n,) or (w < 0).any() or not np.isclose(w.sum(), 1):
-        raise InputError(f"weights have shape {w.shape} and sum {w.sum():g}, expected ({n},) and sum 1")
-    return float(w @ d) - 0.5 * float(w @ D @ w)
-
-
-def is_negative_type(distances: ArrayLike) -> bool:
-    """Whether a distance is of negative type on n points.
-
-    ``sum_ij c_i c_j d_ij <= 0`` for all c with ``sum_i c_i = 0`` (Schoenberg 1938). If this holds for all points, the
-    energy score with d is proper. If it fails, there are two distributions on these points for which the wrong
-    forecast has the lower expected score (Sejdinovic et al. 2013).
-
-    Parameters
-    ----------
-    distances : (n, n) float
-        Symmetric matrix with zeros on the diagonal.
-    """
-    D = np.asarray(distances, dtype=np.float64)
-    if D.ndim != 2 or D.shape[0] != D.shape[1]:
-        raise InputError(f"distances have shape {D.shape}, expected (n, n)")
-    largest = np.abs(D).max(initial=0.0)
-    if not np.allclose(D, D.T, atol=1e-12 * largest) or np.abs(np.diag(D)).max(initial=0.0) > 1e-12 * largest:
-        raise InputError("distances are not symmetric with zeros on the diagonal")
-    if largest == 0:
-        return True
-    centred = D - D.mean(axis=0) - D.mean(axis=1)[:, None] + D.mean()
-    return bool(np.linalg.eigvalsh(centred)[-1] <= 1e-9 * largest * len(D))

@@ -338,12 +338,6 @@ def _import(location: str) -> type:
     return found
 
 
-def loaded_components() -> list[str]:
-    """The components ``FILE:CLASS`` that this process has loaded from files of the user."""
-    return list(_LOADED)
-
-
-_LOADED: dict[str, None] = {}
 _MODULES: dict[tuple[Path, str], ModuleType] = {}  # resolved path and hash of the content of a file -> its module
 
 
@@ -353,7 +347,6 @@ def _from_file(path: str, attribute: str) -> type:
     if not isinstance(found, type):
         classes = ", ".join(cls.__name__ for cls in _classes_of(module))
         raise InputError(f"{path} has no class {attribute!r}", f"it has: {classes or 'none'}")
-    _LOADED[f"{path}:{attribute}"] = None
     return found
 
 

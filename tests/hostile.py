@@ -152,14 +152,11 @@ def _write_masks(path: Path) -> None:
     labels[10:20, 10:20], labels[30:40, 30:50] = 1, 2
     write_masks(path, 0, [labels, (labels > 0).astype(np.uint8)], weights=[0.7, 0.3])
     write_image(path / "000001.png", labels)
-    runs = {"size": [60, 80], "counts": [800, 60, 3940]}
-    entries = [{"segmentation": runs, "score": 0.5}]
-    (path / "000002.json").write_text(json.dumps(entries), encoding="utf-8")
 
 
 def _read_masks(path: Path) -> None:
     errors = []
-    for pause in range(3):
+    for pause in range(2):
         try:
             read_masks(path, pause, (60, 80))
         except InputError as error:
@@ -221,7 +218,6 @@ KINDS = {
     "checkpoint": Kind(_write_checkpoint, _read_checkpoint),
     "cache": Kind(_write_cache, _read_cache),
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
-    "bop": Kind(_layout("bop"), _reader("bop")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),
     "bag": Kind(_bag("bag"), _read_bag),
     "mcap": Kind(_bag("mcap"), _read_bag),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +13,7 @@ from mstfilter.cli import main
 from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder
 from tests.conftest import REPOSITORY
-from tests.runs.test_run import content
-from tests.scene.test_recording import FAULTS, write
-from tests.study.test_failures import BROKEN, wait_for
+from tests.scene.test_recording import write
 
 HEAVY = ("torch", "open3d", "cv2", "scipy", "higra", "mujoco", "matplotlib")
 
@@ -49,11 +46,9 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     assert "pause 1     3 hypotheses" in out
     assert RunFolder.open(run).description["seed"] == 4
     assert not (run / "report.html").exists()
-    code, out, err = call("report", run, "--out", tmp_path / "r.html", "--export", tmp_path / "x", capsys=capsys)
+    code, out, err = call("report", run, "--out", tmp_path / "r.html", capsys=capsys)
     assert code == 0, err
     assert "<html" in (tmp_path / "r.html").read_text()
-    assert list((tmp_path / "x").rglob("*.ply"))
-    assert list((tmp_path / "x").rglob("*.png"))
 
 
 PLACES = {
@@ -69,7 +64,6 @@ WRITERS = {
     "study": ("none.toml", "--out"),
     "train": ("border", "--out"),
     "report": ("none", "--out"),
-    "report, meshes": ("none", "--export"),
     "view": ("none", "--out"),
     "quality": ("none", "none", "--csv"),
 }
@@ -87,16 +81,6 @@ def test_an_output_that_cannot_be_written_is_an_error_before_any_work(tmp_path, 
     assert (code, printed) == (2, "") and err.startswith("error: cannot write") and PLACES[place] in err, err
     assert "hint: choose another place" in err
     assert {path.name for path in tmp_path.iterdir()} == {"file", "study.toml"}
-
-
-@pytest.mark.parametrize("fault", ["truncated PNG", "not JSON"])
-def test_bad_recordings_are_one_clear_error(recording, tmp_path, capsys, fault):
-    """One line `error:`, exit code 2, no traceback, no half-written run folder."""
-    FAULTS[fault][0](recording)
-    code, out, err = call("run", recording, "--out", tmp_path / "run", capsys=capsys)
-    assert (code, out) == (2, "") and not (tmp_path / "run").exists()
-    lines = [line for line in err.splitlines() if line.strip()]
-    assert lines[0].startswith("error: ") and all(line.startswith("hint: ") for line in lines[1:]), err
 
 
 @pytest.mark.parametrize(
@@ -160,10 +144,6 @@ def test_an_interrupted_command_says_what_it_keeps(command, message, tmp_path, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_of_study_names_the_table(capsys):
-    assert "table `smoke`" in " ".join(call("study", "--help", capsys=capsys)[1].replace("│", " ").split())
-
-
 def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     arguments = ("run", recording, "n=1", "n_proposed=1", "--compare", "--no-report", "--out", tmp_path / "run")
     code, _, _ = call(*arguments, capsys=capsys)
@@ -174,35 +154,6 @@ def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     completers = [run.description["config"]["proposal"]["completer"]["component"] for run in compared.values()]
     assert completers == ["network", "network"]  # that of the update of `mst`, whose samples are surfaces
     assert all(run.description["config"]["transition"]["component"] == "identity" for run in compared.values())
-
-
-def test_one_hypothesis_is_singular(recording, tmp_path, capsys):
-    arguments = ("run", recording, "--preset", "floor_one_blob", "n=1", "n_proposed=1", "--no-report")
-    assert "1 hypothesis of 1 object," in call(*arguments, "--out", tmp_path / "run", capsys=capsys)[1]
-
-
-def test_unknown_commands_are_usage_errors(capsys):
-    code, _, err = call("florp", capsys=capsys)
-    assert code == 2
-    assert "florp" in err
-
-
-def test_shells_complete_commands():
-    """What the function of bash calls, which `--install-completion` installs."""
-    question = {"_MSTFILTER_COMPLETE": "complete_bash", "COMP_WORDS": "mstfilter si", "COMP_CWORD": "1"}
-    command = [sys.executable, "-m", "mstfilter"]
-    done = subprocess.run(command, env={**os.environ, **question}, capture_output=True, text=True, timeout=600)
-    assert done.stdout.split() == ["simulate"]
-
-
-def test_list_shows_components_and_fields(capsys):
-    code, out, _ = call("list", "resamplers", capsys=capsys)
-    assert code == 0
-    assert "systematic" in out
-    assert "keep_weights" in out
-    assert "scheme=multinomial" in out
-    code, out, _ = call("list", capsys=capsys)
-    assert {"presets:", "families:", "transition:", "sampler:"} <= set(out.splitlines())
 
 
 def python(code, *arguments):
@@ -252,26 +203,6 @@ def test_what_the_presets_need(preset, blocked, two_pauses, tmp_path):
         return
     assert done.returncode == 0, done.stderr
     assert preset == "mst" or "<html" in (tmp_path / "run" / "report.html").read_text()
-
-
-def test_a_run_that_was_killed_is_resumed(recording, tmp_path, capsys):
-    """The process is killed in its second step; the same command ends with the bytes of an undisturbed run."""
-    marker = tmp_path / "marker"
-    hangs = [f"transition={BROKEN}:Breaks", "transition.how=hang", f'transition.marker="{marker}"']
-    arguments = ["run", recording, "n=3", *hangs, "--no-report"]
-    command = [sys.executable, "-m", "mstfilter", *arguments]
-    part = tmp_path / "part"
-    process = subprocess.Popen([*command, "--out", part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    wait_for(marker, process)
-    process.kill()
-    process.wait()
-    assert RunFolder.open(part).n_pauses == 1
-    assert not (part / "metrics.csv").exists()
-    subprocess.run([*command, "--out", part], check=True, capture_output=True, timeout=600)
-    assert call(*arguments, "--out", tmp_path / "whole", capsys=capsys)[0] == 0
-    whole, resumed = content(tmp_path / "whole"), content(part)
-    assert whole.keys() == resumed.keys()
-    assert [k for k in whole if whole[k] != resumed[k]] == []
 
 
 USER_FILE = """

@@ -106,7 +106,7 @@ def test_quality(tmp_path, capsys):
     code, out, err = call("quality", tmp_path / "run", recording, "--csv", tmp_path / "q.csv", capsys=capsys)
     assert code == 0, err
     out, belief = out.split("\n\n")
-    scores = ["log_loss", "base_rate", "brier", "calibration_error", "energy"]
+    scores = ["log_loss", "base_rate", "brier", "calibration_error"]
     lines, columns = out.splitlines(), ["mean", "weighted", "best", "top", "estimate", "one_blob", "components"]
     assert lines[0].split() == ["pause", "form", "n", *columns]
     assert len(lines) == 1 + 3 * 3 + 3
@@ -119,10 +119,6 @@ def test_quality(tmp_path, capsys):
     table = list(csv.DictReader((tmp_path / "q.csv").open()))
     means = [float(row["mean"]) for row in table if row["form"] == "objects"]
     assert float(lines[-3].split()[2]) == pytest.approx(np.mean(means), abs=6e-4)
-    code, again, _ = call("quality", tmp_path / "run", recording / "voxels.npz", capsys=capsys)
-    assert (code, again.strip()) == (0, out)  # volumes alone have no questions
-    code, perfect, _ = call("quality", recording / "voxels.npz", recording, capsys=capsys)
-    assert perfect.split("\n\n")[0].splitlines()[-3].split()[2] == "1.000"
     for arguments, message in (
         ((tmp_path / "run", tmp_path / "none"), "does not exist"),
         ((tmp_path, recording), "not a run folder"),

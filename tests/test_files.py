@@ -106,15 +106,6 @@ def test_a_lock_is_released_and_leaves_no_files(tmp_path):
         pass
 
 
-def test_a_writer_in_the_same_process_is_another_writer(recording, tmp_path):
-    with RecordingWriter(tmp_path / "a", recording.frames[0].camera) as writer:
-        with pytest.raises(InputError, match="another process"):
-            save_recording(recording, tmp_path / "a")
-        writer.add_frame(recording.frames[0].rgb, recording.frames[0].depth, 0.0, "static")
-    assert len(open_recording(tmp_path / "a")) == 1
-    assert names(tmp_path) == ["a"]
-
-
 @pytest.mark.parametrize("existing", ["refuse", "keep", "replace"])
 def test_a_folder_that_was_made_meanwhile(tmp_path, existing):
     raised = pytest.raises(InputError, match="made meanwhile") if existing == "refuse" else nullcontext()
@@ -224,25 +215,6 @@ def test_a_stopped_run_drops_damaged_pauses(recording, tmp_path):
     with pytest.warns(InputWarning, match=r"pause 0 is damaged: SHA256SUMS is missing"):
         run(recording, path)
     assert content(path) == whole
-
-
-def test_check_names_damaged_files(recording, tmp_path, capsys):
-    path, copy = run(recording, tmp_path / "run").path, save_recording(recording, tmp_path / "copy")
-    for folder in (path, copy, recording.path):
-        assert call("check", folder, capsys=capsys)[:2] == (0, f"sound       {folder}\n")
-    for file in (path / "metrics.csv", path / "pauses" / "000" / "rgb.png", copy / "manifest.json"):
-        file.write_bytes(file.read_bytes() + b" ")
-    (path / "pauses" / "001" / "state.npz").unlink()
-    (copy / "voxels.npz").unlink()
-    code, out, _ = call("check", path, capsys=capsys)
-    wrong = ("metrics.csv has changed", "pauses/000/rgb.png has changed", "pauses/001/state.npz is missing")
-    assert (code, out.splitlines()) == (1, [f"damaged     {path}: {text}" for text in wrong])
-    code, out, _ = call("check", copy, capsys=capsys)
-    wrong = ("manifest.json has changed", "voxels.npz is missing")
-    assert (code, out.splitlines()) == (1, [f"damaged     {copy}: {text}" for text in wrong])
-    (copy / "SHA256SUMS").unlink()
-    assert "SHA256SUMS is missing" in call("check", copy, capsys=capsys)[1]
-    assert "not a recording" in call("check", tmp_path / "run" / "pauses", capsys=capsys)[2]
 
 
 def test_sums_are_those_of_sha256sum(tmp_path):

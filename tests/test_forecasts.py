@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError
-from mstfilter.forecasts import ForecastTable, Recalibration, energy_score, is_negative_type
+from mstfilter.forecasts import ForecastTable, Recalibration
 
 FORECASTS = st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]), st.booleans()), min_size=1)
 
@@ -64,36 +64,3 @@ def test_recalibration_is_the_best_monotone_map(pairs):
         ]
     )
     np.testing.assert_allclose(values, m, atol=1e-9)
-
-
-def expected_score(honest, forecast, D):
-    """Expected energy score of a forecast if the outcome is drawn from `honest`."""
-    return sum(p * energy_score(D[:, k], D, forecast) for k, p in enumerate(honest))
-
-
-def test_energy_score_of_numbers():
-    """For |x - y| on a line, the energy score is the integral of (F(x) - [x >= y])^2."""
-    rng = np.random.default_rng(3)
-    x, w, y = rng.normal(size=6), rng.dirichlet(np.ones(6)), 0.3
-    edges = np.sort(np.append(x, y))
-    F = np.array([w[x <= e].sum() for e in edges])
-    integral = ((F - (edges >= y)) ** 2)[:-1] @ np.diff(edges)
-    assert energy_score(np.abs(x - y), np.abs(x[:, None] - x), w) == pytest.approx(integral)
-
-
-def test_negative_type_decides_whether_the_score_is_proper():
-    line = np.abs(np.subtract.outer(np.arange(4.0), np.arange(4.0)))
-    assert is_negative_type(line) and is_negative_type(np.sqrt(line)) and not is_negative_type(line**3)
-    # Path distances in the complete bipartite graph K(2, 3) are the smallest metric that is not of negative type.
-    group = np.array([0, 0, 1, 1, 1])
-    graph = np.where(np.equal.outer(group, group), 2.0, 1.0) - 2 * np.eye(5)
-    assert not is_negative_type(graph)
-    # Then a wrong forecast has the lower expected score: weight on the first group, outcomes from the second.
-    honest, wrong = np.array([0, 0, 1, 1, 1]) / 3, np.array([1, 1, 0, 0, 0]) / 2
-    assert expected_score(honest, wrong, graph) < expected_score(honest, honest, graph)
-    rng = np.random.default_rng(4)
-    for _ in range(200):  # with a distance of negative type this never happens
-        p, q = rng.dirichlet(np.ones(4)), rng.dirichlet(np.ones(4))
-        assert expected_score(p, p, np.sqrt(line)) <= expected_score(p, q, np.sqrt(line)) + 1e-12
-    with pytest.raises(InputError, match="symmetric"):
-        is_negative_type([[0, 1], [2, 0]])

@@ -52,7 +52,9 @@ def test_filters_and_resampling():
         (["--help"], "pip install mstfilter"),
         (["--version"], "mstfilter 0."),
         (["list"], "not available: pip install opencv-python-headless"),
+        (["list"], "\nfamilies:\n"),
         (["list", "resamplers"], "systematic          One uniform"),
+        (["list", "resamplers"], "scheme=multinomial"),
         (["list", "presets"], "mst                 MST, the default"),
     ],
 )

@@ -55,7 +55,6 @@ def data(tmp_path_factory):
         image = read_rgb(file) if file.parent.name == "rgb" else np.rint(read_depth(file, 1)).astype(np.uint16)
         write_image(file, image.repeat(4, axis=0).repeat(4, axis=1))
     layouts.write_redwood(path / "bedroom")
-    layouts.write_bop(path / "000048")
     (path / "frames").mkdir()
     for k in (0, 4):
         for part in ("rgb", "depth"):
@@ -86,12 +85,12 @@ def test_commands_run(here, command, capsys):
         shutil.rmtree(here / words[2])
     if words[0] == "run":
         words += ["--no-report", "n=2"]
-    if words[0] in ("quality", "report"):
+    if words[0] == "quality":
         call("run", words[1].replace("run", "table"), "--out", words[1], "--no-report", "n=2", capsys=capsys)
     code, out, err = call(*words, capsys=capsys)
     assert code == 0, err
     assert words[0] != "convert" or re.search(r"pauses +\d+ of \d+ frames: ", out)
-    made = {"convert": f"{words[2]}/manifest.json", "view": words[-1], "report": "meshes"} if len(words) > 2 else {}
+    made = {"convert": f"{words[2]}/manifest.json", "view": words[-1]} if len(words) > 2 else {}
     assert (here / made.get(words[0], ".")).exists()
 
 
@@ -121,7 +120,7 @@ def test_every_format_has_a_command():
     """Data of each registered format is converted or run by a command of the page."""
     from mstfilter import formats
 
-    data = {"recording": "table-7", "pairs": "frames", "tum": "rgbd_dataset", "bop": "000048"}
+    data = {"recording": "table-7", "pairs": "frames", "tum": "rgbd_dataset"}
     data |= {"redwood": "bedroom", "bag": "session.bag"}
     assert set(data) == set(formats.__components__["format"])
     assert all(any(name in command.split() for command in COMMANDS) for name in data.values())

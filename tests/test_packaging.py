@@ -75,12 +75,6 @@ def test_in_a_wheel(wheel, tmp_path):
     assert folder == str(tmp_path / "site" / "mstfilter" / "_models")
 
 
-def test_in_a_checkout(tmp_path):
-    package, folder = ask(tmp_path, PYTHONPATH=str(REPOSITORY))
-    assert package == str(REPOSITORY / "mstfilter")
-    assert folder == str(REPOSITORY / "models")
-
-
 def test_in_an_editable_install(tmp_path):
     """The environment that `make` sets up is one: a .pth file leads to the checkout."""
     package, folder = ask(tmp_path, "-P")

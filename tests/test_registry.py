@@ -14,7 +14,6 @@ from typing import get_type_hints
 
 import pytest
 
-import mstfilter.registry
 from mstfilter.completion import Completer
 from mstfilter.crossover import CrossoverUpdate
 from mstfilter.errors import InputError, InputWarning
@@ -251,25 +250,6 @@ def test_hints_are_shown_in_python_too():
     assert (str(error), str(warning)) == ("depth is empty", "depth is odd\nhint: check it\nhint: or not")
     again = pickle.loads(pickle.dumps(error))
     assert (str(again), again.hints, again.__notes__) == (str(error), error.hints, error.__notes__)
-
-
-def test_entry_points_add_components(monkeypatch):
-    @dataclass(frozen=True)
-    class Entry:
-        name: str
-        value: str
-
-    monkeypatch.setattr(
-        mstfilter.registry,
-        "entry_points",
-        lambda group: [Entry("resampler.mine", "mstfilter.smc.resampling:Residual")],
-    )
-    mstfilter.registry._installed_components.cache_clear()
-    try:
-        assert type(REGISTRY.build("resampler", "mine")).__name__ == "Residual"
-        assert "mine" not in REGISTRY.known("trigger")
-    finally:
-        mstfilter.registry._installed_components.cache_clear()
 
 
 def test_no_preset_is_properly_weighted():

@@ -5,7 +5,7 @@
 number.csv has one row per number of hypotheses, means over the scenes that all numbers have: recalibrated log loss
 (nats, lower is better) and its difference from that of the next smaller number, paired by scene with a 95 % interval;
 the calibration error of the forecasts as they come; the quality of the estimate (`Belief.estimate`) and the mean
-quality; the energy score and its floor, the same hypotheses with noise at the border; processor seconds of a step.
+quality; processor seconds of a step.
 """
 
 from __future__ import annotations
@@ -19,10 +19,7 @@ from mstfilter.files import read_csv, write_csv
 from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import compare_arms
 
-COLUMNS = (
-    *(LOG_LOSS, "calibration_error", "quality_estimate", "quality"),
-    *("energy", "energy_floor", "core_seconds"),
-)
+COLUMNS = (LOG_LOSS, "calibration_error", "quality_estimate", "quality", "core_seconds")
 
 
 def by_scene(path: Path, column: str) -> dict[int, dict[str, float]]:
@@ -59,21 +56,17 @@ def main() -> None:
 
 
 def draw(rows: list[dict[str, float]], path: Path) -> None:
-    """Log loss and energy score against the number of hypotheses."""
+    """Log loss and quality against the number of hypotheses."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
     plt.style.use("mstfilter.report.figures")
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2))
+    figure, axes = plt.subplots(1, 2, figsize=(7, 3.2))
     n = [row["n"] for row in rows]
-    panels = ((LOG_LOSS,), ("energy", "energy_floor"), ("quality_estimate", "quality"))
-    titles = (
-        "log loss (recalibrated), nats (lower is better)",
-        "energy score (lower is better)",
-        "quality (higher is better)",
-    )
+    panels = ((LOG_LOSS,), ("quality_estimate", "quality"))
+    titles = "log loss (recalibrated), nats (lower is better)", "quality (higher is better)"
     for axis, names, title in zip(axes, panels, titles, strict=True):
         for name in names:
             axis.plot(n, [row[name] for row in rows], "o-", label=name.replace("_", " "))

@@ -29,7 +29,7 @@ from mstfilter.study import ENDPOINTS, StudyFolder, Summary, cost_columns, summa
 
 Row = Mapping[str, Any]
 
-DESCRIBED = ("quality_estimate", "log_loss", "calibration_error", "energy", "volume_missed", "volume_invented")
+DESCRIBED = ("quality_estimate", "log_loss", "calibration_error", "volume_missed", "volume_invented")
 
 METRICS = (
     "quality",
@@ -58,8 +58,6 @@ METRICS = (
     "brier",
     "log_loss",
     "calibration_error",
-    "energy",
-    "energy_floor",
     "core_seconds",
     "peak_mb",
 )

@@ -16,10 +16,9 @@ COLOURS = {
     "authors": "#edae49",
     "mst_rules": "#b08fd8",
     "mst": "#5b3a8c",
-    "+ cover": "#2e7d4f",
 }
-NAMES = {"+ cover": "mst_rules, all six changes", "n exact draws": "n draws of the exact posterior"}
-RANKED = ("exact", "bootstrap", "guided", "balanced", "paper", "authors", "mst_rules", "mst", "+ cover")
+NAMES = {"n exact draws": "n draws of the exact posterior"}
+RANKED = ("exact", "bootstrap", "guided", "balanced", "paper", "authors", "mst_rules", "mst")
 
 
 def draw(out: Path) -> None:

@@ -1,23 +1,17 @@
-"""MST on the miniature world: its presets, other rules for its weights, and a properly weighted version.
+"""MST on the miniature world: its presets, and a properly weighted version.
 
 >>> filter = adapt_to_miniature(mstfilter.preset("paper"), world, n=5, weight_rule="p")
->>> filter = replace(filter, update=ScoredFusion(world, filter.update, distinct=True, predictive=True))
 >>> filter = balanced_filter(world, n=500)              # exact: no crossover, weights f g / q
 >>> state, infos = filter.run(observations, seed=0)
 
 The parts that need images are replaced: tracking by the motion model, tree cuts by cuts of the reported
 segmentation, and free space by the cells in front of the depth reading. Crossover, weights and resampler are those of
 the preset; the mode filter is sized to the grid.
-
-The weights of MST depend on the parents of a candidate, not on the candidate. `ScoredFusion` repairs this
-(docs/exactness.md). With all its options, and candidates that cover the probable states, the weights are those of the
-exact filter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import product
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -25,20 +19,8 @@ import numpy as np
 from miniature_filters import PriorProposal, PushTransition, state_weights
 from miniature_world import Miniature, Observation, draw_states
 
-from mstfilter.crossover import CrossoverUpdate
 from mstfilter.scene import Hypothesis, Projection
-from mstfilter.smc import (
-    Multinomial,
-    ParticleFilter,
-    Population,
-    Proposal,
-    Update,
-    child,
-    coalesce,
-    first_seen,
-    log_mean_exp,
-    union,
-)
+from mstfilter.smc import ParticleFilter, Population, Proposal, Update, child, log_mean_exp, union
 
 
 @dataclass(frozen=True)
@@ -181,66 +163,6 @@ def predictive_distribution(world: Miniature, predicted: Population | None) -> n
     if predicted is None:
         return world.prior
     return (1 - world.rearranged) * state_weights(world, predicted) + world.rearranged * world.prior
-
-
-@dataclass(frozen=True)
-class ScoredFusion(Update):
-    """Draws some candidates by the weights of their pairs, builds them, and weights them by their likelihood.
-
-    Parameters
-    ----------
-    world : Miniature
-    fusion : CrossoverUpdate
-        Makes the candidates.
-    built_per_particle : int
-        Number of candidates that are built per predicted particle. 0: no crossover; needs `include_parents`.
-    distinct : bool
-        Whether equal candidates count once.
-    predictive : bool
-        Whether candidates are also weighted by p(x | past).
-    include_parents : bool
-        Whether the moved hypotheses and the samples are candidates too.
-    """
-
-    world: Miniature
-    fusion: CrossoverUpdate
-    built_per_particle: int = 4
-    distinct: bool = False
-    predictive: bool = False
-    include_parents: bool = False
-
-    properly_weighted: ClassVar[bool] = False
-
-    def update(
-        self,
-        rng: np.random.Generator,
-        predicted: Population | None,
-        proposed: Population | None,
-        observation: Observation,
-    ) -> Population:
-        world = self.world
-        if predicted is None or proposed is None:
-            built = union(predicted, proposed)
-        else:
-            populations = []
-            if self.built_per_particle > 0:
-                # The score uses the same observation as Q, so Q is omitted from the pair weights.
-                fusion = replace(self.fusion, quality_exponent=0.0)
-                candidates = fusion.update(rng, predicted, proposed, observation)  # type: ignore[arg-type]
-                m = self.built_per_particle * len(predicted)
-                chosen, _ = Multinomial().select(child(rng, "first stage"), candidates.log_weights, m)
-                populations.append(candidates.take(chosen, np.zeros(m)).realised())
-            if self.include_parents:
-                populations += [replace(p, log_weights=np.zeros(len(p))) for p in (predicted, proposed)]
-            built = reduce(union, populations)
-        states = world.states.index(built.particles)
-        score = world.log_likelihood(observation)[states]
-        if self.predictive:
-            score = score + np.log(predictive_distribution(world, predicted))[states]
-        if not self.distinct:
-            return replace(built, log_weights=score)
-        representatives, _ = coalesce(np.zeros(len(states)), first_seen(states.tolist()))
-        return built.take(representatives, score[representatives])
 
 
 @dataclass(frozen=True)

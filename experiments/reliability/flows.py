@@ -15,7 +15,7 @@ from disk import LOSSES as LOSSES, Disk, Stop, content
 
 from mstfilter.cli import running
 from mstfilter.errors import InputError
-from mstfilter.files import sweep
+from mstfilter.files import damaged_files, sweep
 from mstfilter.formats import open_recording, save_recording
 from mstfilter.frontends import write_masks
 from mstfilter.presets import load_config
@@ -70,8 +70,9 @@ def flows(recording: Recording) -> list[Flow]:
     def one_of_both(root: Path) -> None:
         sweep(root / "runs")
         found = RunFolder.open(root / "runs" / "one")
-        if found.damage() or not found.n_pauses:
-            raise ValueError(f"the earlier run is lost: {found.damage()}")
+        damage = [wrong for t in range(found.n_pauses) for wrong in damaged_files(found.pause(t))]
+        if damage or not found.n_pauses:
+            raise ValueError(f"the earlier run is lost: {damage}")
 
     def study(root: Path) -> None:
         data = {"scenes": [{"recordings": str(recording.path)}], "seeds": [0], "cache_gb": 0, "name": "small"}

@@ -5,9 +5,9 @@
 (64, 3, 7, 7)
 
 A ``.caffemodel`` is a message `NetParameter` in the wire format of protocol buffers. Four messages of caffe.proto are
-read: in `NetParameter` the fields 100 (``layer``) and 2 (``layers``, the format before 2015); in a layer its name (1,
-before 4) and blobs (7, before 6); in a blob its data (5, or 8 for double) and its shape (7, before 1 to 4). All other
-fields are skipped. Nothing in the file is executed.
+read: in `NetParameter` the field 100 (``layer``); in a layer its name (1) and blobs (7); in a blob its data (5, or 8
+for double) and its shape (7). All other fields are skipped, as are the layers of files before 2015 (field 2). Nothing
+in the file is executed.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def read_caffemodel(path: str | Path) -> dict[str, tuple[np.ndarray, ...]]:
     found: dict[str, tuple[np.ndarray, ...]] = {}
     try:
         for number, value in _fields(data):
-            if number not in (100, 2) or not isinstance(value, memoryview):
+            if number != 100 or not isinstance(value, memoryview):
                 continue
-            name, blobs = _layer(value, *((1, 7) if number == 100 else (4, 6)))
+            name, blobs = _layer(value)
             if blobs and name in found:
                 _fail(f"two layers are named {name!r}")
             if blobs:
@@ -94,30 +94,26 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
         at += size
 
 
-def _layer(data: memoryview, name_field: int, blob_field: int) -> tuple[str, tuple[np.ndarray, ...]]:
+def _layer(data: memoryview) -> tuple[str, tuple[np.ndarray, ...]]:
     name, blobs = "", []
     for number, value in _fields(data):
-        if number == name_field and isinstance(value, memoryview):
+        if number == 1 and isinstance(value, memoryview):
             name = bytes(value).decode()
-        elif number == blob_field and isinstance(value, memoryview):
+        elif number == 7 and isinstance(value, memoryview):
             blobs.append(value)
     return name, tuple(_blob(blob, name) for blob in blobs)
 
 
 def _blob(data: memoryview, layer: str) -> np.ndarray:
-    shape: list[int] | None = None
-    legacy: dict[int, int] = {}
+    shape: list[int] = []
     parts: dict[int, list[memoryview]] = {5: [], 8: []}
     for number, value in _fields(data):
         if number == 7 and isinstance(value, memoryview):
             shape = _shape(value)
-        elif number in (1, 2, 3, 4) and isinstance(value, int):
-            legacy[number] = value
         elif number in parts and isinstance(value, memoryview):
             parts[number].append(value)  # one packed run, or one value
     kind = 5 if parts[5] else 8
     values = np.frombuffer(b"".join(parts[kind]), "<f4" if kind == 5 else "<f8")
-    shape = [legacy.get(k, 1) for k in (1, 2, 3, 4)] if shape is None else shape
     size = 1
     for length in shape:
         size *= length

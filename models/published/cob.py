@@ -15,17 +15,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from mstfilter.errors import InputError, naming
-from mstfilter.fields import Bounds, NonNegativeFloat, PositiveInt
+from mstfilter.fields import NonNegativeFloat, PositiveInt
 from mstfilter.files import weights_file
 from mstfilter.registry import load_file
-from mstfilter.scene import Frame, Recording, UsesFiles, memo, scaled_length
+from mstfilter.scene import Frame, Recording, UsesFiles, memo
 from mstfilter.segmentation import BoundaryModel, Tree, TreeBuilder
-from mstfilter.segmentation.boundary import fill_from_nearest
 from mstfilter.segmentation.tree import linkage_tree, prune
 
 _HERE = Path(__file__).parent
@@ -43,18 +42,12 @@ class CobBoundary(BoundaryModel, UsesFiles):
     ----------
     weights : str
         Path of a ``.caffemodel``.
-    input : {"rgb", "rgbhha"}
-        Input of the model. HHA is computed from depth (`hha`).
     scale : {"fine", "coarse", "mean"}
         Which output is the boundary map.
-    table_height : float
-        Height of the table above the ground in metres, for HHA.
     """
 
     weights: str = ""
-    input: Literal["rgb", "rgbhha"] = "rgb"
     scale: Literal["fine", "coarse", "mean"] = "fine"
-    table_height: Annotated[float, Bounds(at_least=0, unit="number of metres")] = 0.7
 
     @property
     def bound_key(self) -> bytes:
@@ -75,18 +68,14 @@ class CobBoundary(BoundaryModel, UsesFiles):
 
         The angle is in radians from x (right) to y (down), 0 to pi; NaN where no orientation is confident.
         """
-        key = (frame.key, self.input, self.table_height, self.bound_key)
-        return memo("cob", key, lambda: self._run(frame), stored_as=(np.ndarray,) * 3)
+        return memo("cob", (frame.key, self.bound_key), lambda: self._run(frame), stored_as=(np.ndarray,) * 3)
 
     def _run(self, frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         network = self._network()
         import torch
         from torch.nn import functional
 
-        image = frame.rgb
-        if self.input == "rgbhha":
-            image = np.concatenate([image, hha(frame, self.table_height)], axis=2)
-        data, size = load_file(_HERE / "cob_network.py").cob_input(image), frame.depth.shape
+        data, size = load_file(_HERE / "cob_network.py").cob_input(frame.rgb), frame.depth.shape
         with torch.inference_mode():
             if size[0] * size[1] > _MAX_PIXELS:
                 data = functional.interpolate(data[None], (500, 500), mode="bicubic", antialias=True)[0]
@@ -98,13 +87,13 @@ class CobBoundary(BoundaryModel, UsesFiles):
 
     def _network(self) -> Any:
         path, digest = weights_file(self.weights, *_SOURCE)
-        return _load(digest, path, self.input)
+        return _load(digest, path)
 
 
 @lru_cache(maxsize=1)
-def _load(digest: str, path: str, kind: str) -> Any:
+def _load(digest: str, path: str) -> Any:
     """The network with the weights of a file; the last one is kept."""
-    network = load_file(_HERE / "cob_network.py").CobNetwork(3 if kind == "rgb" else 6)
+    network = load_file(_HERE / "cob_network.py").CobNetwork()
     with naming(path):
         network.load_caffe(load_file(_HERE / "caffe.py").read_caffemodel(path))
     return network.eval()
@@ -129,33 +118,6 @@ def decode_orientation(confidence: np.ndarray) -> np.ndarray:
     mean = (best * first + second * other) / np.maximum(best + second, 1e-12)
     angle = np.where(near, mean, first) * np.pi / n
     return np.where(best >= _LEAST_CONFIDENCE, angle, np.nan).astype(np.float32)
-
-
-def hha(frame: Frame, table_height: float) -> np.ndarray:
-    """HHA encoding (H, W, 3) uint8 of depth: disparity, height above ground, angle of the normal with gravity.
-
-    Gupta, Girshick, Arbelaez, Malik, ECCV 2014, with the constants of their program: 31000 / max(z, 100) with z in
-    cm, height in cm, angle in degrees + 38. Disparity is thus 255 for everything nearer than 1.2 m. Missing depth
-    takes the nearest reading. The table is z = 0 of the world. Normals are those of the depth image, smoothed with a
-    standard deviation of 2 pixels (the program fits planes to 7 x 7 pixels). Raises InputError without depth or pose.
-    """
-    import cv2
-
-    if not frame.valid.any() or frame.camera.T_world_camera is None:
-        missing = "depth" if frame.camera.T_world_camera is not None else "pose of the camera"
-        raise InputError(f"a frame has no {missing}, which HHA needs", "use a model with input=rgb")
-    depth = fill_from_nearest(frame.depth, ~frame.valid)
-    points = frame.camera.unproject(cv2.GaussianBlur(depth, (0, 0), max(1.0, scaled_length(2, frame.camera.width))))
-    rows, columns = np.gradient(points, axis=0), np.gradient(points, axis=1)
-    normal = np.cross(columns, rows)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    to_camera = frame.camera.position - points
-    normal *= np.where((normal * to_camera).sum(axis=-1, keepdims=True) < 0, -1, 1)
-    # The program that defines HHA turns normals away from the camera, so the floor has the angle 0 with gravity.
-    angle = np.degrees(np.arccos(np.clip(normal[..., 2], -1, 1)))
-    height = 100 * (points[..., 2] + table_height)
-    layers = np.stack([31000 / np.maximum(100 * depth, 100), height, angle + 38], axis=-1)
-    return np.clip(np.rint(layers), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)

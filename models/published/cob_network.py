@@ -30,8 +30,8 @@ from torch.nn import functional
 from mstfilter.errors import InputError
 
 N_ORIENTATIONS = 8
-#: Mean of each channel, R G B, then horizontal disparity, height, angle; subtracted from the input (`cob_detect.m`).
-MEANS = (122.67891434, 116.66876762, 104.00698793, 134.0313, 92.0228, 117.3808)
+#: Mean of each channel, R G B, subtracted from the input (`cob_detect.m`).
+MEANS = (122.67891434, 116.66876762, 104.00698793)
 #: Name, last layer, channels and stride of each level.
 LEVELS = (("conv1", 64, 1), ("res2c", 256, 2), ("res3d", 512, 4), ("res4f", 1024, 8), ("res5c", 2048, 16))
 _STAGES = ((2, "abc", 64), (3, "abcd", 128), (4, "abcdef", 256), (5, "abc", 512))  # stage, blocks, channels
@@ -48,9 +48,9 @@ class Convolution(NamedTuple):
     bias: bool = True
 
 
-def cob_convolutions(channels: int = 3) -> Iterator[Convolution]:
-    """All convolutions, in the order of the prototxt; `channels` is 3 for RGB, 6 for RGB-HHA."""
-    yield Convolution("conv1" if channels == 3 else "conv1_rgbHHA", channels, 64, 7)
+def cob_convolutions() -> Iterator[Convolution]:
+    """All convolutions, in the order of the prototxt."""
+    yield Convolution("conv1", 3, 64, 7)
     inputs = 64
     for stage, blocks, width in _STAGES:
         for block in blocks:
@@ -82,38 +82,32 @@ class CobOutput(NamedTuple):
 
 
 class CobNetwork(nn.Module):
-    """COB for RGB (3 channels) or RGB-HHA (6)."""
+    """COB for RGB images."""
 
-    def __init__(self, channels: int = 3) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.channels = channels
         self.layers = nn.ModuleDict(
             {
                 c.name: nn.Conv2d(c.inputs, c.outputs, c.kernel, c.stride, c.kernel // 2, bias=c.bias)
-                for c in cob_convolutions(channels)
+                for c in cob_convolutions()
             }
         )
         self.requires_grad_(False)
 
     def load_caffe(self, blobs: Mapping[str, tuple[np.ndarray, ...]]) -> None:
         """Load the blobs of a Caffe model. Raises InputError if a layer is missing or has another shape."""
-        names = [c.name for c in cob_convolutions(self.channels)]
+        names = [c.name for c in cob_convolutions()]
         missing = [name for name in names if name not in blobs]
         if missing:
-            other = "conv1" if self.channels == 6 else "conv1_rgbHHA"
-            hint = "the file is of the other input: set input to rgb or rgbhha" if other in blobs else "expected COB"
             raise InputError(
-                f"the model lacks {len(missing)} of {len(names)} layers, the first is {missing[0]!r}", hint
+                f"the model lacks {len(missing)} of {len(names)} layers, the first is {missing[0]!r}",
+                "expected COB for RGB images",
             )
         for name in names:
             parameters = list(self.layers[name].parameters())
             expected = [tuple(p.shape) for p in parameters]
             found = [blob.shape for blob in blobs[name]]
-            # Files before 2015 store the bias as (1, 1, 1, n).
-            fits = len(found) == len(expected) and all(
-                f == e or (len(e) == 1 and f == (1, 1, 1, *e)) for f, e in zip(found, expected, strict=True)
-            )
-            if not fits:
+            if found != expected:
                 raise InputError(f"layer {name!r} has blobs of shape {found}, expected {expected}", "expected COB")
             for parameter, blob in zip(parameters, blobs[name], strict=True):
                 if not np.isfinite(blob).all():
@@ -136,7 +130,7 @@ class CobNetwork(nn.Module):
 
     def _levels(self, x: torch.Tensor) -> list[torch.Tensor]:
         """Outputs of the five levels of the ResNet."""
-        x = self.layers["conv1" if self.channels == 3 else "conv1_rgbHHA"](x).relu()
+        x = self.layers["conv1"](x).relu()
         levels = [x]
         x = functional.max_pool2d(x, 2, 2, ceil_mode=True)
         for stage, blocks, _ in _STAGES:
@@ -194,10 +188,6 @@ def _check_deconvolutions(blobs: Mapping[str, tuple[np.ndarray, ...]]) -> None:
 
 
 def cob_input(image: np.ndarray) -> torch.Tensor:
-    """The input (C, H, W) float32 of an image (H, W, 3) RGB or (H, W, 6) RGB and HHA, uint8.
-
-    Means are subtracted, and the channels are B G R, or B G R A H H.
-    """
-    centred = image.astype(np.float32) - np.array(MEANS[: image.shape[2]], np.float32)
-    order = [2, 1, 0] if image.shape[2] == 3 else [2, 1, 0, 5, 4, 3]
-    return torch.from_numpy(np.ascontiguousarray(centred[..., order].transpose(2, 0, 1)))
+    """The input (3, H, W) float32 of an image (H, W, 3) RGB uint8: without the means, the channels are B G R."""
+    centred = image.astype(np.float32) - np.array(MEANS, np.float32)
+    return torch.from_numpy(np.ascontiguousarray(centred[..., ::-1].transpose(2, 0, 1)))

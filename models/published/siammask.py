@@ -21,9 +21,8 @@ import numpy as np
 from mstfilter.errors import naming
 from mstfilter.fields import NonNegativeFloat, PositiveInt, Share
 from mstfilter.files import weights_file
-from mstfilter.frontends.mask_trackers import thinned
 from mstfilter.registry import load_file
-from mstfilter.scene import Clip, Recording, UsesFiles, component_key, content_key, memo
+from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 from mstfilter.tracking import MaskTracker
 
 _TEMPLATE, _SEARCH = 127, 255  # pixels of the crops
@@ -32,6 +31,11 @@ _CONTEXT = 0.5  # context around a box, in half its circumference
 _RATIOS = (0.33, 0.5, 1, 2, 3)
 _SMALLEST = 10  # pixels of a side of a box
 _MAX_LOG = 10.0  # log of the ratio of a box to its anchor; only untrained networks exceed it
+
+
+def thinned(clip: Clip, step: int) -> list[Frame]:
+    """Every `step`-th frame of a clip, and the last frame."""
+    return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
 
 
 @dataclass(frozen=True)

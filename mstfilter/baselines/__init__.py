@@ -2,11 +2,13 @@
 
 >>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
 
-`updates` has fusion without crossover (samples alone, tracking alone, their union). `proposals` has the floors, and
-`object_fusion` a map of volumes in the style of MID-Fusion. ``docs/baselines.md`` lists the presets.
+`updates` has fusion without crossover (samples alone, tracking alone, their union). `proposals` has the floors. A map
+of volumes in the style of MID-Fusion is in ``models/published/object_fusion.py``. ``docs/baselines.md`` lists all
+presets.
 """
 
 from mstfilter.lazy import attach
+from mstfilter.resources import models_folder
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
@@ -18,7 +20,7 @@ __components__ = {
         "one_blob": "OneBlob",
     },
     "update": {
-        "object_fusion": "ObjectFusion",
+        "object_fusion": f"{models_folder()}/published/object_fusion.py:ObjectFusion",
         "samples_only": "SamplesOnly",
         "tracking_only": "TrackingOnly",
         "union": "Union",

@@ -1,4 +1,3 @@
-from mstfilter.baselines.object_fusion import ObjectFusion as ObjectFusion
 from mstfilter.baselines.proposals import (
     FirstPause as FirstPause,
     ImageComponents as ImageComponents,

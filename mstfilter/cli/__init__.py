@@ -21,7 +21,6 @@ from mstfilter.errors import (
     missing_library,
     place_in_user_file,
 )
-from mstfilter.registry import loaded_components
 
 _WITHOUT_TYPER = """Usage: mstfilter list [KIND]
 
@@ -61,9 +60,7 @@ def _report(error: Exception, given: list[str]) -> int:
     if known := exhausted(error):
         _print("error", known.message, *known.hints)
         return 1
-    checks = [f"`mstfilter check {name}` tests the component of this command" for name in loaded_components()]
-    hints = [*getattr(error, "__notes__", ()), *(checks if place is None else []), "--debug shows the traceback"]
-    _print("error", describe_error(error), *hints)
+    _print("error", describe_error(error), *getattr(error, "__notes__", ()), "--debug shows the traceback")
     return 1
 
 

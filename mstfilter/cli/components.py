@@ -25,19 +25,13 @@ def list_(
 def check(
     component: Annotated[
         str,
-        typer.Argument(
-            help="./file.py:Class, KIND.NAME such as resampler.systematic, or the folder of a run, "
-            "a study or a recording."
-        ),
+        typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic."),
     ],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Values of fields.")
     ] = None,
 ) -> None:
-    """Test whether a component keeps the contract of its interface, or whether files in a folder are damaged."""
-    if Path(component).is_dir():
-        _check_folder(Path(component))
-        return
+    """Test whether a component keeps the contract of its interface."""
     from mstfilter.presets import REGISTRY, settings
     from mstfilter.smc.testing import FALSE_ALARM
     from mstfilter.testing import run_contract
@@ -61,25 +55,6 @@ def check(
     verdict = f"{broken} {'property is' if broken == 1 else 'properties are'} broken"
     print(f"{cls.__name__}: {verdict if broken else 'all properties that apply hold'}")
     if broken:
-        raise typer.Exit(1)
-
-
-def _check_folder(path: Path) -> None:
-    """Print which files of a run, of the runs of a study, or of a recording are damaged; then exit with code 1."""
-    from mstfilter.files import SUMS, damaged_files
-    from mstfilter.formats import open_recording
-    from mstfilter.runs import RunFolder
-
-    runs = [run.parent for run in sorted(path.glob("**/run.json")) if ".partial/" not in run.as_posix()]
-    damaged = [f"{run}: {wrong}" for run in runs for wrong in RunFolder.open(run).damage()]
-    noted = bool(runs) or (path / SUMS).exists()
-    if not runs and noted:
-        damaged = [f"{path}: {wrong}" for wrong in damaged_files(path)]
-    if not runs and not damaged:
-        open_recording(path, "recording").check()
-    note = "" if noted else f"; {SUMS} is missing, so changes are not noticed"
-    print("\n".join(f"damaged     {line}" for line in damaged) or f"sound       {path}{note}")
-    if damaged:
         raise typer.Exit(1)
 
 

@@ -22,7 +22,6 @@ from mstfilter.cli.root import (
     read_source,
     safe_name,
 )
-from mstfilter.errors import InputError
 from mstfilter.files import atomic_folder, check_output, locked, write_csv
 from mstfilter.report.progress import progress_bar
 
@@ -123,27 +122,18 @@ def simulate_(
 def report(
     run: Annotated[Path, typer.Argument(help="Run folder, or study folder.")],
     out: Annotated[Path | None, typer.Option(help="HTML file. Default: report.html in the folder.")] = None,
-    export: Annotated[Path | None, typer.Option(help="Also write meshes and label images into this folder.")] = None,
-    mesh_format: Annotated[str, typer.Option(help="Format of exported meshes: ply or obj.")] = "ply",
 ) -> None:
     """Write the report of a run or a study, which need not be finished."""
     if out is not None:
         check_output(out)
-    if export is not None:
-        check_output(export, folder=True, empty=False)
     if (run / "study.json").is_file():
         from mstfilter.report import write_study_report
 
-        if export is not None:
-            raise InputError(f"{run} is a study, only runs can be exported", f"export one of {run / 'runs'}")
         print(f"report      {write_study_report(run, out)}")
         return
-    from mstfilter.report import export_run, write_report
+    from mstfilter.report import write_report
 
     print(f"report      {write_report(run, out)}")
-    if export is not None:
-        export_run(run, export, mesh_format)
-        print(f"hypotheses  {export}")
 
 
 @app.command()
@@ -198,8 +188,8 @@ def convert(
 
 @app.command()
 def quality(
-    run: Annotated[Path, typer.Argument(help="Run folder, or label volumes (.npz or .npy).")],
-    truth: Annotated[Path, typer.Argument(help="Recording with ground truth, or its voxels.npz.")],
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    truth: Annotated[Path, typer.Argument(help="Recording with ground truth.")],
     csv: Annotated[Path | None, typer.Option(help="Also write the table into this file.")] = None,
     format: FormatOption = "",
     option: Options = None,
@@ -208,12 +198,10 @@ def quality(
     if csv is not None:
         check_output(csv)
     from mstfilter.runs import RunFolder
-    from mstfilter.scoring import read_estimates, read_truth, score_pauses
+    from mstfilter.scoring import read_truth, score_pauses
 
-    volumes = truth.is_file() and truth.suffix in (".npz", ".npy")
-    known = truth if volumes else read_source(truth, format, option, "")
-    estimates = RunFolder.open(run).estimates() if run.is_dir() else read_estimates(run)
-    rows = score_pauses(estimates, read_truth(known))
+    known = read_truth(read_source(truth, format, option, ""))
+    rows = score_pauses(RunFolder.open(run).estimates(), known)
     if csv is not None:
         write_csv(csv, [asdict(row) for row in rows], float_format=".6f")
     names = ("mean", "weighted", "best", "top", "estimate", "one_blob", "components")
@@ -225,7 +213,7 @@ def quality(
         print(f"{'all':<7}{form:<9}{'':>4}" + _numbers([row for row in rows if row.form == form], names, 12))
     if rows[0].brier == rows[0].brier:
         print("\nthe weighted set, asked whether two voxels belong to one object (lower is better)")
-        scores = ("log_loss", "base_rate", "brier", "calibration_error", "energy")
+        scores = ("log_loss", "base_rate", "brier", "calibration_error")
         these = [row for row in rows if row.form == forms[0]]
         print(f"{'pause':<7}" + "".join(f"{name:>19}" for name in scores))
         for row in these:

@@ -22,9 +22,6 @@ def study(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,
-    scheduler: Annotated[
-        str, typer.Option(help="Address of a Dask scheduler, tcp://HOST:PORT. Default: processes of this machine.")
-    ] = "",
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the small form that the table `smoke` of the file describes.")
     ] = False,
@@ -34,17 +31,12 @@ def study(
 
     wanted = load_study(config, smoke=smoke)
     check_arm_names(wanted, overrides or ())  # before any large library is imported
-    from mstfilter.study import Executor, Local, run_study
+    from mstfilter.study import Local, run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
     check_output(folder, folder=True, empty=False)
-    executor: Executor = Local(workers, folder / "logs")
-    if scheduler:
-        from mstfilter.study import Cluster
-
-        executor = Cluster(scheduler)
     with study_bars() as progress:
-        result = run_study(wanted, folder, executor, overrides or (), progress=progress)
+        result = run_study(wanted, folder, Local(workers, folder / "logs"), overrides or (), progress=progress)
     print(f"study       {folder}")
     print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
     _print_summary(result.folder.summary())
@@ -64,33 +56,15 @@ def _print_summary(summary: Any) -> None:
 
     from mstfilter.study import ENDPOINTS, title_of
 
-    if not summary.metrics or "quality" not in summary.names:
-        return
-    endpoints = [name for name in ENDPOINTS if name in summary.names]
-    columns = [
-        text
-        for name in endpoints
-        for text in (f"{title_of(name)}, t >= 1", "95 %", f"arm - {summary.reference}", "95 %")
-    ]
-    table = Table("family", "arm", "n", *columns, "s a step")
+    table = Table("metric, t >= 1", "family", "arm", "n", "mean", "95 %", f"arm - {summary.reference}", "95 %")
     compared = {(one.metric, one.family, one.arm): one.difference for one in summary.differences}
-    for family in summary.families:
-        for arm in summary.arms:
-            main, seconds = summary.metric(family, arm), summary.metric(family, arm, "core_seconds")
-            if main is None:
-                continue
-            cells = []
-            for name in endpoints:
-                metric, d = summary.metric(family, arm, name), compared.get((name, family, arm))
-                cells += ["", ""] if metric is None else [f"{metric.mean:.3f}", _range(*metric.interval)]
-                cells += (
-                    ["", ""]
-                    if d is None
-                    else ["–" if d.mean != d.mean else f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
-                )
-            spent = "" if seconds is None else f"{seconds.mean:.2f}"
-            table.add_row(family, arm, str(len(main.by_scene)), *cells, spent)
-    Console(width=None if sys.stdout.isatty() else 180).print(table)
+    for one in (one for name in ENDPOINTS for one in summary.metrics if one.name == name):
+        d = compared.get((one.name, one.family, one.arm))
+        cells = ["", ""] if d is None else [f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
+        numbers = str(len(one.by_scene)), f"{one.mean:.3f}", _range(*one.interval)
+        table.add_row(title_of(one.name), one.family, one.arm, *numbers, *cells)
+    if table.row_count:
+        Console(width=None if sys.stdout.isatty() else 180).print(table)
 
 
 def _range(low: float, high: float, sign: str = "") -> str:

@@ -19,7 +19,6 @@ __components__ = {
         "recording": "RecordingFolder",
         "pairs": "PairedImages",
         "tum": "Tum",
-        "bop": "Bop",
         "redwood": "Redwood",
         "bag": "Bag",
     },

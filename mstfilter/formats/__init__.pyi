@@ -1,5 +1,4 @@
 from mstfilter.formats.bag import Bag as Bag
-from mstfilter.formats.bop import Bop as Bop
 from mstfilter.formats.folder import (
     RecordingFolder as RecordingFolder,
     RecordingWriter as RecordingWriter,

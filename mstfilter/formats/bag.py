@@ -16,11 +16,10 @@ metres. Compressed depth is a PNG, or the ``compressedDepth`` transport: a heade
 from __future__ import annotations
 
 import contextlib
-import functools
 import struct
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,8 +31,6 @@ from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
 from mstfilter.scene import decode_image
-
-MAX_CHUNK = 2**28  #: Largest chunk of a bag when it is unpacked, in bytes
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,6 @@ class BagFile:
             with reading(file, "a bag"), open_regular(file, limit) as opened:
                 if file.suffix == ".bag" and opened.read(13) != b"#ROSBAG V2.0\n":
                     raise InputError(f"bag cannot be read: {file} does not begin with #ROSBAG V2.0")
-        _bound_decompressors()
         with self._reading():
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
@@ -123,35 +119,6 @@ class BagFile:
             if k == entry.ordinal:
                 return message
         raise InputError(f"bag {self.path} changed while it was read: a message of {topic} is missing")
-
-
-@functools.cache
-def _bound_decompressors() -> None:
-    """Limit rosbags to chunks of at most `MAX_CHUNK` bytes, since it unpacks chunks before it compares their size."""
-    import bz2
-
-    import lz4.frame
-    from rosbags.rosbag1 import reader
-    from rosbags.rosbag2 import storage_mcap
-
-    bounded = {
-        "bz2": _bounded(bz2.BZ2Decompressor),
-        "lz4": _bounded(lz4.frame.LZ4FrameDecompressor),
-        "zstd": _bounded(storage_mcap.zstd.ZstdDecompressor),
-    }
-    for table in (reader.decompressors, storage_mcap.DECOMPRESSORS):
-        table.update({name: bounded[name] for name in table if name in bounded})
-
-
-def _bounded(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
-    def decompress(data: bytes, *size: int) -> bytes:
-        engine = decompressor()
-        found: bytes = engine.decompress(data, max_length=MAX_CHUNK)
-        if len(found) == MAX_CHUNK and not engine.eof:
-            raise ValueError(f"a chunk needs more than {MAX_CHUNK} bytes when it is unpacked")
-        return found
-
-    return decompress
 
 
 def _close(reader: Any) -> None:

@@ -76,12 +76,6 @@ def detect_format(path: Path) -> str:
         raise InputError(
             f"{path} looks like {' and like '.join(found)}", f"choose one: --format {' or --format '.join(found)}"
         )
-    if _is_colour_only(path):
-        raise InputError(
-            f"{path} holds colour images only: hypotheses in 3-D need a depth image for every colour image",
-            "record with an RGB-D camera, with depth aligned to colour; `mstfilter list format` shows the layouts",
-            "if you have estimated depth, make a recording in Python: mstfilter.Recording.from_arrays",
-        )
     if path.is_dir() and (
         not any(path.iterdir()) or any((path / n).exists() for n in ("camera.json", "rgb", "depth"))
     ):
@@ -89,6 +83,7 @@ def detect_format(path: Path) -> str:
     raise InputError(
         f"{path} has no known format",
         f"known formats: {', '.join(names)}; `mstfilter list format` describes them",
+        "each colour image needs a depth image that is aligned with it: record with an RGB-D camera",
         "in Python, mstfilter.Recording.from_arrays makes a recording from arrays",
     )
 
@@ -104,16 +99,3 @@ def _with_lists(text: str) -> str:
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text
     return f"{path}={json.dumps([word.strip() for word in value.split(',') if word.strip()])}"
-
-
-_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".gif")
-_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-
-
-def _is_colour_only(path: Path) -> bool:
-    """Whether a path is a video file, an image, or a folder of images without any name that contains "depth"."""
-    if path.is_file():
-        return path.suffix.lower() in (*_VIDEOS, *_IMAGES)
-    names = [p.relative_to(path).as_posix().lower() for p in (*path.glob("*"), *path.glob("*/*"))]
-    images = any(name.endswith(_IMAGES) or name.endswith(_VIDEOS) for name in names)
-    return images and not any("depth" in name for name in names)

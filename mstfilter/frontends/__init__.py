@@ -8,11 +8,10 @@
 `mask_trees`        nested masks as a tree whose cuts are levels
 `mask_proposal`     the proposal, and the recipe for SAM
 `completions`       meshes, point clouds and voxels of others as completions
-`mask_trackers`     SAM 2 and EdgeTAM through their package
 ==================  ===================================================================
 
-The networks of the published system, COB and SiamMask, are files in ``models/published``. The registry loads these
-files like components of users. No weights are part of the package, and none are downloaded.
+The networks of the published system, COB and SiamMask, and the tracker SAM 2 are files in ``models/published``. The
+registry loads these files like components of users. No weights are part of the package, and none are downloaded.
 """
 
 from mstfilter.lazy import attach
@@ -20,11 +19,11 @@ from mstfilter.resources import models_folder
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-_COB, _SIAMMASK = (f"{models_folder()}/published/{name}.py" for name in ("cob", "siammask"))
+_COB, _SIAMMASK, _SAM2 = (f"{models_folder()}/published/{name}.py" for name in ("cob", "siammask", "sam2_tracker"))
 __components__ = {
     "proposal": {"mask_folder": "MaskProposal"},
     "boundary": {"cob": f"{_COB}:CobBoundary"},
     "tree": {"cob": f"{_COB}:CobTree"},
     "completer": {"external": "ExternalCompletion"},
-    "tracker": {"siammask": f"{_SIAMMASK}:SiamMaskTracker", "sam2": "Sam2Tracker"},
+    "tracker": {"siammask": f"{_SIAMMASK}:SiamMaskTracker", "sam2": f"{_SAM2}:Sam2Tracker"},
 }

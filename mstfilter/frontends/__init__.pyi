@@ -1,6 +1,5 @@
 from mstfilter.frontends.completions import ExternalCompletion as ExternalCompletion, read_shapes as read_shapes
 from mstfilter.frontends.mask_files import (
-    MaskRegion as MaskRegion,
     PauseMasks as PauseMasks,
     read_masks as read_masks,
     write_masks as write_masks,
@@ -9,7 +8,6 @@ from mstfilter.frontends.mask_proposal import (
     MaskProposal as MaskProposal,
     write_automatic_masks as write_automatic_masks,
 )
-from mstfilter.frontends.mask_trackers import Sam2Tracker as Sam2Tracker
 from mstfilter.frontends.mask_trees import (
     mask_tree as mask_tree,
     nested_masks as nested_masks,

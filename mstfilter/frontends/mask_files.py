@@ -2,29 +2,24 @@
 
 >>> write_masks("masks", 0, [labels_a, labels_b], weights=[0.7, 0.3])    # label images (H, W), 0 = no mask
 >>> masks = read_masks("masks", 0, (480, 640))
->>> [len(region.weights) for region in masks.regions]
-[2]
+>>> len(masks.trees), masks.weights
+(2, array([0.7, 0.3]))
 
 In the layout, numbers are those of the pauses (`Clip.index`), from 0::
 
     masks/000000.png              one segmentation of the image at pause 0
     masks/000001/a.png, b.npz     several alternatives of the whole image
-
-    masks/000002/left/a.json, b.json     alternatives of a region; the regions of a pause are independent
-    masks/000002/sure/0.json      a region with one alternative is certain
-
-    .../weights.json              optional, beside the alternatives: {"a.png": 2, "b.npz": 1}
+    masks/000001/weights.json     optional, beside the alternatives: {"a.png": 2, "b.npz": 1}
 
 A file is one set of masks of the size of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
 
 * ``.png``: label image, 8 or 16 bits, in which 0 means no mask.
 * ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), for labels in ascending
   order.
-* ``.json``: a list of COCO annotations, or ``{"masks": [...]}``. Each has ``segmentation: {size: [H, W], counts}``,
-  run lengths as numbers or compressed, and optionally ``score`` or ``predicted_iou``, as SAM writes it.
 
 Scores are at least 0. Missing scores are 1. Without weights.json, the weight of an alternative is the mean score of
-its largest masks. Weights of a region need not sum to 1.
+its largest masks. Weights need not sum to 1. For objects that are uncertain independently of each other, use nested
+masks in one alternative.
 """
 
 from __future__ import annotations
@@ -35,7 +30,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,34 +41,24 @@ from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
 
 MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
-_SUFFIXES = (".png", ".npz", ".json")
+_SUFFIXES = (".png", ".npz")
 _WEIGHTS = "weights.json"
 #: Number of axes, kinds of type, and words for an error, of the arrays in an npz file.
 _KINDS = {"labels": (2, "iu", "integers (H, W)"), "masks": (3, "b", "bool (n, H, W)")}
 
 
 @dataclass(frozen=True, eq=False)
-class MaskRegion:
-    """Alternatives of a region of the image, one of which is true."""
+class PauseMasks:
+    """The alternatives of a pause, one of which is true."""
 
-    name: str
     weights: np.ndarray  #: (k,) probabilities, their sum is 1
     trees: tuple[Tree, ...]  #: the masks of each alternative; leaf 0 is the rest of the image
     stops: tuple[np.ndarray, ...]  #: probabilities to stop at the nodes of each tree (see `mask_tree`)
-
-
-@dataclass(frozen=True, eq=False)
-class PauseMasks:
-    """All masks of a pause."""
-
-    regions: tuple[MaskRegion, ...]  #: independent, and without common pixels
     key: bytes  #: key of the content of the files
 
 
 def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
     """Read the masks of a pause. `shape` is that of the image, (H, W).
-
-    `shape` is the shape of the image, (H, W). `rgb` is compared with the key in npz files.
 
     Files are read at each call, but their content is parsed once. Raises InputError if the folder has no masks for
     the pause, or a file cannot be used.
@@ -82,30 +66,12 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseM
     if not str(folder):
         raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")
     where = _find(Path(folder), pause)
-    parts = {"": where} if where.is_file() else {p.name: p for p in _entries(where) if p.is_dir()}
-    files = [] if where.is_file() else [p for p in _entries(where) if p.is_file() and p.name != _WEIGHTS]
-    if parts and files and where.is_dir():
-        raise InputError(
-            f"{where} has both files and folders: {files[0].name} and {next(iter(parts))}",
-            "files are alternatives of the whole image, folders are regions; put a certain mask into a folder too",
-        )
-    groups = {name: [p] if p.is_file() else _alternatives(p) for name, p in parts.items()}
-    groups = groups or {"": _alternatives(where)}
-    content = {p: read_bytes(p, "masks") for group in groups.values() for p in group}
-    weights = {name: read_weights(group[0].parent, group) for name, group in groups.items() if len(group) > 1}
-    key = content_key(
-        "masks",
-        shape,
-        *(part for p, data in content.items() for part in (p.relative_to(where.parent).as_posix(), data)),
-        *((w, name) for name, w in weights.items()),
-    )
-
-    def parse() -> PauseMasks:
-        regions = tuple(_region(name, group, content, weights.get(name), shape) for name, group in groups.items())
-        _check_apart(regions, where)
-        return PauseMasks(regions, key)
-
-    return memo("mask_files", key, parse)
+    files = [where] if where.is_file() else _alternatives(where)
+    content = {path: read_bytes(path, "masks") for path in files}
+    weights = read_weights(where, files) if len(files) > 1 else None
+    named = (part for path, data in content.items() for part in (path.name, data))
+    key = content_key("masks", shape, weights, *named)
+    return memo("mask_files", key, lambda: _parsed(content, weights, shape, key))
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -125,7 +91,7 @@ def _find(folder: Path, pause: int) -> Path:
     if not found:
         raise InputError(
             f"folder {folder} has no masks",
-            "the masks of pause 0 are the file 000000.png, .npz or .json, or the folder 000000",
+            "the masks of pause 0 are the file 000000.png or .npz, or the folder 000000",
         )
     if pause not in found:
         numbers = ", ".join(map(str, sorted(found)))
@@ -141,7 +107,7 @@ def _find(folder: Path, pause: int) -> Path:
 
 
 def _alternatives(folder: Path) -> list[Path]:
-    """The mask files of a region."""
+    """The mask files of a pause."""
     files = [p for p in _entries(folder) if p.name != _WEIGHTS]
     for path in files:
         if path.is_dir() or path.suffix not in _SUFFIXES:
@@ -169,24 +135,21 @@ def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
     return [float(weights[p.name]) for p in files]
 
 
-def _region(
-    name: str,
-    files: list[Path],
-    content: Mapping[Path, bytes],
-    weights: Sequence[float] | None,
-    shape: tuple[int, int],
-) -> MaskRegion:
+def _parsed(
+    content: Mapping[Path, bytes], weights: Sequence[float] | None, shape: tuple[int, int], key: bytes = b""
+) -> PauseMasks:
+    """The alternatives in the content of files."""
     trees, stops, means = [], [], []
-    for path in files:
+    for path, data in content.items():
         with naming(str(path)):
-            masks, scores = _READERS[path.suffix](path, content[path], shape)
+            masks, scores = (_read_png if path.suffix == ".png" else _read_npz)(path, data, shape)
             tree, stop = (label_tree if masks.ndim == 2 else mask_tree)(masks, scores)
         trees.append(tree)
         stops.append(stop)
         means.append(_mean_of_largest(masks, scores))
     given = np.array(means if weights is None else weights)
-    share = given / given.sum() if given.sum() > 0 else np.full(len(files), 1 / len(files))
-    return MaskRegion(name, share, tuple(trees), tuple(stops))
+    share = given / given.sum() if given.sum() > 0 else np.full(len(given), 1 / len(given))
+    return PauseMasks(share, tuple(trees), tuple(stops), key)
 
 
 def _mean_of_largest(masks: np.ndarray, scores: np.ndarray) -> float:
@@ -203,22 +166,6 @@ def _mean_of_largest(masks: np.ndarray, scores: np.ndarray) -> float:
             largest.append(k)
         taken |= flat[k]
     return float(scores[largest].mean())
-
-
-def _check_apart(regions: tuple[MaskRegion, ...], where: Path) -> None:
-    """Raise InputError if two regions share pixels."""
-    taken: np.ndarray | None = None
-    for number, region in enumerate(regions):
-        mine = np.any([tree.leaves > 0 for tree in region.trees], axis=0)
-        taken = np.full(mine.shape, -1) if taken is None else taken
-        both = mine & (taken >= 0)
-        if both.any():
-            other = regions[int(taken[both][0])].name
-            raise InputError(
-                f"{where}: regions {other} and {region.name} share {int(both.sum())} pixels",
-                "regions are independent, so a pixel can be in one of them only",
-            )
-        taken[mine] = number
 
 
 def _check_shape(path: Path, found: Sequence[int], shape: tuple[int, int]) -> None:
@@ -264,76 +211,13 @@ def _read_npz(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarr
     return masks, scores
 
 
-def _read_json(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    with reading(path, "masks"):
-        entries = json.loads(data)
-    entries = entries.get("masks") if isinstance(entries, dict) else entries
-    most = min(MAX_MASKS, MAX_FILE // (shape[0] * shape[1]))  # a small file can hold many large masks
-    if not isinstance(entries, list) or len(entries) > most:
-        raise InputError(f"{path} is not a list of at most {most} masks, or an object with such a list `masks`")
-    masks, scores = np.zeros((len(entries), *shape), dtype=bool), np.ones(len(entries))
-    for k, entry in enumerate(entries):
-        rle = entry.get("segmentation") if isinstance(entry, dict) else None
-        if not isinstance(rle, dict) or not {"size", "counts"} <= set(rle):
-            raise InputError(
-                f"{path}: mask {k} has no segmentation with size and counts",
-                "run lengths are read, polygons are not; SAM writes them with output_mode='coco_rle'",
-            )
-        size = rle["size"]
-        if not isinstance(size, list) or len(size) != 2:
-            raise InputError(f"{path}: size of mask {k} is {size!r}, expected [H, W]")
-        _check_shape(path, size, shape)
-        with naming(f"{path}: mask {k}"):
-            masks[k] = decode_rle(rle["counts"], shape)
-        score = entry.get("score", entry.get("predicted_iou", 1.0))
-        if not isinstance(score, int | float) or isinstance(score, bool):
-            raise InputError(f"{path}: score of mask {k} is {score!r}, expected a number")
-        scores[k] = score
-    return masks, scores
-
-
-_READERS = {".png": _read_png, ".npz": _read_npz, ".json": _read_json}
-
-
-def decode_rle(counts: Any, shape: tuple[int, int]) -> np.ndarray:
-    """The mask (H, W) bool of COCO run lengths, as numbers or compressed text (cocoapi, maskApi.c, `rleFrString`).
-
-    Runs go down the columns and alternate. The first run is outside the mask.
-    """
-    runs: list[int] = []
-    if isinstance(counts, str):
-        value = shift = 0
-        for character in counts:
-            code = ord(character) - 48
-            if not 0 <= code < 64 or shift > 30:
-                raise InputError(f"compressed run lengths have the character {character!r}")
-            value |= (code & 31) << shift
-            shift += 5
-            if not code & 32:
-                value -= (code & 16) << (shift - 4)  # the sign bit of the last five bits
-                runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-                value = shift = 0
-        if shift:
-            raise InputError("compressed run lengths end within a number")
-    elif isinstance(counts, list) and all(type(c) is int for c in counts):
-        runs = counts
-    else:
-        raise InputError(f"run lengths are {str(counts)[:40]!r}, expected a text or a list of integers")
-    pixels = shape[0] * shape[1]
-    if any(not 0 <= run <= pixels for run in runs) or sum(runs) != pixels:
-        raise InputError(f"run lengths sum to {sum(runs)}, expected {pixels} for {shape[0]} x {shape[1]} pixels")
-    inside = np.arange(len(runs)) % 2 == 1
-    return np.repeat(inside, runs).reshape(shape[::-1]).T
-
-
 def write_masks(
     folder: str | Path,
     pause: int,
     alternatives: Sequence[np.ndarray | tuple[np.ndarray, Sequence[float] | np.ndarray]],
     weights: Sequence[float] | None = None,
-    region: str = "",
 ) -> None:
-    """Write the alternatives of a pause, or of one of its regions, as npz files. Earlier masks are replaced.
+    """Write the alternatives of a pause as npz files. Earlier masks are replaced.
 
     Nothing is written if the masks cannot be read; see `mstfilter.frontends.mask_files`.
 
@@ -347,10 +231,8 @@ def write_masks(
         with its scores.
     weights : sequence of float, optional
         One weight for each alternative. By default, computed from the scores.
-    region : str
-        Name of the region; empty for the whole image.
     """
-    path = Path(folder) / f"{pause:06d}" / region
+    path = Path(folder) / f"{pause:06d}"
     if not len(alternatives) or (weights is not None and len(weights) != len(alternatives)):
         given = "none" if weights is None else len(weights)
         raise InputError(
@@ -365,8 +247,7 @@ def write_masks(
                 arrays["scores"] = np.asarray(scores, dtype=np.float64)
             name = partial / f"{k}.npz"
             np.savez_compressed(name, **arrays)  # type: ignore[arg-type]
-            content = {name: read_bytes(name, "masks")}
-            _region("", [name], content, None, masks.shape[-2:])  # the checks of the reader
+            _parsed({name: read_bytes(name, "masks")}, None, masks.shape[-2:])  # the checks of the reader
         if weights is not None:
             write_text(partial / _WEIGHTS, json.dumps({f"{k}.npz": float(w) for k, w in enumerate(weights)}))
             read_weights(partial, _alternatives(partial))

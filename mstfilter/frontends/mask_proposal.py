@@ -3,9 +3,8 @@
 >>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
 
-`mstfilter.frontends.mask_files` describes the folder. A sampled segmentation has one alternative of each region,
-drawn by its weight and independently of the other regions, and a cut of the tree of its masks. Combinations are not
-enumerated: the work is that of the alternatives that are drawn, and each distinct mask is completed once.
+`mstfilter.frontends.mask_files` describes the folder. A sampled segmentation is a cut of the tree of masks of one
+alternative, which is drawn by its weight. Each distinct mask is completed once.
 """
 
 from __future__ import annotations
@@ -69,36 +68,31 @@ class MaskProposal(Proposal, UsesFiles):
         masks = read_masks(self.folder, observation.index, frame.depth.shape)
         chosen: list[list[int]] = [[] for _ in range(n)]
         pixels: dict[int, np.ndarray] = {}
-        alternatives = {}
-        for region in masks.regions:
-            drawn = child(rng, "region", _number(region.name.encode())).choice(
-                len(region.weights), n, p=region.weights
+        whole = _number(b"")  # names the random streams of the whole image
+        drawn = child(rng, "region", whole).choice(len(masks.weights), n, p=masks.weights)
+        for k in np.unique(drawn).tolist():
+            tree, rows = masks.trees[k], np.flatnonzero(drawn == k)
+            found = memo(
+                "segments",
+                (frame.key, grid.key, tree.key, component_key(self.objects)),
+                partial(self.objects.segments, tree, frame, grid),
             )
-            alternatives[region.name] = np.bincount(drawn, minlength=len(region.weights)).tolist()
-            for k in np.unique(drawn).tolist():
-                tree = region.trees[k]
-                rows = np.flatnonzero(drawn == k)
-                stream = child(rng, "cuts", _number(region.name.encode()), k)
-                found = memo(
-                    "segments",
-                    (frame.key, grid.key, tree.key, component_key(self.objects)),
-                    partial(self.objects.segments, tree, frame, grid),
-                )
-                w = node_values(tree, _stops_at_objects(tree, region.stops[k], found.is_object))
-                cuts = self.sampler.sample(stream, tree, w, len(rows)).cuts
-                numbers: dict[int, int] = {}
-                for row, cut in zip(rows.tolist(), cuts, strict=True):
-                    for node in cut[found.is_object[cut] & (cut > 0)].tolist():  # leaf 0 is the rest of the image
-                        if node not in numbers:
-                            mask = tree.mask(node) & found.object_pixels
-                            # Equal masks of several alternatives have the same number, and share the completion.
-                            numbers[node] = _number(np.packbits(mask).tobytes())
-                            pixels[numbers[node]] = mask
-                        chosen[row].append(numbers[node])
+            w = node_values(tree, _stops_at_objects(tree, masks.stops[k], found.is_object))
+            cuts = self.sampler.sample(child(rng, "cuts", whole, k), tree, w, len(rows)).cuts
+            numbers: dict[int, int] = {}
+            for row, cut in zip(rows.tolist(), cuts, strict=True):
+                for node in cut[found.is_object[cut] & (cut > 0)].tolist():  # leaf 0 is the rest of the image
+                    if node not in numbers:
+                        mask = tree.mask(node) & found.object_pixels
+                        # Equal masks of several alternatives have the same number, and share the completion.
+                        numbers[node] = _number(np.packbits(mask).tobytes())
+                        pixels[numbers[node]] = mask
+                    chosen[row].append(numbers[node])
         samples = [np.array(row, dtype=np.int64) for row in chosen]
         particles, counts = complete_segments(
             rng, observation, samples, pixels.__getitem__, self.completer, self.threshold
         )
+        alternatives = np.bincount(drawn, minlength=len(masks.weights)).tolist()
         notes = {"masks": masks.key.hex(), "alternatives": alternatives, **counts}
         return Population(particles, notes=notes)
 

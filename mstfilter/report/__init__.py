@@ -1,8 +1,7 @@
-"""Reports of runs and studies, pictures of hypotheses, and export to other programs.
+"""Reports of runs and studies, pictures and meshes of hypotheses.
 
->>> from mstfilter.report import export_run, write_report, write_study_report
+>>> from mstfilter.report import write_report, write_study_report
 >>> write_report("runs/demo")                                        # doctest: +SKIP
->>> export_run("runs/demo", "out", "obj")                            # doctest: +SKIP
 >>> write_study_report("studies/first")                              # doctest: +SKIP
 
 `overlay` and `voxel_picture` draw a hypothesis. `assign_identities` gives an object the same colour in all pictures

@@ -1,4 +1,4 @@
-from mstfilter.report.export import export_mesh as export_mesh, export_run as export_run
+from mstfilter.report.export import export_mesh as export_mesh
 from mstfilter.report.figures import (
     SERIES as SERIES,
     draw_forest as draw_forest,

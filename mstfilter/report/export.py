@@ -1,17 +1,9 @@
-"""Export of hypotheses for other programs: meshes, label images and a table of objects. open3d writes the meshes.
+"""Meshes of hypotheses for other programs. open3d writes them.
 
->>> export_run("runs/demo", "out")                         # PLY meshes
->>> export_run("runs/demo", "out", mesh_format="obj")
->>> export_mesh(hypothesis, "scene.obj")                   # one hypothesis
+>>> export_mesh(hypothesis, "scene.ply")
+>>> export_mesh(hypothesis, "scene.obj", assign_identities(run).colours(t, k))      # the colours of the report
 
-Layout of an exported run::
-
-    objects.csv                          pause, hypothesis, weight, label, id, birth, voxels, colour
-    pause_000/hypothesis_000.ply         meshes of all objects; world metres
-    pause_000/hypothesis_000.png         label of the object at each pixel, 0 for none
-
-Vertices have the colour of their object in the report. Objects share no vertices. A hypothesis without objects has
-no mesh file. The z axis points up as in the recording.
+Objects share no vertices. The z axis points up as in the recording.
 """
 
 from __future__ import annotations
@@ -23,15 +15,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_choice
-from mstfilter.files import atomic_path, write_csv, writing
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_path
 from mstfilter.open3d_import import import_open3d
-from mstfilter.report.identities import assign_identities
-from mstfilter.report.pictures import Colour, colour, hexadecimal
-from mstfilter.runs import RunFolder
-from mstfilter.scene import Hypothesis, project, write_image
-
-MESH_FORMATS = ("ply", "obj")
+from mstfilter.report.pictures import Colour, colour
+from mstfilter.scene import Hypothesis
 
 # Corners of the face of a unit voxel towards +axis, counter-clockwise seen from outside; reversed towards -axis.
 _CORNERS = {
@@ -82,44 +70,3 @@ def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, 
             raise InputError(f"open3d cannot write the mesh {path}", "choose another folder")
         os.replace(work, partial)
     return path
-
-
-def export_run(run: RunFolder | str | Path, out: str | Path, mesh_format: str = "ply") -> list[Path]:
-    """Write meshes and label images of all hypotheses of all pauses, and a table of all objects, in the layout above.
-
-    Returns the files. Raises InputError if an option is unknown, the folder cannot be written, or open3d cannot be
-    imported. `mesh_format` is "ply" or "obj".
-    """
-    check_choice("mesh_format", mesh_format, MESH_FORMATS)
-    import_open3d()  # a missing library is reported before anything is written
-    run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
-    identities = assign_identities(run)
-    paths: list[Path] = []
-    rows: list[dict[str, object]] = []
-    for t in range(run.n_pauses):
-        folder, camera, weights = Path(out) / f"pause_{t:03d}", run.camera(t), run.info(t)["weights"]
-        with writing(f"exports to {out}", "choose another folder"):
-            folder.mkdir(parents=True, exist_ok=True)
-        for k, hypothesis in enumerate(run.hypotheses(t)):
-            colours, volumes = identities.colours(t, k), hypothesis.volumes()
-            image = folder / f"hypothesis_{k:03d}.png"
-            write_image(image, project(hypothesis, camera))
-            paths.append(image)
-            if hypothesis.objects:
-                paths.append(export_mesh(hypothesis, image.with_suffix(f".{mesh_format}"), colours))
-            for record in hypothesis.objects:
-                rows.append(
-                    {
-                        "pause": t,
-                        "hypothesis": k,
-                        "weight": f"{weights[k]:.6g}",
-                        "label": record.label,
-                        "id": record.id,
-                        "birth": record.birth,
-                        "voxels": volumes[record.label],
-                        "colour": hexadecimal(colours[record.label]),
-                    }
-                )
-    columns = ("pause", "hypothesis", "weight", "label", "id", "birth", "voxels", "colour")
-    write_csv(Path(out) / "objects.csv", rows, columns)
-    return [*paths, Path(out) / "objects.csv"]

@@ -36,33 +36,25 @@ _REFERENCES = 6  # hypotheses of a pause that others are compared with
 class Identities:
     """Identity of every object of every hypothesis."""
 
-    #: ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth, a name that of another run.
-    table: Mapping[tuple[int, int | str], Mapping[int, int]] = field(default_factory=dict)
+    #: ``(pause, hypothesis) -> {label: identity}``; hypothesis -1 is the ground truth.
+    table: Mapping[tuple[int, int], Mapping[int, int]] = field(default_factory=dict)
 
-    def of(self, t: int, k: int | str) -> Mapping[int, int]:
+    def of(self, t: int, k: int) -> Mapping[int, int]:
         """``{label: identity}`` of hypothesis `k` (-1: the truth) at pause `t`."""
         return self.table.get((t, k), {})
 
-    def colours(self, t: int, k: int | str) -> dict[int, Colour]:
+    def colours(self, t: int, k: int) -> dict[int, Colour]:
         """``{label: (r, g, b)}`` of hypothesis `k` (-1: the truth) at pause `t`."""
         return {label: colour(identity) for label, identity in self.of(t, k).items()}
 
 
 def assign_identities(run: RunFolder) -> Identities:
-    """Identities of all objects of a run, pause by pause, and of the heaviest hypothesis of each compared run."""
-    assignment, compared = _Assignment(), run.compared()
+    """Identities of all objects of a run, pause by pause."""
+    assignment = _Assignment()
     for t in range(run.n_pauses):
         info = run.info(t)
         assignment.add(t, run.hypotheses(t), info["weights"], info["parents"].get("previous"), run.truth(t))
-        for name, other in compared.items():
-            if t < other.n_pauses:
-                assignment.add_other(t, name, heaviest(other, t))
     return Identities(assignment.table)
-
-
-def heaviest(run: RunFolder, t: int) -> Hypothesis:
-    """The hypothesis of largest weight at a pause."""
-    return run.hypotheses(t)[int(np.argmax(run.info(t)["weights"]))]
 
 
 def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[dict[int, Colour]]:
@@ -77,8 +69,8 @@ class _Assignment:
     """Identities of the pauses so far."""
 
     def __init__(self) -> None:
-        self.table: dict[tuple[int, int | str], dict[int, int]] = {}
-        self._ids: dict[tuple[int, int | str], dict[int, int]] = {}  # (pause, hypothesis) -> {stable id: identity}
+        self.table: dict[tuple[int, int], dict[int, int]] = {}
+        self._ids: dict[tuple[int, int], dict[int, int]] = {}  # (pause, hypothesis) -> {stable id: identity}
         # Voxels with identity + 1 (0 for none) of the truth and the heaviest hypotheses: of this pause, of the last.
         self._now: list[np.ndarray] = []
         self._before: list[np.ndarray] = []
@@ -111,15 +103,10 @@ class _Assignment:
             score = _DESCENT_SCORES[truth is not None]
             self._assign(t, k, h.labels, ids, self._ids.get((t - 1, parent), {}), score)
 
-    def add_other(self, t: int, name: str, hypothesis: Hypothesis) -> None:
-        """Add a hypothesis of another run after those of the pause."""
-        ids = {o.label: o.id for o in hypothesis.objects}
-        self._assign(t, name, hypothesis.labels, ids, self._ids.get((t - 1, name), {}), _DESCENT_SCORES[True])
-
     def _assign(
         self,
         t: int,
-        k: int | str,
+        k: int,
         labels: np.ndarray,
         ids: Mapping[int, int],
         inherited: Mapping[int, int],

@@ -39,7 +39,7 @@ from mstfilter.scoring import (
 def write_report(
     run: RunFolder | str | Path, out: str | Path | None = None, numbers: RunNumbers | None = None
 ) -> Path:
-    """Write the report of a run, finished or not, as HTML. Default: By default, ``report.html`` in the run folder.
+    """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
 
     `numbers` are those of `read_numbers`, if they are already known. Returns the file. Raises InputError if the
     folder is not a run folder, or the file cannot be written.
@@ -74,7 +74,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     pauses = []
     for t, (step, scene) in enumerate(zip(numbers.steps, scenes, strict=True)):
         assert scene.camera is not None and scene.image is not None and view is not None
-        cards = [_card(one, scene.camera, view) for one in (*scene.views, *scene.others)]
+        cards = [_card(one, scene.camera, view) for one in scene.views]
         pauses.append(
             {
                 "t": t,
@@ -92,7 +92,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
 
 
 def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
-    """Pictures and numbers of equal hypotheses, of the ground truth, or of another run, for the template."""
+    """Pictures and numbers of equal hypotheses, or of the ground truth, for the template."""
     # Small images are enlarged, so that contours are about as fine as on large ones.
     scale = max(1, round(960 / camera.width))
     return {

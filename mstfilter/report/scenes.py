@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mstfilter.report.identities import TRUTH, Identities, assign_identities, heaviest, names_of, weigh_distinct
+from mstfilter.report.identities import TRUTH, assign_identities, names_of, weigh_distinct
 from mstfilter.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Frame, Hypothesis, Recording, VoxelGrid, project
@@ -25,13 +25,13 @@ _MOST_VIEWS = 12  # hypotheses of a pause
 
 @dataclass(frozen=True)
 class ShownHypothesis:
-    """A hypothesis, the truth, or the heaviest hypothesis of another run, at a pause."""
+    """A hypothesis or the truth at a pause."""
 
     name: str
     text: str
     hypothesis: Hypothesis
     identity: Mapping[int, int]  #: label -> identity, which sets the colour
-    weight: float | None = None  #: None for the truth and other runs
+    weight: float | None = None  #: None for the truth
     colours: Mapping[int, Colour] = field(default_factory=dict)  #: in place of those of the identities
     quality: float | None = None
 
@@ -67,7 +67,6 @@ class ShownPause:
     camera: Camera | None = None
     links: Sequence[tuple[int, int]] = ()  #: (view of the last pause, view) where one descends from the other
     hidden: float = 0.0  #: weight of the hypotheses that are not shown
-    others: Sequence[ShownHypothesis] = ()  #: of the runs that are compared
 
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
@@ -92,21 +91,10 @@ def scenes_of_run(run: RunFolder) -> list[ShownPause]:
         if truth is not None:
             known = Hypothesis.from_labels(truth, hypotheses[0].grid)
             views.append(ShownHypothesis("truth", "", known, identities.of(t, TRUTH)))
-        hidden, others = float(sum(weight for _, weight in groups[_MOST_VIEWS:])), _others(run, t, identities)
+        hidden = float(sum(weight for _, weight in groups[_MOST_VIEWS:]))
         named = f"pause {t}", views, float(times[t])
-        scenes.append(ShownPause(*named, run.rgb(t), run.camera(t), sorted(links), hidden, others))
+        scenes.append(ShownPause(*named, run.rgb(t), run.camera(t), sorted(links), hidden))
     return scenes
-
-
-def _others(run: RunFolder, t: int, identities: Identities) -> list[ShownHypothesis]:
-    """The heaviest hypothesis of each compared run that has the pause."""
-    found = []
-    for name, other in run.compared().items():
-        if t < other.n_pauses:
-            best, scores = int(np.argmax(other.info(t)["weights"])), other.info(t)["quality"]
-            quality = None if scores is None else scores["objects"][best]
-            found.append(ShownHypothesis(name, "", heaviest(other, t), identities.of(t, name), quality=quality))
-    return found
 
 
 def scenes_of_recording(recording: Recording) -> list[ShownPause]:

@@ -39,8 +39,6 @@ _TABLES = {
         ("log_loss", "as it comes"),
         ("calibration_error", "calibration error"),
         ("brier", "Brier"),
-        ("energy", "energy score"),
-        ("energy_floor", "baseline: energy with noise"),
         ("diversity", "diversity"),
     ),
     "Objects and volume": (
@@ -61,7 +59,7 @@ _TABLES = {
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
     """Write the report of a study folder, finished or not, as HTML.
 
-    Default: By default, ``report.html`` in the study folder.
+    Default: ``report.html`` in the study folder.
 
     Returns the file. Raises InputError if the folder is not a study folder, or the file cannot be written.
     """

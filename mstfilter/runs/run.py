@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import platform
-import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import mstfilter
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError
 from mstfilter.files import atomic_folder, check_output, locked
 from mstfilter.lazy import progress_of
 from mstfilter.oracles import bind_truth, uses_truth
@@ -159,20 +158,9 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
                 + _first_difference(found, description[key]),
                 "choose another folder, or remove this one (on the command line: --replace)",
             )
-    _warn_of_another_machine(folder, description["machine"])
     folder.repair()
     folder.set_status("running")
     return folder
-
-
-def _warn_of_another_machine(folder: RunFolder, now: dict[str, Any]) -> None:
-    """Warn if the run was started on another kind of machine. The number of threads changes no result."""
-    found = {key: value for key, value in folder.description["machine"].items() if key != "threads"}
-    wanted = {key: value for key, value in now.items() if key != "threads"}
-    if found != wanted:
-        message = f"run folder {folder.path} was begun on another machine{_first_difference(found, wanted)}"
-        hint = "the last bits of the results can differ; start again with --replace to have all pauses of one machine"
-        warnings.warn(InputWarning(message, hint), stacklevel=4)
 
 
 def check_run_folder(path: Path, replace: bool = False) -> None:

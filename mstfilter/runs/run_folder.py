@@ -289,13 +289,6 @@ class RunFolder:
                 "move it elsewhere, or choose another folder",
             )
 
-    def damage(self) -> list[str]:
-        """The files of the run that differ from their hashes."""
-        found = damaged_files(self.path) if self.description["status"] == "done" else []
-        for t in range(self.n_pauses):
-            found += [f"pauses/{t:03d}/{wrong}" for wrong in damaged_files(self.pause(t))]
-        return found
-
     def repair(self) -> None:
         """Prepare the folder for resuming. Remove remains of a killed process, and damaged pauses with a warning.
 

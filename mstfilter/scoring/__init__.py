@@ -7,7 +7,7 @@ probabilities of the weighted set (`questions`, `log_loss`).
 >>> truth, status = recording.truth(2), object_status(recording, 2)
 >>> row, qualities = pause_metrics(labels, weights, truth)  # doctest: +SKIP
 >>> belief = score_belief(ask(recording, 2), hypotheses, weights, truth)  # doctest: +SKIP
->>> row["quality"], belief.row["brier"], belief.row["energy"]  # doctest: +SKIP
+>>> row["quality"], belief.row["brier"]  # doctest: +SKIP
 """
 
 from mstfilter.lazy import attach

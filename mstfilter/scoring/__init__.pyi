@@ -3,7 +3,6 @@ from mstfilter.scoring.log_loss import (
     NO_COUNTS as NO_COUNTS,
     BeliefScore as BeliefScore,
     FittedForecasts as FittedForecasts,
-    answer_distances as answer_distances,
     forecast_table as forecast_table,
     leave_one_out as leave_one_out,
     score_belief as score_belief,
@@ -19,7 +18,6 @@ from mstfilter.scoring.pauses import (
     PauseScore as PauseScore,
     PauseTruth as PauseTruth,
     measure_pause as measure_pause,
-    read_estimates as read_estimates,
     read_truth as read_truth,
     score_pauses as score_pauses,
 )

@@ -1,7 +1,7 @@
 """Scores of the probabilities of a weighted set of hypotheses: scores of its answers to `questions`.
 
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t))
->>> belief.row["brier"], belief.row["energy"]                  # as the hypotheses come
+>>> belief.row["brier"], belief.row["log_loss"]                # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
@@ -12,13 +12,6 @@ The score is the mean log loss in nats; lower is better. Noise at the border is 
 other scenes. So a forecaster that adds noise at borders gains nothing (`experiments/information` shows this for all
 methods). Forecasters are compared by the questions that their forecasts distinguish. Noise of another kind, or at a
 higher rate than the largest one, can still give a small gain.
-
-**Energy score.** With d the root of the share of questions that are answered differently,
-
-    ES = sum_i w_i d(h_i, y) - 1/2 sum_ij w_i w_j d(h_i, h_j)
-
-It is proper, and it is never shown without its floor. The floor is the score of the same hypotheses with one draw of
-noise at the border of each, at the rate that is best on other scenes.
 """
 
 from __future__ import annotations
@@ -30,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.forecasts import SOFTENING, ForecastTable, Recalibration, energy_score
+from mstfilter.forecasts import SOFTENING, ForecastTable, Recalibration
 from mstfilter.scene import Hypothesis, read_only
 from mstfilter.scoring.questions import NOISE_RATES, Questions
 
@@ -48,13 +41,12 @@ class BeliefScore(NamedTuple):
     ----------
     row : dict
         ``brier``: mean squared error of the forecasts. ``log_loss``: mean log loss of softened forecasts, in nats.
-        ``calibration_error``: on ten bins of equal numbers of questions. ``energy``: energy score.
-        ``energy_noise``: list, energy score with noise of each rate of `NOISE_RATES`.
+        ``calibration_error``: on ten bins of equal numbers of questions.
     counts : (r, 1001, 2) int32
         Number of questions by rate of noise, forecast in thousandths, and outcome.
     """
 
-    row: dict[str, Any]
+    row: dict[str, float]
     counts: np.ndarray
 
     @property
@@ -85,43 +77,21 @@ def score_belief(
     weights = np.asarray(weights, dtype=np.float64)
     if len(hypotheses) != len(weights) or not len(hypotheses):
         raise InputError(f"there are {len(hypotheses)} hypotheses and {len(weights)} weights")
-    m = len(questions)
-    if not m:
-        nan = float("nan")
-        unknown = dict.fromkeys(("brier", "log_loss", "calibration_error", "energy"), nan)
-        empty = np.zeros((len(NOISE_RATES), *NO_COUNTS.shape), np.int32)
-        return BeliefScore({**unknown, "energy_noise": [nan] * len(NOISE_RATES)}, empty)
+    if not len(questions):
+        unknown = dict.fromkeys(("brier", "log_loss", "calibration_error"), float("nan"))
+        return BeliefScore(unknown, np.zeros((len(NOISE_RATES), *NO_COUNTS.shape), np.int32))
     outcome = questions.outcomes(truth)
     forecasts = questions.forecasts(hypotheses, weights, NOISE_RATES)
-    labels = [one.labels if isinstance(one, Hypothesis) else one for one in hypotheses]
     table = ForecastTable.of(np.round(forecasts[0], 12), outcome)  # weights sum to 1 up to rounding
-    rng = np.random.default_rng(m)
-    energy = [
-        energy_score(*_root_distances(questions.answers(labels, rate, rng), outcome), weights) for rate in NOISE_RATES
-    ]
-    row: dict[str, Any] = {
+    row = {
         "brier": table.brier,
         "log_loss": table.log_loss(SOFTENING),
         "calibration_error": table.reliability().error,
-        "energy": energy[0],
-        "energy_noise": energy,
     }
     level = np.rint(forecasts * (N_LEVELS - 1)).astype(np.int64)
     code = (np.arange(len(level))[:, None] * N_LEVELS + level) * 2 + outcome
     counts = np.bincount(code.ravel(), minlength=len(level) * NO_COUNTS.size)
     return BeliefScore(row, counts.reshape(len(level), *NO_COUNTS.shape).astype(np.int32))
-
-
-def answer_distances(answers: np.ndarray) -> np.ndarray:
-    """Share (n, n) of the questions that two hypotheses answer differently, from answers (n, m) bool."""
-    a = answers.astype(np.float64)
-    n_yes = a.sum(axis=1)
-    return np.maximum(n_yes[:, None] + n_yes[None, :] - 2 * a @ a.T, 0.0) / max(answers.shape[1], 1)
-
-
-def _root_distances(answers: np.ndarray, outcome: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Roots of the shares: distances (n,) to the truth, and (n, n) between hypotheses."""
-    return np.sqrt(np.mean(answers != outcome, axis=1)), np.sqrt(answer_distances(answers))
 
 
 def forecast_table(counts: np.ndarray) -> ForecastTable:

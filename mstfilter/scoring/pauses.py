@@ -1,6 +1,6 @@
 """Scores of hypotheses, or of label volumes, at the pauses of a recording against the ground truth.
 
->>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(Path("recordings/mine/voxels.npz")))
+>>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(open_recording("recordings/mine")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
 There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). The row has the mean over
@@ -8,8 +8,8 @@ the hypotheses, the weighted mean, the maximum, and the values of two hypotheses
 least expected loss. The row also has two floors: the occupied voxels of the same hypotheses as one blob, and as
 connected components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in
 the image. Pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the
-weighted set: Brier score, log loss, log loss of the base rate, calibration error and energy score (`score_belief`),
-which are the same for all forms.
+weighted set: Brier score, log loss, log loss of the base rate and calibration error (`score_belief`), which are the
+same for all forms.
 
 `measure_pause` computes all metrics of a pause, for the tables of a study.
 """
@@ -18,15 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError
-from mstfilter.files import reading
-from mstfilter.reading import read_arrays
-from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, as_labels, render
+from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, render
 from mstfilter.scoring.log_loss import score_belief
 from mstfilter.scoring.metrics import diversity, least_loss, pairwise_quality, pause_metrics
 from mstfilter.scoring.quality import FORMS, connected_components, object_status, one_blob, weighted_coverage
@@ -45,7 +42,7 @@ class PauseEstimate:
         A `Hypothesis` also has probabilities of its voxels.
     weights : (n,) array
         The sum of the weights is 1.
-    frame : int, optional
+    frame : int
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
         Grid of arrays.
@@ -53,7 +50,7 @@ class PauseEstimate:
 
     hypotheses: Sequence[Hypothesis | np.ndarray]
     weights: np.ndarray
-    frame: int | None = None
+    frame: int
     grid: VoxelGrid | None = None
 
     @property
@@ -70,7 +67,7 @@ class PauseTruth:
     ----------
     labels : (X, Y, Z) array, or (H, W) if `camera` is given
         Label 0 is no object.
-    frame : int, optional
+    frame : int
         Frame of the recording.
     grid : VoxelGrid, optional
         Grid of a volume.
@@ -81,7 +78,7 @@ class PauseTruth:
     """
 
     labels: np.ndarray
-    frame: int | None = None
+    frame: int
     grid: VoxelGrid | None = None
     camera: Camera | None = None
     questions: Questions | None = None
@@ -105,58 +102,24 @@ class PauseScore:
     brier: float = float("nan")
     log_loss: float = float("nan")
     calibration_error: float = float("nan")
-    energy: float = float("nan")
     base_rate: float = float("nan")
 
 
-def read_estimates(path: Path) -> list[PauseEstimate]:
-    """Estimates from the label volumes of a file: .npz with ``labels`` as in voxels.npz, or .npy."""
-    volumes, frames, grid = _read_volumes(path, "label volumes")
-    return [PauseEstimate([one], np.ones(1), frame, grid) for one, frame in zip(volumes, frames, strict=True)]
-
-
-def read_truth(source: Path | Recording) -> list[PauseTruth]:
-    """Ground truth of a recording (volumes, or else instance images), or of a .npz or .npy file of volumes."""
-    if isinstance(source, Path):
-        volumes, frames, grid = _read_volumes(source, "true volumes")
-        return [PauseTruth(one, frame, grid) for one, frame in zip(volumes, frames, strict=True)]
+def read_truth(recording: Recording) -> list[PauseTruth]:
+    """Ground truth of a recording: volumes, or else instance images."""
     found = []
-    for t, index in enumerate(source.pauses):
-        volume, image = source.truth(t), source.instance(index)
+    for t, index in enumerate(recording.pauses):
+        volume, image = recording.truth(t), recording.instance(index)
         if volume is not None:
-            found.append(PauseTruth(volume, index, source.grid, questions=ask(source, t)))
+            found.append(PauseTruth(volume, index, recording.grid, questions=ask(recording, t)))
         elif image is not None:
-            found.append(PauseTruth(image, index, None, source.frames[index].camera))
+            found.append(PauseTruth(image, index, None, recording.frames[index].camera))
     if not found:
         raise InputError(
-            f"recording {source.name} has no ground truth: neither volumes (voxels.npz) nor instance images",
-            "give volumes as .npz: labels (S, X, Y, Z), frame (S,), origin (3,), voxel_size",
+            f"recording {recording.name} has no ground truth: neither volumes (voxels.npz) nor instance images",
+            "add one in Python: dataclasses.replace(recording, truth=volume, instance=image)",
         )
     return found
-
-
-def _read_volumes(path: Path, what: str) -> tuple[np.ndarray, list[int | None], VoxelGrid | None]:
-    """Labels (S, X, Y, Z), the frame of each or None, and the grid or None."""
-    if not path.exists():
-        raise InputError(f"{what}: file does not exist: {path}")
-    hint = "expected .npz with an array `labels` (S, X, Y, Z), or .npy"
-    data = read_arrays(path, what, hint)
-    with reading(path, what, hint):
-        data = {"labels": data[""]} if "" in data else data
-        if "particles/labels" in data:
-            raise InputError(f"{path} holds the hypotheses of one pause of a run", "give the run folder")
-        labels = data["labels"]
-        labels = as_labels(labels, f"{path}: labels")
-        labels = labels[None] if labels.ndim == 3 else labels
-        if labels.ndim != 4 or len(labels) == 0:
-            raise InputError(f"{path}: labels have shape {labels.shape}, expected (S, X, Y, Z), one volume a pause")
-        frames: list[int | None] = [int(f) for f in data["frame"]] if "frame" in data else [None] * len(labels)
-        if len(frames) != len(labels):
-            raise InputError(f"{path}: there are {len(labels)} label grids for {len(frames)} frames")
-        grid = None
-        if "origin" in data and "voxel_size" in data:
-            grid = VoxelGrid(data["origin"], float(data["voxel_size"]), labels.shape[1:])
-    return labels, frames, grid
 
 
 def measure_pause(
@@ -179,7 +142,7 @@ def measure_pause(
     -------
     row : dict
         Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
-        ``qualities`` and ``energy_noise`` are lists, which tables leave out.
+        ``qualities`` is a list, which tables leave out.
     counts : (r, 1001, 2) int32, or None without ground truth
         As in `BeliefScore`.
     """
@@ -197,19 +160,12 @@ def measure_pause(
 
 
 def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
-    """Scores of all pauses that have both. Pauses are matched by frame if both have frames, and else by order."""
-    by_frame = {t.frame: t for t in truths}
-    named = None not in by_frame and all(e.frame is not None for e in estimates)
-    if not named and len(estimates) != len(truths):
-        raise InputError(
-            f"there are {len(estimates)} pauses with hypotheses and {len(truths)} with truth, and no frame numbers",
-            "add an array `frame` (S,) to the .npz files",
-        )
+    """Scores of all pauses that have both. Pauses are matched by their frames."""
+    by_frame = {truth.frame: truth for truth in truths}
     rows = []
     for pause, estimate in enumerate(estimates):
-        truth = by_frame.get(estimate.frame) if named else truths[pause]
-        if truth is not None:
-            rows += _score_pause(pause, estimate, truth)
+        if estimate.frame in by_frame:
+            rows += _score_pause(pause, estimate, by_frame[estimate.frame])
     if not rows:
         raise InputError(
             f"no pause has both: hypotheses are at frames {[e.frame for e in estimates]}, truth at {list(by_frame)}",
@@ -226,8 +182,7 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
     belief = {}
     if truth.questions is not None:
         scores = score_belief(truth.questions, estimate.hypotheses, w, true)
-        belief = {name: scores.row[name] for name in ("brier", "log_loss", "calibration_error", "energy")}
-        belief["base_rate"] = scores.base_rate_loss
+        belief = {**scores.row, "base_rate": scores.base_rate_loss}
     best_guess, where = least_loss(found, w), "volume" if truth.camera is None else "image"
     rows = []
     for form in FORMS:
@@ -251,7 +206,7 @@ def _comparable(
             )
         return lambda labels: labels, truth.labels
     if grid is None:
-        raise InputError("label volumes without a grid cannot be projected", "add origin and voxel_size to the .npz")
+        raise InputError("label volumes without a grid cannot be projected", "give the field `grid`")
     known = truth.labels != _ROBOT
     return lambda labels: render(labels, grid, camera).labels[known], truth.labels[known]
 

@@ -111,23 +111,6 @@ class Questions:
         found = np.clip(found, 0.0, 1.0)  # sums of weights exceed 1 by rounding
         return found[0] if len(e) == 1 and not noisy else found
 
-    def answers(
-        self, labels: Sequence[np.ndarray], rate: float = 0.0, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        """(n, m) bool: the answer of each hypothesis. With a rate e, one draw of noise at its border is added."""
-        if not rate:
-            return np.stack([self.outcomes(one) for one in labels])
-        assert rng is not None
-        voxels, place, around = self._voxels
-        found = []
-        for one in labels:
-            flat = self._flat(one)
-            redrawn = around[rng.integers(len(around), size=len(voxels)), np.arange(len(voxels))]
-            drawn = np.where(rng.random(len(voxels)) < rate, flat[redrawn], flat[voxels])[place]
-            a, b = drawn[: len(self)], drawn[len(self) :]
-            found.append((a == b) & (a > 0))
-        return np.stack(found)
-
     def _shares(self, one: np.ndarray | Hypothesis) -> tuple[np.ndarray, np.ndarray | None]:
         """The object of each voxel, flat, and its probability; None if it is 1 for every object."""
         if not isinstance(one, Hypothesis):

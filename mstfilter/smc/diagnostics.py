@@ -37,7 +37,7 @@ def energy_distance(
     represent the same distribution, and else positive.
 
     ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
-    of negative type (`mstfilter.forecasts.is_negative_type`). For other distances, the result can be 0 for different
+    of negative type (Sejdinovic et al. 2013). For other distances, the result can be 0 for different
     distributions. Default: The default is Euclidean, for arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))

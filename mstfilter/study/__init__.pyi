@@ -1,4 +1,3 @@
-from mstfilter.study.cluster import Cluster as Cluster
 from mstfilter.study.config import (
     SceneEntry as SceneEntry,
     StudyConfig as StudyConfig,

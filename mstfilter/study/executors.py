@@ -1,4 +1,4 @@
-"""Executors run the jobs of a study: `Local` in processes of this machine, `Cluster` on a Dask scheduler.
+"""Executors run the jobs of a study: `Local` in processes of this machine. For a cluster, write an `Executor`.
 
 >>> outcomes = Local(workers=2).run(jobs, tell=print)
 

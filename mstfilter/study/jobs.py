@@ -75,7 +75,7 @@ def _check_code(expected: str) -> None:
     if code_version() != expected:
         raise InputError(
             "this process has other code of mstfilter than the study began with",
-            "after a change of the code, repeat the command; install the same version on all machines of a cluster",
+            "after a change of the code, repeat the command; all machines need the same version",
         )
     for package in PACKAGES:
         for name in package.__all__:

@@ -68,7 +68,6 @@ class JobOutcome:
 class _Row(BaseModel, extra="allow"):
     pause: int
     qualities: list[float | None] | None = None
-    energy_noise: list[float] | None = None
     __pydantic_extra__: dict[str, float | None]
 
 
@@ -205,24 +204,21 @@ class StudyFolder:
         return rows
 
     def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Add the recalibrated log loss and ``energy_floor`` to rows, in place.
+        """Add the recalibrated log loss to rows, in place.
 
-        The forecasts of a scene are recalibrated on the other scenes of its family and arm, and so is the rate of
-        noise for the floor of the energy score. Filter seeds of one scene are never on both sides.
+        The forecasts of a scene are recalibrated on the other scenes of its family and arm. Filter seeds of one scene
+        are never on both sides.
         """
         groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
-            if row.get("energy_noise"):
-                groups[row["family"], row["arm"]].append(row)
+            groups[row["family"], row["arm"]].append(row)
         for of_arm, own in groups.items():
             counts = self._counts(*of_arm)
             fits = leave_one_out(_sum_by_scene(counts))
-            best = {scene: _best_noise([row for row in own if row["scene"] != scene]) for scene in fits}
             for row in own:
                 scene, of_run = row["scene"], counts.get((row["scene"], row["seed"]))
                 if scene in fits and of_run is not None:
                     row[LOG_LOSS] = fits[scene].log_loss(of_run[row["pause"]])
-                    row["energy_floor"] = row["energy_noise"][best[scene]]
 
     def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
         """Counts (T, r, 1001, 2) of the forecasts of every run of an arm that has them, by scene and seed."""
@@ -277,12 +273,6 @@ def _sum_by_scene(counts: Mapping[tuple[str, Any], np.ndarray]) -> dict[str, np.
     for (scene, _), one in counts.items():
         found[scene] = found.get(scene, 0) + one[1:].sum(axis=0, dtype=np.int64)
     return found
-
-
-def _best_noise(rows: Sequence[Mapping[str, Any]]) -> int:
-    """Index of the rate of noise with the lowest mean energy score over pauses t >= 1."""
-    energies = [row["energy_noise"] for row in rows if row["pause"] >= 1 and row.get("energy_noise")]
-    return int(np.argmin(np.nansum(np.array(energies), axis=0)))
 
 
 def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter.baselines.object_fusion import ObjectFusion, ObjectVolume
 from mstfilter.presets import preset
+from mstfilter.registry import load_file
+from mstfilter.resources import models_folder
 from mstfilter.scene import Clip, Frame, Hypothesis, render
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import Population
@@ -15,6 +16,8 @@ from mstfilter.testing import scene_example
 from tests.baselines.scenes import slide
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
+module = load_file(models_folder() / "published" / "object_fusion.py")
+ObjectFusion, ObjectVolume = module.ObjectFusion, module.ObjectVolume
 RNG = np.random.default_rng(0)
 
 

@@ -285,22 +285,6 @@ def test_one_hypothesis_has_no_entropy_and_empty_hypotheses_count():
         assert belief.push_information(np.zeros(SHAPE, bool)) == belief.push_map(tolerance=20).max() == 0
 
 
-def test_one_object_or_two():
-    """A box that half of the hypotheses cut: a push knows, the depth of a camera does not."""
-    one = np.zeros(SHAPE, int)
-    one[:, 1, 0] = 1
-    two = one.copy()
-    two[2:, 1, 0] = 2
-    belief = belief_of([one, two], [0.0, 0.0])
-    assert belief.push_information((0, 1, 0)) == pytest.approx(np.log(2))
-    assert belief.push_information((0, 0, 0)) == 0
-    assert belief.view_information(CAMERA) == 0
-    np.testing.assert_allclose(belief.object_count(), [0, 0.5, 0.5])
-    assert belief.boundary_entropy()[1, 1, 0] == belief.boundary_entropy()[2, 1, 0] == pytest.approx(np.log(2))
-    assert belief.boundary_entropy().astype(bool).sum() == 2
-    assert belief.push_information((0, 1, 0), 2) == pytest.approx(-np.log(0.5 + 0.5 * np.exp(-1)))  # 2 voxels differ
-
-
 def test_probabilities_of_unsure_hypotheses():
     """Occupancy and "same object" by their definition, with hypotheses that say how sure they are of each voxel."""
     rng = np.random.default_rng(4)

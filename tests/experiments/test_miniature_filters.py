@@ -18,16 +18,13 @@ from miniature_filters import (
     rank_uniformity,
     state_statistics,
     state_weights,
-    total_variation,
 )
 from miniature_mst import (
     CutProposal,
     DepthFreeSpace,
-    ScoredFusion,
     adapt_to_miniature,
     balanced_filter,
     cut_distribution,
-    predictive_distribution,
 )
 from miniature_world import Miniature, Observation
 
@@ -71,26 +68,6 @@ def test_the_evidence_is_unbiased(name, world):
         ratio = np.exp([filter.run(observations, seed)[0].log_evidence - exact for seed in range(80)])
         assert ratio.std() < 0.5
         assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
-
-
-@pytest.mark.parametrize("name", PROPER)
-@ids
-def test_proper_filters_converge(name, world):
-    """The distance falls like 1 / sqrt(n) once n is large: 16 times the particles, a quarter of it (0.4 allowed).
-
-    The median over twelve data sets is compared: the mean depends on a few with weights that vary much.
-    """
-    sizes, distances = (1000, 16_000), []
-    for n in sizes:
-        tv = []
-        for seed in range(12):
-            _, observations = world.simulate(np.random.default_rng(seed), 3)
-            state, _ = PROPER[name](world, n).run(observations, seed)
-            exact = exact_filter(world, observations).posterior[-1]
-            tv.append(total_variation(state_weights(world, state.population), exact))
-        distances.append(np.median(tv))
-    assert distances[1] < 0.4 * distances[0]
-    assert distances[1] < 0.15
 
 
 def test_a_guided_move_is_an_importance_draw_of_the_motion_model():
@@ -164,37 +141,6 @@ def test_presets_run_and_report_no_evidence(name):
         [h.labels for h in a.population.particles], [h.labels for h in b.population.particles]
     )
     assert state_weights(WORLD, a.population).sum() == pytest.approx(1)
-
-
-def test_scored_candidates_are_distinct_and_weighted_by_prediction_times_likelihood():
-    _, observations = WORLD.simulate(np.random.default_rng(1), 2)
-    rng, y = np.random.default_rng(2), observations[1]
-    proposed = CutProposal(WORLD).sample(rng, y, 10)
-    predicted = Population(WORLD.states.take(WORLD.draw_prior(rng, 10)), np.log(np.arange(1.0, 11.0)))
-    law = predictive_distribution(WORLD, predicted)
-    assert law.sum() == pytest.approx(1)
-    rule = ScoredFusion(
-        WORLD, preset("mst_rules", WORLD, 10).update, distinct=True, predictive=True, include_parents=True
-    )
-    fused = rule.update(np.random.default_rng(0), predicted, proposed, y)
-    states = WORLD.states.index(fused.particles)
-    assert len(set(states.tolist())) == len(states)
-    assert set(WORLD.states.index(predicted.particles)) <= set(states)
-    expected = np.log(law) + WORLD.log_likelihood(y)
-    np.testing.assert_allclose(np.diff(fused.log_weights), np.diff(expected[states]), atol=1e-10)
-
-
-def test_scoring_without_crossover_returns_the_parents():
-    _, observations = WORLD.simulate(np.random.default_rng(1), 2)
-    proposed = CutProposal(WORLD).sample(np.random.default_rng(2), observations[1], 6)
-    predicted = Population(WORLD.states.take(WORLD.draw_prior(np.random.default_rng(3), 6)))
-    fusion = preset("mst_rules", WORLD, 6).update
-    fused = ScoredFusion(WORLD, fusion, built_per_particle=0, include_parents=True).update(
-        np.random.default_rng(0), predicted, proposed, observations[1]
-    )
-    np.testing.assert_array_equal(
-        WORLD.states.index(fused.particles), WORLD.states.index([*predicted.particles, *proposed.particles])
-    )
 
 
 def test_errors_of_the_exact_posterior_are_zero():

@@ -6,11 +6,8 @@ import importlib
 from functools import cache
 from xml.etree import ElementTree
 
-import numpy as np
-
 from tests.experiments.scripts import EXPERIMENTS, own_modules, run_script
 from tests.report.test_study_report import make_study
-from tests.segmentation.trees import all_cuts, random_tree
 
 FOLDER = EXPERIMENTS / "paper_figures"
 SIMULATED = ("teaser.png", "sampled_cuts.png")
@@ -60,30 +57,5 @@ def test_quality_over_time_is_a_complete_file(tmp_path):
     assert "the study has no arm 'mine'" in wrong
 
 
-def test_the_licence_of_the_r1_data_names_its_owner():
-    licence = (FOLDER / "results/LICENSE-R1").read_text()
-    assert "Copyright (c) 2020 The Autonomous Robotic Manipulation Lab" in licence
-    assert "Permission is hereby granted" in licence
-
-
 def test_figures_use_tuning_seeds():
     assert all(script(name).SEED < 100 for name in ("teaser", "sampled_cuts"))
-
-
-def test_drawn_tree_holds_every_node_of_the_cuts():
-    drawn = script("sampled_cuts").Drawn
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        tree = random_tree(rng, 12, most_children=3)
-        odds = np.where(np.arange(tree.n_nodes) < tree.n_leaves, 0, rng.normal(-5, 4, tree.n_nodes))
-        tree = type(tree)(tree.parent, tree.leaves, tree.start, odds)
-        cuts = [np.array(all_cuts(tree)[k]) for k in rng.integers(0, len(all_cuts(tree)), 2)]
-        part = drawn.of(tree, cuts)
-        assert {n for cut in cuts for n in cut.tolist()} <= set(part.x)
-        for node, inside in part.inside.items():
-            if inside:
-                assert sorted(inside) == list(tree.children[node])
-                assert min(part.x[c] for c in inside) < part.x[node] < max(part.x[c] for c in inside)
-                assert part.y[node] >= max(part.y[c] for c in inside)
-        ends = [part.x[n] for n, inside in part.inside.items() if not inside]
-        assert sorted(ends) == list(range(len(ends)))

@@ -44,28 +44,6 @@ def write_tum(path, shifts=SHIFTS, scale=0.0002, lag=0.004):
     return path
 
 
-def write_bop(path, shifts=(0, 3, 5), depth_scale=0.1):
-    rgb, depth, labels = video(shifts)
-    from mstfilter.scene import render
-    from tests.scene.scenes import GRID
-
-    for part in ("rgb", "depth", "mask_visib"):
-        (path / part).mkdir(parents=True)
-    cameras = {}
-    for k in range(len(rgb)):
-        number = 3 * k + 1
-        write_image(path / "rgb" / f"{number:06d}.png", rgb[k])
-        write_image(path / "depth" / f"{number:06d}.png", units(depth[k], depth_scale / 1000))
-        cameras[str(number)] = {"cam_K": CAMERA.K.ravel().tolist(), "depth_scale": depth_scale}
-        seen = render(labels[k], GRID, CAMERA).labels
-        for label in (1, 2):
-            write_image(
-                path / "mask_visib" / f"{number:06d}_{label - 1:06d}.png", (seen == label).astype(np.uint8) * 255
-            )
-    (path / "scene_camera.json").write_text(json.dumps(cameras))
-    return path
-
-
 def write_redwood(path, shifts=SHIFTS, scale=0.001):
     rgb, depth, _ = video(shifts)
     for part in ("color", "depth"):

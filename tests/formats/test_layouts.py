@@ -14,7 +14,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import open_recording
-from mstfilter.formats.bop import Bop
 from mstfilter.formats.folder import RecordingWriter, save_recording
 from mstfilter.formats.image_folders import Redwood, Tum
 from mstfilter.formats.pauses import Ends
@@ -26,7 +25,6 @@ from tests.formats.layouts import (
     SHIFTS,
     K,
     video,
-    write_bop,
     write_redwood,
     write_tum,
 )
@@ -201,34 +199,6 @@ def test_rgb_and_depth_without_a_file_of_intrinsics(tmp_path):
             open_recording(path)
 
 
-def test_bop(tmp_path):
-    """Depth in tenths of millimetres, image numbers with gaps, masks as instances that follow the box."""
-    path = write_bop(tmp_path / "000048")
-    recording = Bop(world=WORLD).open(path)
-    same_frames(recording, (0, 3, 5), atol=1e-6)
-    assert recording.pauses == (0, 1, 2)
-    columns = [np.nonzero(recording.instance(k) == 1)[1].mean() for k in range(3)]
-    assert columns[0] + 3 < columns[1] < columns[2]
-    assert set(np.unique(recording.instance(0))) == {0, 1, 2}
-    same_on_disk(recording, tmp_path / "out")
-    np.testing.assert_array_equal(open_recording(tmp_path / "out").instance(1), recording.instance(1))
-    few = Bop(images=(7, 1)).open(path)
-    np.testing.assert_array_equal(few.frames[0].rgb, video((5,))[0][0])
-    shutil.rmtree(path / "mask_visib")
-    assert Bop().open(path).instance(0) is None
-
-
-def test_bop_motion(tmp_path):
-    path = write_bop(tmp_path / "000048", shifts=SHIFTS[:12])
-    cameras = json.loads((path / "scene_camera.json").read_text())
-    for k, entry in enumerate(cameras.values()):
-        matrix = camera_to_world(k).inv().as_matrix()
-        entry["cam_R_w2c"] = matrix[:3, :3].ravel().tolist()
-        entry["cam_t_w2c"] = (matrix[:3, 3] * 1000).tolist()
-    (path / "scene_camera.json").write_text(json.dumps(cameras))
-    check_motion(Bop().open(path))
-
-
 def edit(file, change):
     data = json.loads(file.read_text())
     change(data)
@@ -265,10 +235,6 @@ def intrinsics(**entries):
     return lambda path: edit(path / "intrinsic.json", lambda data: data.update(entries))
 
 
-def camera_of(image, change):
-    return lambda path: edit(path / "scene_camera.json", lambda data: change(data[image]))
-
-
 def text(name, content):
     return lambda path: (path / name).write_text(content)
 
@@ -293,12 +259,8 @@ FAULTS = {
     "redwood, row by row": (Redwood(), ROW_BY_ROW, "expected the rows fx 0 cx"),
     "redwood, units below 1": (Redwood(), intrinsics(depth_scale=0.00025), "depth_scale is 0.00025, expected"),
     "redwood, no depth": (Redwood(), lambda path: shutil.rmtree(path / "depth"), "depth is missing"),
-    "bop, no depth_scale": (Bop(), camera_of("1", lambda entry: entry.pop("depth_scale")), "depth_scale"),
-    "bop, no cam_K": (Bop(), camera_of("4", lambda entry: entry.pop("cam_K")), "'cam_K' is missing"),
-    "bop, two cameras": (Bop(), camera_of("4", lambda entry: entry["cam_K"].reverse()), "image 4 differs"),
-    "bop, no such image": (Bop(images=(2,)), nothing, "image 2 is not"),
 }
-WRITERS = {"tum": write_tum, "redwood": write_redwood, "bop": write_bop}
+WRITERS = {"tum": write_tum, "redwood": write_redwood}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -1,4 +1,4 @@
-"""Which format it is, its options, and a reader of the user's own."""
+"""Which format it is, and its options."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.formats.bop import Bop
 from mstfilter.formats.image_folders import PairedImages, Redwood
 from mstfilter.formats.sources import detect_format, format_settings, open_recording
 from mstfilter.presets import REGISTRY
@@ -19,7 +18,6 @@ from tests.scene.test_recording import write
 
 WRITERS = {
     "tum": layouts.write_tum,
-    "bop": layouts.write_bop,
     "redwood": layouts.write_redwood,
     "recording": write,
 }
@@ -37,10 +35,12 @@ def test_unknown_and_ambiguous(tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("x")
     (tmp_path / "data.bin").write_bytes(b"x")
-    for name in ("notes", "data.bin"):
+    (tmp_path / "video.mp4").write_bytes(b"")
+    for name in ("notes", "data.bin", "video.mp4"):
         with pytest.raises(InputError, match="has no known format") as caught:
             open_recording(tmp_path / name)
-        assert "tum, bop, redwood, bag" in caught.value.hints[0]
+        assert "tum, redwood, bag" in caught.value.hints[0]
+        assert "RGB-D camera" in caught.value.hints[1]
     path = layouts.write_redwood(layouts.write_tum(tmp_path / "both") / "x").rename(tmp_path / "both2")
     for part in ("rgb.txt", "depth.txt"):
         (path / part).write_text("0 a.png\n")
@@ -61,10 +61,10 @@ def test_options_as_text():
 
 
 def test_a_single_number_is_a_list_of_one():
-    for option, images in (("images=0", (0,)), ("images=0,1", (0, 1))):
-        assert REGISTRY.make(Bop, format_settings([option])).images == images
-    with pytest.raises(InputError, match="images is"):
-        REGISTRY.make(Bop, format_settings(["images=x"]))
+    for option, frames in (("pauses.frames=0", (0,)), ("pauses.frames=0,1", (0, 1))):
+        assert REGISTRY.make(Redwood, format_settings(["pauses=at", option])).pauses.frames == frames
+    with pytest.raises(InputError, match="frames is"):
+        REGISTRY.make(Redwood, format_settings(["pauses=at", "pauses.frames=x"]))
 
 
 def test_options_reach_the_reader(tmp_path):
@@ -84,44 +84,6 @@ def test_options_reach_the_reader(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             open_recording(path, options=wrong)
-
-
-def test_a_reader_of_ones_own(tmp_path):
-    """A layout of the user's own: one class in a file, named like any component."""
-    rgb, depth, _ = layouts.video((0, 2))
-    np.savez(tmp_path / "mine.npz", rgb=rgb, depth=depth.astype(np.float32))
-    (tmp_path / "mine.py").write_text(
-        "from dataclasses import dataclass\n"
-        "import numpy as np\n"
-        "from mstfilter.formats import RecordingFormat\n"
-        "from mstfilter.scene.recording import Recording\n"
-        "@dataclass(frozen=True)\n"
-        "class Mine(RecordingFormat):\n"
-        "    '''Arrays in one file.'''\n"
-        "    f: float = 1.0\n"
-        "    @classmethod\n"
-        "    def detects(cls, path):\n"
-        "        return path.suffix == '.npz'\n"
-        "    def open(self, path):\n"
-        "        data = np.load(path)\n"
-        "        K = np.array([[self.f, 0, 79.5], [0, self.f, 59.5], [0, 0, 1]])\n"
-        "        return Recording.from_arrays(data['rgb'], data['depth'], K, name='mine')\n"
-    )
-    recording = open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", ["f=131"])
-    assert (recording.name, len(recording)) == ("mine", 2)
-    with pytest.raises(InputError, match="which is not loaded here"):
-        open_recording(tmp_path / "mine.npz", f"{tmp_path}/mine.py:Mine", allow_files=False)
-
-
-@pytest.mark.parametrize("layout", ["video.mp4", "rgb/000.png", "frames/0.jpg"])
-def test_colour_alone_is_one_error(layout, tmp_path):
-    file = tmp_path / "data" / layout
-    file.parent.mkdir(parents=True)
-    file.write_bytes(b"")
-    path = file if "/" not in layout else tmp_path / "data"
-    with pytest.raises(InputError, match="holds colour images only: hypotheses in 3-D need a depth image") as caught:
-        open_recording(path)
-    assert "RGB-D camera" in caught.value.hints[0]
 
 
 def test_label_images_beside_pairs_are_true_instances(tmp_path):

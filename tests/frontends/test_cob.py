@@ -15,7 +15,6 @@ from scipy import ndimage
 from mstfilter.errors import InputError
 from mstfilter.registry import load_file
 from mstfilter.resources import models_folder
-from mstfilter.scene import Camera, Frame, look_at
 from mstfilter.segmentation import OptimalCut, SceneCutObjectness, TreeCutProposal
 from tests.segmentation.scenes import TWO, clip_of, frame_of
 
@@ -41,23 +40,16 @@ def field(number: int, content: bytes) -> bytes:
     return varint(number << 3 | 2) + varint(len(content)) + content
 
 
-def encode(layers: dict[str, list[np.ndarray]], old: bool = False) -> bytes:
-    """A NetParameter with these blobs, as protoc would write it; `old` is the format before 2015."""
+def encode(layers: dict[str, list[np.ndarray]]) -> bytes:
+    """A NetParameter with these blobs, as protoc would write it."""
     out = [field(1, b"COB")]
     for name, blobs in layers.items():
         parts = []
         for blob in blobs:
-            if old:
-                sizes = (1,) * (4 - blob.ndim) + blob.shape
-                shape = b"".join(varint(k << 3) + varint(n) for k, n in enumerate(sizes, start=1))
-            else:
-                shape = field(7, field(1, b"".join(map(varint, blob.shape))))
+            shape = field(7, field(1, b"".join(map(varint, blob.shape))))
             parts.append(shape + field(5, blob.astype("<f4").tobytes()))
-        if old:
-            out.append(field(2, field(4, name.encode()) + b"".join(field(6, p) for p in parts)))
-        else:
-            content = field(1, name.encode()) + field(2, b"Convolution") + b"".join(field(7, p) for p in parts)
-            out.append(field(100, content))
+        content = field(1, name.encode()) + field(2, b"Convolution") + b"".join(field(7, p) for p in parts)
+        out.append(field(100, content))
     return b"".join(out)
 
 
@@ -108,7 +100,7 @@ def reference(layers: dict[str, list[np.ndarray]], x: np.ndarray) -> tuple[np.nd
     """The network, written from the names of the layers in the published prototxt, in double precision."""
     size = x.shape[1:]
     relu = lambda y: np.maximum(y, 0)  # noqa: E731
-    x = relu(conv(x, layers["conv1" if "conv1" in layers else "conv1_rgbHHA"]))
+    x = relu(conv(x, layers["conv1"]))
     found = {"conv1": x}
     x = functional.max_pool2d(torch.from_numpy(x), 2, ceil_mode=True).numpy()
     for stage, blocks in (("2", "abc"), ("3", "abcd"), ("4", "abcdef"), ("5", "abc")):
@@ -187,15 +179,11 @@ def test_a_file_is_read_name_by_name_and_shape_by_shape(model, blobs, tmp_path):
         for one, other in zip(found[name], expected, strict=True):
             assert one.dtype == np.float32
             assert (one == other).all()
-    old = tmp_path / "old.caffemodel"
-    chosen = {name: blobs[name] for name in ("conv1", "res2a_branch1")}
-    old.write_bytes(encode(chosen, old=True))
-    assert caffe.read_caffemodel(old)["conv1"][0].shape == (64, 3, 7, 7)
-    assert caffe.read_caffemodel(old)["conv1"][1].shape == (1, 1, 1, 64)
     single = field(100, field(1, b"a") + field(7, b"".join(varint(5 << 3 | 5) + struct.pack("<f", v) for v in (1, 2))
                                                + field(7, varint(1 << 3) + varint(2))))  # fmt: skip
-    old.write_bytes(varint(3 << 3) + varint(7) + varint(9 << 3 | 1) + bytes(8) + single)
-    assert caffe.read_caffemodel(old)["a"][0].tolist() == [1, 2]
+    other = tmp_path / "other.caffemodel"
+    other.write_bytes(varint(3 << 3) + varint(7) + varint(9 << 3 | 1) + bytes(8) + single)
+    assert caffe.read_caffemodel(other)["a"][0].tolist() == [1, 2]
 
 
 def test_the_component_runs_on_a_frame(model):
@@ -275,38 +263,6 @@ def test_polygons_of_a_chain():
     assert sorted(cob._segments(points, 1.5)) == [(0, 9), (9, 18)]
     stairs = np.array([(k // 2, (k + 1) // 2) for k in range(20)], float)
     assert cob._segments(stairs, 1.5) == [(0, 19)]
-
-
-def test_hha_of_a_plane():
-    """Straight down from 1.5 m: disparity 31000 / 150, the height of the table, an angle of 0 (the floor has 38)."""
-    pose = look_at(np.array([0.0, 0.0, 1.5]), np.array([0.0, 1e-6, 0.0]))
-    camera = Camera.from_intrinsics(100, 100, 31.5, 23.5, 64, 48, pose)
-    depth = np.full((48, 64), 1.5, np.float32)
-    depth[20:24, 30:34] = np.nan
-    found = cob.hha(Frame(np.zeros((48, 64, 3), np.uint8), depth, camera), 0.7)
-    assert (found[..., 0] == 207).all()
-    assert (found[..., 1] == 70).all()
-    assert (found[..., 2] == 38).all()
-    blank = Frame(np.zeros((48, 64, 3), np.uint8), depth * np.nan, camera)
-    with pytest.raises(InputError, match="no depth"):
-        cob.hha(blank, 0.7)
-
-
-def test_rgb_hha(blobs, tmp_path, monkeypatch):
-    blobs = {**blobs, "conv1_rgbHHA": [np.repeat(blobs["conv1"][0], 2, axis=1), blobs["conv1"][1]]}
-    del blobs["conv1"]
-    path = tmp_path / "hha.caffemodel"
-    path.write_bytes(b"read below")
-    monkeypatch.setattr(caffe, "read_caffemodel", lambda path: blobs)
-    frame = frame_of(TWO, width=48)
-    boundary = CobBoundary(str(path), input="rgbhha")
-    image = np.concatenate([frame.rgb, cob.hha(frame, 0.7)], axis=2)
-    means = np.array([122.67891434, 116.66876762, 104.00698793, 134.0313, 92.0228, 117.3808])
-    data = (image - means)[..., [2, 1, 0, 5, 4, 3]].transpose(2, 0, 1)
-    np.testing.assert_allclose(boundary.boundary(frame), reference(blobs, data)[0], atol=1e-4)
-    with pytest.raises(InputError, match="lacks 1 of 148 layers, the first is 'conv1'") as caught:
-        CobBoundary(str(path)).boundary(frame)
-    assert "other input" in caught.value.hints[0]
 
 
 def test_presets_name_the_components_without_importing_torch():

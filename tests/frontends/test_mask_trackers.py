@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.frontends import Sam2Tracker
 from mstfilter.registry import load_file
 from mstfilter.resources import models_folder
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, read_rgb, render
@@ -24,10 +23,12 @@ from tests.segmentation.scenes import GRID
 torch = pytest.importorskip("torch")
 functional = pytest.importorskip("torch.nn.functional")
 
-siammask, network_file = (
-    load_file(models_folder() / "published" / name) for name in ("siammask.py", "siammask_network.py")
+siammask, network_file, sam2 = (
+    load_file(models_folder() / "published" / f"{name}.py")
+    for name in ("siammask", "siammask_network", "sam2_tracker")
 )
 SiamMaskTracker, SiamMaskNetwork = siammask.SiamMaskTracker, network_file.SiamMaskNetwork
+Sam2Tracker = sam2.Sam2Tracker
 
 
 def branches() -> dict[str, tuple[int, ...]]:
@@ -373,22 +374,14 @@ def test_sam2_tracks_all_masks_with_one_pass_over_the_frames(tmp_path, monkeypat
     assert built[0].encoded == 4
     assert built[0].built == ("configs/sam2.1/sam2.1_hiera_t.yaml", str(path), "cpu")
     assert (tracker.track(clip_of(images[:1]), masks[:1])[0] == masks[0]).all()
+
+    def fails(config, checkpoint, device):
+        raise RuntimeError("missing keys\nand more")
+
+    monkeypatch.setitem(sys.modules, "sam2.build_sam", types.SimpleNamespace(build_sam2_video_predictor=fails))
+    with pytest.raises(InputError, match=r"sam2 cannot load .*sam2\.pt: RuntimeError: missing keys") as caught:
+        replace(tracker, device="cuda").track(clip_of(images), masks[:1])
+    assert "\n" not in caught.value.message
     monkeypatch.setitem(sys.modules, "sam2.build_sam", None)
     with pytest.raises(MissingLibraryError, match="cannot be imported"):
         replace(tracker, device="cuda").track(clip_of(images), masks[:1])
-
-
-def test_a_checkpoint_that_the_package_cannot_load_is_one_error(tmp_path, monkeypatch):
-    """The package raises anything."""
-    images, masks = video(2)
-    path = tmp_path / "x.pth"
-    path.write_bytes(b"")
-
-    def build(config, checkpoint, device):
-        raise RuntimeError("missing keys\nand more")
-
-    monkeypatch.setitem(sys.modules, "sam2", types.ModuleType("sam2"))
-    monkeypatch.setitem(sys.modules, "sam2.build_sam", types.SimpleNamespace(build_sam2_video_predictor=build))
-    with pytest.raises(InputError, match=r"sam2 cannot load .*x\.pth: RuntimeError: missing keys") as caught:
-        Sam2Tracker(str(path)).track(clip_of(images), masks[:1])
-    assert "\n" not in caught.value.message

@@ -6,7 +6,6 @@ import io
 import json
 import zipfile
 from collections import Counter
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ from mstfilter.frontends import (
     write_automatic_masks,
     write_masks,
 )
-from mstfilter.frontends.mask_files import decode_rle
 from mstfilter.presets import preset
 from mstfilter.scene import render, scene_cache, write_image
 from mstfilter.segmentation import ExactCuts, ObjectRule
@@ -59,51 +57,50 @@ def segments_of(hypothesis) -> frozenset[str]:
 
 
 def law(tmp_path: Path) -> dict[frozenset[str], float]:
-    """Write three regions, and return all segmentations with their probability, written down by hand."""
-    folder = tmp_path / "masks"
+    """Write alternatives, and return all segmentations with their probability, written down by hand."""
     left, right = halves(BOX[0], 1)
     top, bottom = halves(BOX[1], 0)
-    write_masks(folder, 0, [BOX[0].astype(int), left + 2 * right.astype(int)], weights=[3, 1], region="a")
     # A mask of score .9 and its two parts of score .6: the mask with probability .9 / (.9 + .6).
-    write_masks(folder, 0, [(stack(top, BOX[1], bottom), [0.6, 0.9, 0.6])], region="b")
-    # Alternatives without weights: the mean scores of their largest masks, .5 and .8.
-    third = halves(BOX[2], 1)
-    write_masks(folder, 0, [(stack(BOX[2]), [0.5]), (stack(*third), [0.7, 0.9])], region="c")
+    nested = stack(top, BOX[1], bottom, BOX[2]), [0.6, 0.9, 0.6, 1.0]
+    write_masks(tmp_path / "masks", 0, [left + 2 * right.astype(int), BOX[0].astype(int), nested], weights=[1, 2, 5])
     options = [
-        [((BOX[0],), 0.75), ((left, right), 0.25)],
-        [((BOX[1],), 0.6), ((top, bottom), 0.4)],
-        [((BOX[2],), 0.5 / 1.3), (third, 0.8 / 1.3)],
+        ((left, right), 1 / 8),
+        ((BOX[0],), 2 / 8),
+        ((BOX[1], BOX[2]), 5 / 8 * 0.6),
+        ((top, bottom, BOX[2]), 5 / 8 * 0.4),
     ]
     expected = {}
-    for combination in product(*options):
+    for masks, probability in options:
         single = tmp_path / f"single{len(expected)}"
-        masks = [mask for chosen, _ in combination for mask in chosen]
         write_masks(single, 0, [stack(*masks)])
         (hypothesis,) = MaskProposal(str(single)).sample(np.random.default_rng(0), CLIP, 1).particles
         assert hypothesis.n_objects == len(masks)
-        expected[segments_of(hypothesis)] = float(np.prod([p for _, p in combination]))
-    assert sum(expected.values()) == pytest.approx(1)
+        expected[segments_of(hypothesis)] = probability
     return expected
 
 
-def test_regions_alternatives_and_levels_are_sampled_with_their_law(tmp_path):
+def test_alternatives_and_levels_are_sampled_with_their_law(tmp_path):
     """Chi-square test against enumeration; a correct sampler fails it with probability 1e-6."""
     expected = law(tmp_path)
     population = MaskProposal(str(tmp_path / "masks")).sample(np.random.default_rng(1), CLIP, 4000)
     found = Counter(segments_of(h) for h in population.particles)
-    assert set(found) <= set(expected)
-    assert len(expected) == 8
+    assert set(found) == set(expected) and len(expected) == 4
     assert (population.log_weights == 0).all()
     counts = [found[one] for one in expected]
     assert chisquare(counts, 4000 * np.array(list(expected.values()))).pvalue > 1e-6
 
 
+def test_the_weight_of_an_alternative_is_the_mean_score_of_its_largest_masks(tmp_path):
+    left, right = halves(BOX[2], 1)
+    write_masks(tmp_path, 0, [(stack(BOX[2], left), [0.5, 0.1]), (stack(left, right), [0.7, 0.9])])
+    np.testing.assert_allclose(read_masks(tmp_path, 0, SHAPE).weights, [0.5 / 1.3, 0.8 / 1.3])
+
+
 def test_the_work_is_that_of_the_distinct_masks(tmp_path, monkeypatch):
-    """Four regions of ten alternatives: one tree for each file, one completion for each distinct mask."""
-    for r, box in enumerate([BOX[0], BOX[1], *halves(BOX[2], 1)]):
-        columns = np.nonzero(box)[1]
-        cuts = np.linspace(columns.min() + 2, columns.max() - 1, 10)
-        write_masks(tmp_path, 0, [np.where(np.indices(SHAPE)[1] < cut, 1, 2) * box for cut in cuts], region=f"r{r}")
+    """Ten alternatives: one tree for each file, one completion for each distinct mask."""
+    columns = np.nonzero(BOX[0])[1]
+    cuts = np.linspace(columns.min() + 2, columns.max() - 1, 10)
+    write_masks(tmp_path, 0, [np.where(np.indices(SHAPE)[1] < cut, 1, 2) * BOX[0] + 3 * BOX[1] for cut in cuts])
     calls = Counter()
     for cls, name in ((ObjectRule, "segments"), (Extrude, "fill")):
         usual = getattr(cls, name)
@@ -111,8 +108,8 @@ def test_the_work_is_that_of_the_distinct_masks(tmp_path, monkeypatch):
     scene_cache.clear()
     for seed in (0, 1):  # the same masks again: all work is found by its content
         population = MaskProposal(str(tmp_path)).sample(np.random.default_rng(seed), CLIP, 300)
-        assert population.notes["distinct_hypotheses"] > 250
-    assert calls["fill"] <= 80 and calls["segments"] <= 40
+        assert population.notes["distinct_hypotheses"] == 10
+    assert calls["fill"] <= 21 and calls["segments"] == 10
 
 
 def test_equal_masks_of_two_alternatives_are_completed_once(tmp_path):
@@ -203,41 +200,14 @@ def test_the_recipe_writes_the_masks_of_a_generator(tmp_path):
     assert {h.n_objects for h in population.particles} >= {2, 3}
 
 
-def encode_rle(mask: np.ndarray) -> tuple[list[int], str]:
-    """COCO run lengths as numbers and as text, written from the description of cocoapi's `rleToString`."""
-    flat = mask.T.ravel().astype(int)
-    ends = [0, *np.flatnonzero(np.diff(flat)) + 1, len(flat)]
-    runs = [0] * int(flat[0]) + np.diff(ends).tolist()
-    text = ""
-    for i, run in enumerate(runs):
-        x = run - runs[i - 2] if i > 2 else run
-        more = True
-        while more:
-            c = x & 31
-            x >>= 5
-            more = x != -1 if c & 16 else x != 0
-            text += chr((c | 32 if more else c) + 48)
-    return runs, text
-
-
 def test_files_of_all_kinds_hold_the_same_masks(tmp_path):
-    for k, mask in enumerate(BOX):
-        runs, text = encode_rle(mask)
-        assert (decode_rle(runs, SHAPE) == mask).all()
-        assert (decode_rle(text, SHAPE) == mask).all(), k
-    annotations = [
-        {"segmentation": {"size": list(SHAPE), "counts": encode_rle(mask)[k % 2]}, "predicted_iou": 0.9, "area": 1}
-        for k, mask in enumerate(BOX)
-    ]
-    (tmp_path / "000000.json").write_text(json.dumps(annotations))
-    (tmp_path / "1.json").write_text(json.dumps({"masks": annotations}))
-    write_image(tmp_path / "000002.png", SHOWN.astype(np.uint8))
-    write_image(tmp_path / "000003.png", (300 * SHOWN).astype(np.uint16))
-    np.savez(tmp_path / "000004.npz", labels=SHOWN.astype(np.int32))
-    write_masks(tmp_path, 5, [stack(*BOX)])
+    write_image(tmp_path / "000000.png", SHOWN.astype(np.uint8))
+    write_image(tmp_path / "1.png", (300 * SHOWN).astype(np.uint16))
+    np.savez(tmp_path / "000002.npz", labels=SHOWN.astype(np.int32))
+    write_masks(tmp_path, 3, [stack(*BOX)])
     (tmp_path / ".hidden").write_text("")
     (tmp_path / "README").write_text("")
-    leaves = [read_masks(tmp_path, k, SHAPE).regions[0].trees[0].leaves for k in range(6)]
+    leaves = [read_masks(tmp_path, k, SHAPE).trees[0].leaves for k in range(4)]
     for one in leaves:
         assert (one == SHOWN).all()
 
@@ -288,14 +258,7 @@ def weighted(content):
     )
 
 
-def runs(counts):
-    """An annotation with these run lengths."""
-    return text("000000.json", [{"segmentation": {"size": list(SHAPE), "counts": counts}}])
-
-
 PNG = image("000000.png", SHOWN.astype(np.uint8))
-ENTRY = {"segmentation": {"size": list(SHAPE), "counts": encode_rle(BOX[0])[0]}}
-LIST = ENTRY["segmentation"]["counts"]
 SHIFTED = np.roll(BOX[0], 3, axis=1)
 HOSTILE = {
     "pickle": (npz(labels=np.array([{"a": 1}], dtype=object)), "holds objects"),
@@ -304,7 +267,6 @@ HOSTILE = {
     "other arrays": (npz(x=np.zeros(3)), "no array labels or masks"),
     "text for npz": (text("000000.npz", "not a zip"), "cannot be read"),
     "another size, png": (image("000000.png", np.zeros((9, 8), np.uint8)), "9 x 8 pixels"),
-    "another size, json": (text("000000.json", [{"segmentation": {"size": [3, 4], "counts": [12]}}]), "3 x 4 pixels"),
     "overlap": (npz(masks=stack(BOX[0], SHIFTED)), "masks 0 and 1 overlap"),
     "equal masks": (npz(masks=stack(BOX[0], BOX[0])), "are equal"),
     "empty mask": (npz(masks=stack(BOX[0], BOX[0] & False)), "mask 1 is empty"),
@@ -316,27 +278,12 @@ HOSTILE = {
     "text scores": (npz(masks=stack(BOX[0]), scores=np.array(["a"])), "expected numbers"),
     "colour png": (image("000000.png", np.zeros((*SHAPE, 3), np.uint8)), "expected one channel"),
     "broken png": (text("000000.png", "PNG"), "cannot be decoded"),
-    "broken json": (text("000000.json", '[{"segmentation":'), "cannot be read: Expecting value"),
-    "json number": (text("000000.json", 3), "not a list"),
-    "polygon": (text("000000.json", [{"segmentation": [[1, 2, 3, 4]]}]), "no segmentation with size and counts"),
-    "short runs": (runs([5]), "sum to 5"),
-    "negative runs": (runs([-1, *LIST[1:], 1]), "run lengths sum"),
-    "broken text runs": (runs("é"), "character"),
-    "cut text runs": (runs("o"), "within a number"),
-    "text score": (text("000000.json", [{**ENTRY, "score": "high"}]), "expected a number"),
     "empty folder": (lambda path: None, "has no masks"),
     "missing pause": (image("000003.png", SHOWN.astype(np.uint8)), "no masks for pause 0; it has 3"),
-    "pause twice": (several(PNG, text("0.json", [])), "twice"),
+    "pause twice": (several(PNG, npz(labels=SHOWN)), "twice"),
     "folder without files": (lambda path: (path / "000000").mkdir(), "has no masks"),
     "unknown file": (text("000000/a.tif", "x"), "is not a file of masks"),
-    "files and folders": (
-        several(image("000000/a.png", SHOWN.astype(np.uint8)), text("000000/b/0.json", [])),
-        "both",
-    ),
-    "regions overlap": (
-        several(image("000000/a/0.png", SHOWN.astype(np.uint8)), image("000000/b/0.png", SHOWN.astype(np.uint8))),
-        "regions a and b share",
-    ),
+    "folder in a folder": (image("000000/a/0.png", SHOWN.astype(np.uint8)), "is not a file of masks"),
     "weights of others": (weighted({"a.png": 1}), "one weight for each of a.png, b.png"),
     "weight nan": (weighted('{"a.png": NaN, "b.png": 1}'), "weight of a.png is nan"),
     "weights zero": (weighted({"a.png": 0, "b.png": 0}), "all weights are 0"),
@@ -356,12 +303,9 @@ def test_files_that_cannot_be_used_are_one_clear_error(tmp_path, case):
 def test_the_memory_of_a_file_is_bounded(tmp_path, monkeypatch):
     """Files of a few kilobytes can announce gigabytes of empty masks."""
     monkeypatch.setattr("mstfilter.frontends.mask_files.MAX_FILE", 10 * SHAPE[0] * SHAPE[1])
-    for write in (text("000000.json", [ENTRY] * 11), npz(masks=np.zeros((11, *SHAPE), bool))):
-        for path in tmp_path.iterdir():
-            path.unlink()
-        write(tmp_path)
-        with pytest.raises(InputError, match="list of at most 10 masks|at most 192000 are read"):
-            read_masks(tmp_path, 0, SHAPE)
+    npz(masks=np.zeros((11, *SHAPE), bool))(tmp_path)
+    with pytest.raises(InputError, match="at most 192000 are read"):
+        read_masks(tmp_path, 0, SHAPE)
 
 
 class TestContract(ProposalContract):
@@ -392,11 +336,11 @@ def test_a_folder_is_required():
 def test_writing_replaces_what_was_there_or_changes_nothing(tmp_path):
     write_masks(tmp_path, 0, [SHOWN, BOX[0].astype(int), BOX[1].astype(int)], [1, 1, 1])
     write_masks(tmp_path, 0, [SHOWN])
-    assert len(read_masks(tmp_path, 0, SHAPE).regions[0].trees) == 1
+    assert len(read_masks(tmp_path, 0, SHAPE).trees) == 1
     with pytest.raises(InputError, match="overlap"):
         write_masks(tmp_path, 0, [stack(BOX[0], SHIFTED)])
     for alternatives, weights in (([], None), ([SHOWN], [1, 2])):
         with pytest.raises(InputError, match="expected at least 1 of each"):
             write_masks(tmp_path, 0, alternatives, weights)
-    assert (read_masks(tmp_path, 0, SHAPE).regions[0].trees[0].leaves == SHOWN).all()
+    assert (read_masks(tmp_path, 0, SHAPE).trees[0].leaves == SHOWN).all()
     assert [path.name for path in tmp_path.iterdir()] == ["000000"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -18,13 +17,12 @@ from mstfilter.oracles import (
     TrueMotions,
     TruePairs,
     TrueQuality,
-    UsesTruth,
     bind_truth,
     front_end,
     uses_truth,
 )
 from mstfilter.oracles.truth import RecordingTruth
-from mstfilter.partition import Cells, PartitionUpdate, Readings
+from mstfilter.partition import Cells, Readings
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis, component_key
@@ -290,13 +288,6 @@ def test_choice_and_selection_prefer_true_quality(recording):
     chosen = LargestWeights().resample(RNG, population.reweighted(score), 2)
     order = np.argsort(-score, kind="stable")
     assert chosen.parents["ancestor"].tolist() == order[:2].tolist()
-
-
-def test_oracles_are_frozen_dataclasses():
-    for cls in UsesTruth.__subclasses__():
-        assert dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen, cls
-        assert cls() == cls()
-    assert PartitionUpdate(evidence=(TrueQuality(),)) == PartitionUpdate(evidence=(TrueQuality(),))
 
 
 def test_component_key_depends_on_the_truth(tmp_path):

@@ -1,22 +1,20 @@
-"""Exports: closed meshes that are read back by open3d, and label images that equal the projection."""
+"""Meshes of hypotheses: closed, and read back by open3d."""
 
 from __future__ import annotations
 
-import csv
 import sys
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import MissingLibraryError
 from mstfilter.open3d_import import import_open3d
 from mstfilter.report import write_report
-from mstfilter.report.export import MESH_FORMATS, export_mesh, export_run, voxel_faces
+from mstfilter.report.export import export_mesh, voxel_faces
 from mstfilter.report.pictures import PALETTE
-from mstfilter.scene import Hypothesis, VoxelGrid, project, read_labels
+from mstfilter.scene import Hypothesis, VoxelGrid
 from tests.report.runs import make_run
-from tests.test_cli import call
 
 
 @pytest.fixture
@@ -67,7 +65,7 @@ def test_voxel_faces_are_closed_turned_outwards_and_hold_the_volume(seed, size):
     assert all(table.get((b, a)) == c for (a, b), c in table.items())
 
 
-@pytest.mark.parametrize("ending", MESH_FORMATS)
+@pytest.mark.parametrize("ending", ["ply", "obj"])
 def test_meshes_read_back_are_watertight_and_hold_the_volume_of_the_voxels(o3d, tmp_path, ending):
     path = export_mesh(two_boxes(), tmp_path / f"a.{ending}")
     assert list(tmp_path.iterdir()) == [path]
@@ -84,55 +82,16 @@ def test_meshes_read_back_are_watertight_and_hold_the_volume_of_the_voxels(o3d, 
     assert corners.max(axis=0) == pytest.approx([0.05, 0.03, 0.03], abs=1e-7)
 
 
-@pytest.mark.parametrize("ending", MESH_FORMATS)
+@pytest.mark.parametrize("ending", ["ply", "obj"])
 def test_the_same_hypothesis_gives_the_same_file(o3d, tmp_path, ending):
     first = export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes()
     assert export_mesh(two_boxes(), tmp_path / f"a.{ending}").read_bytes() == first
 
 
-def test_export_of_a_run(o3d, tmp_path):
-    run = make_run(tmp_path / "run")
-    files = export_run(run, tmp_path / "out")
-    assert len(files) == 3 * 3 * 2 + 1 and all(f.is_file() for f in files)
-    for t in range(3):
-        for k, hypothesis in enumerate(run.hypotheses(t)):
-            stem = tmp_path / "out" / f"pause_{t:03d}" / f"hypothesis_{k:03d}"
-            image = read_labels(stem.with_suffix(".png"))
-            assert image.dtype == np.uint16
-            np.testing.assert_array_equal(image, project(hypothesis, run.camera(t)))
-            assert len(objects_of(o3d, stem.with_suffix(".ply"))) == hypothesis.n_objects
-    with (tmp_path / "out" / "objects.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == sum(h.n_objects for t in range(3) for h in run.hypotheses(t))
-
-
-def test_a_hypothesis_without_objects_has_a_label_image_and_no_mesh(o3d, tmp_path):
-    run = make_run(tmp_path / "run", pauses=1, empty=True)
-    names = {path.name for path in export_run(run, tmp_path / "out")}
-    assert names == {"objects.csv", *(f"hypothesis_{k:03d}.png" for k in range(3))}
-
-
-def test_errors(o3d, tmp_path):
-    make_run(tmp_path / "run", pauses=1)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write exports"):
-        export_run(tmp_path / "run", tmp_path / "file")
-    with pytest.raises(InputError, match="mesh_format is 'stl'"):
-        export_run(tmp_path / "run", tmp_path / "out", mesh_format="stl")
-    assert not (tmp_path / "out").exists()
-
-
-def test_command(o3d, tmp_path, capsys):
-    run = make_run(tmp_path / "run", pauses=1)
-    code, out, _ = call("report", run.path, "--export", tmp_path / "out", "--mesh-format", "obj", capsys=capsys)
-    assert code == 0 and str(tmp_path / "out") in out
-    assert len(list((tmp_path / "out").rglob("*.obj"))) == 3
-
-
-def test_without_open3d_the_report_is_written_and_an_export_is_one_clear_error(tmp_path, monkeypatch):
+def test_without_open3d_the_report_is_written_and_a_mesh_is_one_clear_error(tmp_path, monkeypatch):
     run = make_run(tmp_path / "run", pauses=1)
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert write_report(run).is_file()
     with pytest.raises(MissingLibraryError, match="needs open3d, which cannot be imported"):
-        export_run(run, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+        export_mesh(two_boxes(), tmp_path / "a.ply")
+    assert not (tmp_path / "a.ply").exists()

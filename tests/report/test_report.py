@@ -95,16 +95,6 @@ def test_text_of_the_user_is_escaped(finished):
     assert "<b>odd & named</b>" in page.text
 
 
-def test_the_page_does_not_depend_on_the_place_of_the_folder(finished, tmp_path):
-    run, path = finished
-    moved = tmp_path / "elsewhere"
-    shutil.copytree(run.path, moved)
-    (moved / "report.html").unlink()
-    again = write_report(str(moved), tmp_path / "deep" / "page.html")
-    assert again.read_bytes() == path.read_bytes()
-    assert [p.name for p in again.parent.iterdir()] == ["page.html"]
-
-
 def test_only_times_differ_between_equal_runs(finished, tmp_path):
     _run, path = finished
     again = make_run(tmp_path / "again")
@@ -114,18 +104,6 @@ def test_only_times_differ_between_equal_runs(finished, tmp_path):
     assert other != read(path)[1].text and "62 s" in other
     pictures = [re.findall(r"data:image[^\"]*", p.read_text()) for p in (path, again.path / "report.html")]
     assert pictures[0] == pictures[1]
-
-
-def test_baselines_are_the_quality_of_the_occupied_voxels(finished):
-    run, _ = finished
-    numbers = read_numbers(run)
-    for t, step in enumerate(numbers.steps):
-        truth, expected = run.truth(t), 0.0
-        for h in run.hypotheses(t):
-            expected += weighted_coverage((h.labels > 0).astype(int), truth) / len(run.hypotheses(t))
-        assert step.baselines["one blob"] == pytest.approx(expected)
-        assert step.mean == pytest.approx(np.mean([weighted_coverage(h.labels, truth) for h in run.hypotheses(t)]))
-        assert step.true_objects == 2
 
 
 @pytest.mark.parametrize(
@@ -237,13 +215,12 @@ def test_notes_that_a_stage_passes_on_are_shown_once(tmp_path):
 
 
 def test_compared_runs_stand_beside_the_run(tmp_path):
-    """In the summary, the table, the figure, and as a card at every pause that they have."""
+    """In the summary, the table and the figure."""
     run = make_run(tmp_path / "run", pauses=2)
     other = make_run(tmp_path / "run" / "compare" / "without-past", pauses=1)
     assert list(run.compared()) == ["without past"]
     assert read_numbers(run).steps[0].compared == {"without past": np.mean(other.info(0)["quality"]["objects"])}
-    text, page = read(write_report(run))
-    assert page.text.count("Without past") == 2  # the card of pause 0 and the note
+    text, _ = read(write_report(run))
     assert "without past" in re.search(r'<svg class="figure".*?</svg>', text, flags=re.S)[0]
 
 

@@ -132,8 +132,6 @@ def test_a_study_without_results_has_a_page(tmp_path):
 def test_command(tmp_path, capsys):
     code, out, _ = call("report", make_study(tmp_path / "s"), "--out", tmp_path / "r.html", capsys=capsys)
     assert code == 0 and "r.html" in out
-    code, _, error = call("report", tmp_path / "s", "--export", tmp_path / "e", capsys=capsys)
-    assert code == 2 and "only runs can be exported" in error
     with pytest.raises(InputError, match="not a study folder"):
         write_study_report(tmp_path)
 

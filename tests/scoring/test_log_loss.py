@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.forecasts import ForecastTable, energy_score, is_negative_type
+from mstfilter.forecasts import ForecastTable
 from mstfilter.scoring import (
     NOISE_RATES,
     FittedForecasts,
     Questions,
-    answer_distances,
     draw_questions,
     forecast_table,
     leave_one_out,
@@ -45,15 +44,11 @@ def guesses(truth, rng, n=5, reach=2):
     return found
 
 
-def test_with_the_pair_distance_the_energy_score_is_the_brier_score():
+def test_the_brier_score_is_the_mean_squared_error():
     rng = np.random.default_rng(0)
     truth, questions = scene(0)
     labels, weights = guesses(truth, rng), rng.dirichlet(np.ones(5))
-    y = questions.outcomes(truth)
-    answers = questions.answers(labels)
-    energy = energy_score((answers != y).mean(axis=1), answer_distances(answers), weights)
-    brier = np.mean((questions.forecasts(labels, weights) - y) ** 2)
-    assert abs(energy - brier) < 1e-12
+    brier = np.mean((questions.forecasts(labels, weights) - questions.outcomes(truth)) ** 2)
     assert score_belief(questions, labels, weights, truth).row["brier"] == pytest.approx(brier, abs=1e-9)
 
 
@@ -88,9 +83,9 @@ def noisy_copies(labels, rate, rng):
     return np.where(rng.random(labels.shape) < rate, drawn, labels).astype(np.uint16)
 
 
-def test_hedging_by_noise_lowers_the_energy_score_and_does_not_lower_the_recalibrated_log_loss():
+def test_hedging_by_noise_lowers_the_brier_score_and_does_not_lower_the_recalibrated_log_loss():
     """Ten noisy copies of one hypothesis against the hypothesis itself, on twelve scenes."""
-    plain, hedged, energies = {}, {}, []
+    plain, hedged, raw = {}, {}, []
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
         truth, questions = scene(seed)
@@ -99,10 +94,8 @@ def test_hedging_by_noise_lowers_the_energy_score_and_does_not_lower_the_recalib
         one = score_belief(questions, [guess], np.ones(1), truth)
         ten = score_belief(questions, copies, np.full(10, 0.1), truth)
         plain[seed], hedged[seed] = one.counts, ten.counts
-        energies.append((one.row["energy"], ten.row["energy"]))
-    energies = np.array(energies)
-    assert (energies[:, 1] < energies[:, 0]).all()  # the raw score rewards the noise in every scene
-    assert energies[:, 1].mean() < 0.85 * energies[:, 0].mean()
+        raw.append((one.row["brier"], ten.row["brier"]))
+    assert all(noisy < exact for exact, noisy in raw)  # the raw score rewards the noise in every scene
     losses = [
         np.mean([fit.log_loss(counts[scene]) for scene, fit in leave_one_out(counts).items()])
         for counts in (plain, hedged)
@@ -145,16 +138,13 @@ def test_the_posterior_has_the_least_expected_scores():
     assert len(worlds) == 52
     first, second = np.triu_indices(4, 1)
     questions = Questions((4, 1, 1), first, second)
-    answers = questions.answers(worlds).astype(float)
-    roots = np.sqrt(answer_distances(answers > 0))
-    assert is_negative_type(roots) and is_negative_type(roots**2)
+    answers = np.stack([questions.outcomes(world) for world in worlds]).astype(float)
     posterior = rng.dirichlet(np.full(52, 0.2))
 
     def scores(weights):
         p = np.clip(weights @ answers, 1e-12, 1 - 1e-12)
         loss = -(posterior @ (answers * np.log(p) + (1 - answers) * np.log(1 - p))).mean()
-        energy = posterior @ roots @ weights - 0.5 * weights @ roots @ weights
-        return loss, energy
+        return loss, (posterior @ (answers - p) ** 2).mean()
 
     best = scores(posterior)
     for k in range(1000):

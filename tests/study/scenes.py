@@ -38,8 +38,8 @@ def metrics(path):
 class InProcess(Executor):
     """Runs jobs one after another in this process.
 
-    For tests of plans, resuming and tables: starting a worker takes longer than a small run. `Local` and `Cluster`
-    have their own tests.
+    For tests of plans, resuming and tables: starting a worker takes longer than a small run. `Local` has its
+    own tests.
     """
 
     def run(self, jobs, tell):

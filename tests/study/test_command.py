@@ -32,7 +32,7 @@ def test_it_prints_where_and_what(config, tmp_path, capsys):
     assert code == 0, error
     assert "study       studies/mine-smoke" in out
     assert "2 done, 0 of them earlier" in out
-    assert "mst transition=identity update.n_views=2" in out and "quality, t >= 1" in out
+    assert "mst transition=identity update.n_views=2" in out and "metric, t >= 1" in out
     code, out, _ = call("study", config, "--smoke", "update.n_views=1,2", capsys=capsys)
     assert "2 done, 2 of them earlier" in out
     code, _, error = call("study", config, "--smoke", "colour=1", capsys=capsys)

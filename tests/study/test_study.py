@@ -70,10 +70,6 @@ def test_split_grid():
     assert split_grid('a=[1, 2],"x,y"') == ["a=[1, 2]", 'a="x,y"']
 
 
-def test_smoke_replaces(folder):
-    assert load_study(folder / "base.toml", smoke=True).seeds == (3,)
-
-
 def test_identity_depends_on_the_configuration(folder):
     study = load_study(folder / "base.toml")
     runs = make_plan(study).runs
@@ -111,15 +107,6 @@ def test_recordings_of_one_name_in_two_groups(tmp_path):
     with pytest.raises(InputError, match="two scenes are called 'recordings-000001'") as caught:
         make_plan(study_of({**base, "scenes": unnamed}))
     assert caught.value.hints == ("give each a different group",)
-
-
-def test_a_larger_study_runs_new_runs_only(folder, tmp_path):
-    study = load_study(folder / "base.toml", smoke=True)
-    assert run_study(study, tmp_path / "out", InProcess(), cache=tmp_path / "cache").done == 4
-    larger = study.model_copy(update={"seeds": (*study.seeds, 7)})
-    more = run_study(larger, tmp_path / "out", InProcess(), cache=tmp_path / "cache")
-    assert (more.done, more.repeated) == (8, 4)
-    assert {r["seed"] for r in metrics(tmp_path / "out")} == {str(seed) for seed in larger.seeds}
 
 
 def test_keep_tables_removes_the_hypotheses(folder, tmp_path):

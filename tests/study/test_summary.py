@@ -85,10 +85,6 @@ def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():
     assert len(found.metric("f", "ours").by_scene) == 3
 
 
-def test_no_rows_give_no_differences():
-    assert summarise([], "ours").differences == ()
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("n_scenes", "better"), [(20, True), (1, False)])
 def test_a_filter_is_better_only_with_enough_scenes(n_scenes, better):

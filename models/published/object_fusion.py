@@ -43,6 +43,7 @@ from mstfilter.scene import (
 )
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
+from mstfilter.testing import scene_example
 from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
 
 #: Truncation of the signed distances in metres. Two voxels are better than three by .01 to .02 of quality on tuning
@@ -68,6 +69,9 @@ class _Match(NamedTuple):
 
     masks: dict[int, np.ndarray]
     new: list[int]
+
+
+example = scene_example  # of `mstfilter check update.object_fusion`
 
 
 @dataclass(frozen=True)

@@ -26,15 +26,10 @@ import numpy as np
 from mstfilter.errors import InputError, MissingLibraryError, describe_error
 from mstfilter.fields import PositiveInt
 from mstfilter.files import weights_file
-from mstfilter.scene import Clip, Frame, Recording, UsesFiles
+from mstfilter.scene import Clip, Recording, UsesFiles
 from mstfilter.tracking import MaskTracker
 
 _SAM2 = "https://github.com/facebookresearch/sam2"
-
-
-def thinned(clip: Clip, step: int) -> list[Frame]:
-    """Every `step`-th frame of a clip, and the last frame."""
-    return [*list(clip.frames)[: len(clip.frames) - 1 : step], clip.after]
 
 
 @dataclass(frozen=True)
@@ -70,7 +65,8 @@ class Sam2Tracker(MaskTracker, UsesFiles):
 
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame. Raises InputError if the package or the checkpoint is missing."""
-        predictor, frames = self.loaded(), thinned(clip, self.step)
+        predictor = self.loaded()
+        frames = [*list(clip.frames)[: len(clip.frames) - 1 : self.step], clip.after]
         if len(frames) == 1:
             return [mask.astype(bool) for mask in masks]
         found = [np.zeros(mask.shape, dtype=bool) for mask in masks]
