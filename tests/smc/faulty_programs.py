@@ -181,6 +181,12 @@ def a_mean_if_the_observation_is_missing(previous, y):
 
 
 @faulty(ALONE)
+def a_number_of_particles_in_the_closure(previous, y):
+    x = sample("x", Normal(np.zeros(200) if previous is None else 0.9 * previous["x"], 0.6))
+    seen(x, y)
+
+
+@faulty(ALONE)
 def a_parameter_by_position(previous, y):
     x = walk(previous)
     seen(x, y)
@@ -312,13 +318,6 @@ def an_observed_nan_of_some_particles(previous, y):
     x = walk(previous)
     with np.errstate(invalid="ignore"):
         observe("y", stats.gamma(2.0), np.log(x))
-
-
-@faulty("returned 'root' is NaN")
-def a_returned_nan(previous, y):
-    x = walk(previous)
-    seen(x, y)
-    return {"root": np.sqrt(x)}
 
 
 # --- values that copies share, and changes in place ---------------------------------------------------------------
@@ -589,14 +588,6 @@ def a_shift_that_cancels(previous, y):
     w = np.exp(v - v.max())
     k = sample("k", Categorical(w))
     seen(v[np.arange(len(k)), k], y)
-
-
-@correct(n=200)
-def a_number_of_particles_in_the_closure(previous, y):
-    x = sample("x", Normal(np.zeros(200) if previous is None else 0.9 * previous["x"], np.full(200, 0.6)))
-    age = np.zeros(200, int) if previous is None else previous["age"] + 1
-    seen(x, y)
-    return {"age": age}
 
 
 CALLS: list = []

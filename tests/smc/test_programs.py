@@ -211,14 +211,11 @@ def changed(x):
     [
         # events and observations whose shapes differ
         (r"'o': the value has shape \(\), expected \(4,\)", lambda s: observe("o", Normal(s.v + s.x, 1), s.y)),
-        (
-            r"site 's': an event has shape \(4,\), which changes",
-            lambda s: {"t": sample("s", Normal(s.v + s.x, 1))[:, 0]},
-        ),
-        (r"returned 's': an event has shape \(4,\), which changes", lambda s: {"s": s.v + s.x}),
+        (r"alone: site 's': the values have shape", lambda s: {"t": sample("s", Normal(s.v + s.x, 1))[:, 0]}),
+        (r"returned 's' has rows of shape \(4,\), alone \(3,\)", lambda s: {"s": s.v + s.x}),
         (r"'o': the value has shape \(4,\), expected \(\)", lambda s: observe("o", Normal(s.x, 1), s.y), np.zeros(4)),
         (r"has shape \(4,\), expected \(\)", lambda s: observe("o", Normal(s.x, 1), s.y), [0.1, 0.2, 0.3, 0.4]),
-        (r"has shape \(4,\), expected \(\)", lambda s: observe("o", Normal(0.0, 1), s.y - s.x), np.zeros(4)),
+        ("alone: .* do not fit together", lambda s: observe("o", Normal(0.0, 1), s.y - s.x), np.zeros(4)),
         (r"shape \(\), expected \(2,\)", lambda s: observe("o", Normal(np.zeros((1, 2)), 1), s.y)),
         (r"shape \(4,\), expected \(1,\)", lambda s: observe("o", Normal(s.v, 1), s.y), np.zeros(4)),
         (r"expected \(2,\)", lambda s: observe("o", MultivariateNormal([0, 0], np.eye(2)), s.y)),
@@ -227,10 +224,7 @@ def changed(x):
         (r"mean of shape \(4,\) does not fit", lambda s: observe("o", MultivariateNormal(s.x, [[1]]), s.y)),
         (r"'s': parameters of shapes \(4, 2\) and \(4,\)", lambda s: sample("s", Normal(np.zeros((4, 2)), s.z))),
         (r"returned 's' of shape \(3,\), expected one row per particle", lambda s: {"s": np.zeros(3)}),
-        (
-            r"'o': an error with one particle, and none with 4: mean of shape \(1,\) does not fit .* \(4, 4\)",
-            lambda s: observe("o", MultivariateNormal(s.x, np.eye(4)), np.zeros(4)),
-        ),
+        (r"alone: mean .* \(4, 4\)", lambda s: observe("o", MultivariateNormal(s.x, np.eye(4)), np.zeros(4))),
         # names
         ("expected a distribution", lambda s: sample(Normal(), "s")),
         ("the name of a site is a int", lambda s: sample(3, Normal())),
@@ -371,24 +365,18 @@ def test_a_site_in_branches_of_two_switches():
         (lambda previous, y: sample("x", Normal()) and None, "site 'k': the guide has no such site.*'k'"),
         (lambda previous, y: guide_of("z"), "the model has no site 'z', which the guide samples"),
         (lambda previous, y: guide_of(observes=True), "observation 'y': a guide does not observe"),
-        (
-            lambda previous, y: guide_of(k=Normal()),
-            "site 'k': the guide draws from a continuous Normal, the model from a discrete Cat",
-        ),
-        (lambda previous, y: guide_of(x=Bernoulli(0.2)), "site 'x': the guide draws from a discrete Bernoulli"),
+        (lambda previous, y: guide_of(k=Normal()), "no particle explains the observation"),
+        (lambda previous, y: guide_of(x=Bernoulli(0.2)), "site 'x': the guide never draws values"),
         (
             lambda previous, y: guide_of(x=Normal(np.zeros((1, 2)))),
-            r"site 'x': the values of the guide have shape \(30, 2\), expected \(30,\)",
+            r"site 'x': the values of the guide have shape \(200, 2\), expected \(200,\)",
         ),
-        (
-            lambda previous, y: guide_of(k=Categorical([0.5, 0.5])),
-            "'k': the guide chooses from 2 categories, the model from 3",
-        ),
+        (lambda previous, y: guide_of(k=Categorical([0.5, 0.5])), "site 'k': the guide never draws values"),
         (
             lambda previous, y: guide_of(branches=[True, False]),
             "'a' in branch 1 of 's': the guide does not draw it for",
         ),
-        (lambda previous, y: guide_of(branches=[True]), "site 's': the guide chooses from 1 branches"),
+        (lambda previous, y: guide_of(branches=[True]), "site 's': the guide never draws values"),
     ],
 )
 def test_a_guide_that_does_not_fit_the_model(guide, expected):
@@ -396,7 +384,7 @@ def test_a_guide_that_does_not_fit_the_model(guide, expected):
         guide_of()
         observe("y", Normal(), y)
 
-    text = errors_of(model, guide, n=30)
+    text = errors_of(model, guide, n=200)
     assert text.startswith("step 0, initial: ")
     assert re.search(expected, text, re.DOTALL), text
 
@@ -510,7 +498,7 @@ def test_values_of_particles_that_look_like_a_shared_vector():
         sizes.append(len(k))
 
     Program(model).bootstrap(4).run([0.3, 0.2, 0.1], 0)
-    assert list(sizes) == [4, 4, 1, 1] * 3  # every step is checked: it is repeated, and two particles run alone
+    assert list(sizes) == [4, 4, 3, 3] * 3  # every step is repeated, and two groups of particles run alone
     a, _ = Program(model).bootstrap(4).run([0.1], 0)
     p = a.population.particles
     expected = (

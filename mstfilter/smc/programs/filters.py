@@ -18,10 +18,10 @@ from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
 from mstfilter.smc.programs.handlers import (
+    GivenHandler,
     GuideHandler,
     ReplayHandler,
     SampleHandler,
-    ScoreHandler,
     SiteHandler,
 )
 from mstfilter.smc.programs.sites import ProgramRun, active_run
@@ -101,7 +101,7 @@ class _ProgramStep(Component):
             return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
         except InputError:
             if np.isnan(gain).any():  # name the site
-                run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
+                run_program(model, GivenHandler(particles, strict=True), previous, observation, n)
             raise
 
 
@@ -250,7 +250,6 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
             raise InputError(
                 f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"
             )
-        run.returns(name, value)
         if name in run.values and not _equal(value, run.values[name]):
             raise InputError(
                 f"a program returned {name!r} with other values than site {name!r}",
