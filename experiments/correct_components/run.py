@@ -178,8 +178,6 @@ def resamplers() -> Iterator[tuple[str, Any, Any, Any]]:
     basic = {
         **{name: getattr(smc, name)() for name in ("Multinomial", "Stratified", "Systematic", "Residual", "Ssp")},
         **{name: getattr(smc, name)() for name in ("Killing", "FearnheadClifford", "Chopthin")},
-        "Residual, stratified": smc.Residual("stratified"),
-        "Residual, systematic": smc.Residual("systematic"),
         "Chopthin, 20": smc.Chopthin(20.0),
         "Chopthin, 4": smc.Chopthin(4.0),
     }

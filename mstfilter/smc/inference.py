@@ -246,7 +246,6 @@ def ensemble(
     n_iterations: int,
     seed: int = 0,
     *,
-    moves: Any = None,
     batched: bool = False,
 ) -> Chains:
     """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
@@ -260,8 +259,6 @@ def ensemble(
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
         First parameters. At least 2 d different parameters are needed.
-    moves : optional
-        Moves of emcee; the default is its stretch move.
     """
     import emcee
 
@@ -276,7 +273,7 @@ def ensemble(
         found = posterior(rng, thetas)
         return np.stack([found["log_density"], found["log_evidence"]], axis=1)
 
-    sampler = emcee.EnsembleSampler(*theta.shape, log_density, moves=moves, vectorize=True)
+    sampler = emcee.EnsembleSampler(*theta.shape, log_density, vectorize=True)
     own = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))  # emcee draws from the legacy generator
     sampler.run_mcmc(emcee.State(theta, random_state=own.get_state()), n_iterations)
     evidence = sampler.get_blobs().reshape(n_iterations, len(theta))

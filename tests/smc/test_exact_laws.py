@@ -127,14 +127,10 @@ def test_multinomial_and_residual(weights, n, enumerated_uniforms):
 
 
 @pytest.mark.parametrize(("weights", "n"), CASES)
-@pytest.mark.parametrize(
-    "scheme",
-    [Systematic(), Residual("systematic"), Stratified(), Residual("stratified")],
-    ids=["systematic", "residual-systematic", "stratified", "residual-stratified"],
-)
+@pytest.mark.parametrize("scheme", [Systematic(), Stratified()], ids=["systematic", "stratified"])
 def test_schemes_of_uniforms(scheme, weights, n):
     """One uniform, or one a stratum; jumps at multiples of one over the total weight."""
-    by_strata = scheme in (Stratified(), Residual("stratified"))
+    by_strata = scheme == Stratified()
     n = min(n, 4) if by_strata else n
     mean, cov, counts = copies_law(scheme, weights, n, cells=int(np.sum(weights)))
     _, expected, f = expected_of(weights, n)
@@ -142,7 +138,7 @@ def test_schemes_of_uniforms(scheme, weights, n):
     assert (counts.sum(axis=1) == n).all()
     variance = f * (1 - f)
     if by_strata:  # the sum over the strata, of which a particle covers the share p
-        ends = np.cumsum(expected if scheme == Stratified() else f)[:, None]
+        ends = np.cumsum(expected)[:, None]
         begins, k = np.vstack([[0.0], ends[:-1]]), np.arange(n)
         p = np.clip(np.minimum(ends, k + 1) - np.maximum(begins, k), 0, None)
         variance = (p * (1 - p)).sum(axis=1)
@@ -217,14 +213,13 @@ def test_chopthin(weights, n, ratio):
     np.testing.assert_allclose(total, np.array(weights) / len(weights), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("order", ["position", "mean_partition"])
 @pytest.mark.parametrize("n", [1, 2, 4, 5])
-def test_sorted(order, n):
+def test_sorted(n):
     """The law of copies of the scheme in the sorted order; chosen particles keep their ancestors."""
     population = of([2.0, -1.0, 0.5, 1.0], [1.0, 3.0, 2.0, 2.0])
-    found = carried(Sorted(Systematic(), order), population, n, cells=8)
+    found = carried(Sorted(Systematic()), population, n, cells=8)
     np.testing.assert_allclose(found, np.exp(population.log_weights) / 4, atol=1e-12)
-    chosen = Sorted(Stratified(), order).resample(np.random.default_rng(0), population, n)
+    chosen = Sorted(Stratified()).resample(np.random.default_rng(0), population, n)
     np.testing.assert_array_equal(chosen.particles, population.particles[chosen.parents["ancestor"]])
 
 

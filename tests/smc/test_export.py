@@ -7,12 +7,10 @@ import sys
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.errors import MissingLibraryError
 from mstfilter.smc import (
     Always,
     Chains,
-    Infos,
-    Population,
     bootstrap,
     collect,
     ess,
@@ -24,26 +22,7 @@ from mstfilter.smc import (
 from tests.smc.models import AR1, ar1_observations
 
 RNG = np.random.default_rng(0)
-LOG_WEIGHTS = np.append(RNG.normal(-1000.0, 1.0, 5), -np.inf)
 CHAINS = Chains(RNG.normal(size=(4, 2, 3)), RNG.normal(size=(4, 2)), RNG.normal(size=(4, 2)), np.array([0.25, 0.5]))
-PARTICLES = {
-    "numbers": RNG.normal(size=6),
-    "vectors": RNG.normal(size=(6, 2)).astype(np.float32),
-    "mapping": {"k": np.arange(6), "pose": RNG.normal(size=(6, 2, 3))},
-}
-
-
-def test_columns_of_particles():
-    assert list(Population(PARTICLES["vectors"]).columns()) == ["x_0", "x_1", "weight", "log_weight"]
-    mapping = Population(PARTICLES["mapping"], LOG_WEIGHTS)
-    columns = mapping.columns()
-    assert list(columns)[:3] == ["k", "pose_0_0", "pose_0_1"] and len(columns) == 9
-    np.testing.assert_array_equal(columns["pose_1_2"], PARTICLES["mapping"]["pose"][:, 1, 2])
-    np.testing.assert_array_equal(columns["weight"], mapping.weights)
-    objects = Population(("a", ("b",)))
-    assert objects.columns()["particle"].tolist() == ["a", ("b",)]
-    with pytest.raises(InputError, match="arrays called weight"):
-        Population({"weight": np.zeros(2)}).columns()
 
 
 def test_columns_of_chains():
@@ -63,17 +42,16 @@ def test_data_frames():
     history = run_many(
         {"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=lambda state, info: info.n
     )
-    for table in (infos, history, CHAINS, Population(PARTICLES["mapping"])):
+    for table in (history, CHAINS):
         frame = pandas.DataFrame(table.columns())
         for name, column in table.columns().items():
             np.testing.assert_array_equal(frame[name].to_numpy(), column)
-    frame = pandas.DataFrame(infos.columns())
+    frame = pandas.DataFrame(infos.rows())
     assert frame["ess"].tolist() == [info.ess for info in infos] and frame["resampled"].dtype == bool
     row = pandas.DataFrame(history.columns()).query("arm == 'b' and seed == 5 and time == 3").iloc[0]
     assert (row["ess"], row["n"]) == (history["ess"][1, 1, 3], 9)
     table = history.to_xarray()
     assert table["ess"].dims == ("arm", "seed", "time") and float(table["n"].sel(arm="b", seed=5, time=3)) == 9
-    assert Infos().columns() == {}
 
 
 def test_a_missing_library(monkeypatch):

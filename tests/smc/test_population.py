@@ -113,10 +113,6 @@ def test_candidates_are_built_once_and_only_when_looked_at():
     assert candidates[7] == "candidate 7"
     assert built == [7, 500]
     assert candidates.n_built == 2
-    mapped = candidates.map(str.upper)
-    assert candidates.n_built == 2
-    assert mapped.take(np.array([500]))[0] == "CANDIDATE 500"
-    assert built == [7, 500]
 
 
 def test_moved_particles_keep_weights_and_parents():

@@ -153,7 +153,7 @@ def test_states_come_back_bit_for_bit(particles, tmp_path):
     n = len(next(iter(particles.values()))) if isinstance(particles, dict) else len(particles)
     population = Population(particles, np.linspace(-1e4, 1, n), {"previous": np.arange(n)})
     save_state(tmp_path / "s.npz", State(7, population, Key(3), False))
-    state, _ = load_state(tmp_path / "s.npz")
+    state = load_state(tmp_path / "s.npz")
     found = state.population.particles
     assert (state.t, state.key, state.properly_weighted) == (7, Key(3), False)
     np.testing.assert_array_equal(state.population.log_weights, population.log_weights)
@@ -178,7 +178,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
         save((Box((1,)),))
     assert not list(tmp_path.iterdir()), "nothing is left behind"
     save((Box((1,)), Box((2,))), Boxes())
-    assert load_state(tmp_path / "s.npz", Boxes())[0].population.particles == (Box((1,)), Box((2,)))
+    assert load_state(tmp_path / "s.npz", Boxes()).population.particles == (Box((1,)), Box((2,)))
     whole = (tmp_path / "s.npz").read_bytes()
     other, single = io.BytesIO(), io.BytesIO()
     np.savez(other, x=np.zeros(3))
@@ -204,7 +204,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
 def test_a_run_goes_on_from_a_stored_state(filter, ys, codec, tmp_path):
     whole, _ = filter.run(ys, 5)
     save_state(tmp_path / "run.npz", filter.run(ys[:4], 5)[0], codec)
-    state, _ = load_state(tmp_path / "run.npz", codec)
+    state = load_state(tmp_path / "run.npz", codec)
     state, infos = filter.run(ys[state.t :], state)
     assert [info.t for info in infos] == list(range(4, len(ys)))
     assert state.log_evidence == whole.log_evidence and state.t == len(ys)

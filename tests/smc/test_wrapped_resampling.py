@@ -12,7 +12,6 @@ from mstfilter.smc import (
     Chopthin,
     Population,
     Sorted,
-    Ssp,
     Stratified,
     Systematic,
 )
@@ -64,19 +63,6 @@ def test_vectors_are_selected_closer_along_the_hilbert_curve():
     assert 0 < distances["sorted"] < 0.7 * distances["plain"]
 
 
-def test_mean_partition_keeps_as_many_light_particles_as_on_average():
-    rng = np.random.default_rng(5)
-    for _ in range(200):
-        population = Population(np.arange(30.0), 0.3 * rng.standard_normal(30))
-        light = population.weights <= 1 / 30
-        chosen = Sorted(Systematic(), "mean_partition").resample(rng, population, 30)
-        kept = light[chosen.parents["ancestor"]].sum()
-        assert abs(kept - 30 * population.weights[light].sum()) < 1
-        assert (np.bincount(chosen.parents["ancestor"], minlength=30)[light] <= 1).all()
-        ssp = Sorted(Ssp(), "mean_partition").resample(rng, population, 30)
-        assert len(ssp) == 30
-
-
 def test_sorted_orders_mappings_and_refuses_objects():
     rng = np.random.default_rng(0)
     x = rng.standard_normal((20, 1))
@@ -87,9 +73,6 @@ def test_sorted_orders_mappings_and_refuses_objects():
         Sorted().resample(rng, Population(("a", "b")), 2)
     with pytest.raises(InputError, match="63 dimensions"):
         Sorted().resample(rng, Population(rng.standard_normal((5, 63))), 2)
-    assert len(Sorted(order="mean_partition").resample(rng, Population(("a", "b")), 2)) == 2
-    with pytest.raises(InputError, match="order is 'size'"):
-        Sorted(order="size")
 
 
 # --- chopthin -----------------------------------------------------------------------------------------------------

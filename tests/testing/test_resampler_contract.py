@@ -58,7 +58,6 @@ def test_no_planted_fault_is_lost():
 
 OURS = {
     **{name: REGISTRY.build("resampler", name) for name in smc.__components__["resampler"]},
-    "mean partition": Sorted(order="mean_partition"),
     "tempered optimal": Tempered(FearnheadClifford(), 0.0),
     "clusters, optimal inside": ClusterStratified(Gaussian(0.5), 0.3, FearnheadClifford()),
     "clusters, tempered inside": ClusterStratified(Gaussian(0.5), 0.3, Tempered()),

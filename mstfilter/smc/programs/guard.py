@@ -314,7 +314,7 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:
         return
-    n = (distribution.batch_shape or (1,))[0]
+    n = (distribution.parameter_shape or (1,))[0]
     if n == 0:
         return
     generator, row = child(rng, "guard", "density"), n // 2
