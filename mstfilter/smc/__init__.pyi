@@ -4,7 +4,6 @@ from mstfilter.smc.components import (
     Bins as Bins,
     Branching as Branching,
     EssBelow as EssBelow,
-    EveryKth as EveryKth,
     ExactEquality as ExactEquality,
     Kld as Kld,
     Never as Never,

@@ -60,11 +60,9 @@ class Chains:
     def columns(self) -> dict[str, np.ndarray]:
         """Columns of a table: chain, draw, parameters, log evidence and log density, chain after chain."""
         numbers = np.indices(self.log_density.shape)
-        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta, **self._stats()}
+        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta}
+        arrays |= {"log_evidence": self.log_evidence, "log_density": self.log_density}
         return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
-
-    def _stats(self) -> dict[str, np.ndarray]:
-        return {"log_evidence": self.log_evidence, "log_density": self.log_density}
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.

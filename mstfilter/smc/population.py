@@ -18,7 +18,7 @@ to an array after a population was made from it; pass ``array.copy()`` if you ne
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -80,9 +80,6 @@ class Candidates(Sequence[_T], Generic[_T]):
         if index not in self._built:
             self._built[index] = self._build(index)
         return self._built[index]
-
-    def __iter__(self) -> Iterator[_T]:
-        return (self[i] for i in range(len(self)))
 
     @property
     def n_built(self) -> int:

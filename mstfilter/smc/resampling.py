@@ -7,15 +7,10 @@ W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. The sch
 scheme          N_i                                                variance of N_i
 ==============  =================================================  ====================================
 Multinomial     n independent draws                                n W_i (1 - W_i)
-
 Residual        floor(n W_i), the rest by independent draws        f (1 - f / R), R = sum of all f
-
 Stratified      one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
-
 Systematic      one draw, shifted to each stratum                  f (1 - f)
-
 Ssp             floor or ceil, fractions decided pair by pair      f (1 - f)
-
 Killing         survive with w_i / max w, else multinomial         see `Killing`
 ==============  =================================================  ====================================
 
@@ -24,9 +19,9 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-Weights need not sum to 1, may have
-any float type, and may be zero (log weight -inf). n may differ from their number. A particle of weight zero is never
-selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights are zero.
+Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from their number.
+A particle of weight zero is never selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights
+are zero.
 
 All schemes share functions for the inverse of the cumulative weights, at the end of this module: `inverse_cdf` takes
 one point in each of n equal strata, `independent_draws` takes n independent points, and `draw_rows` takes one point
@@ -34,9 +29,6 @@ for each row of a matrix. A user's scheme is a `WeightResampler` whose `select` 
 
 Random schemes do not compare weights, so they have no ties. If weights are equal, `LargestWeights.select` (a stable
 sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first particle.
-
-Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class. In exact arithmetic this scheme selects the
-same particles as `Systematic` for the same uniform number.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).

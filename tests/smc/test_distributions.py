@@ -115,7 +115,7 @@ def test_categorical_rows():
     ids=lambda value: type(value).__name__ if not isinstance(value, tuple) else str(value),
 )
 def test_shapes_of_batch_and_event(distribution, batch, event):
-    assert (distribution.batch_shape, distribution.event_shape) == (batch, event)
+    assert (distribution.parameter_shape, distribution.event_shape) == ((*batch, *event), event)
     values = distribution.sample(np.random.default_rng(0), 5)
     assert values.shape == distribution.value_shape(5) == (5, *event)
     assert distribution.log_prob(values).shape == (5,)

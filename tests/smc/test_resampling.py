@@ -16,7 +16,6 @@ from mstfilter.smc import (
     ClusterStratified,
     Coalesced,
     EssBelow,
-    EveryKth,
     ExactEquality,
     FearnheadClifford,
     Gaussian,
@@ -252,7 +251,6 @@ def test_triggers():
     assert EssBelow(0.5).wants(peaked, 0)
     assert Always().wants(even, 0)
     assert not Never().wants(peaked, 0)
-    assert [EveryKth(3).wants(even, t) for t in range(4)] == [True, False, False, True]
 
 
 # --- schemes that compare particles ---

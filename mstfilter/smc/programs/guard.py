@@ -116,30 +116,31 @@ class Guard:
                 return run(function, handler, previous, self.observation, len(rows))
         except Exception as error:
             hints = error.hints if isinstance(error, InputError) else ()
-            message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {error.args[0]}"
+            message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {error}"
             raise InputError(message, *hints, *_ALONE) from error
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
         """Compare the guide with draws of the model."""
         n, old = len(gain), 0.0 if self.past is None else self.past.log_weights
-        drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
         try:
-            with recorded() as runs:
-                log_q = run(self.guide, GivenHandler(drawn.values), self.previous, self.observation, n).gain
+            drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
         except InputError:
-            return  # the guide draws sites that the model does not reach
+            return  # the model cannot weight its own draws
         by_model, by_guide = old + drawn.gain, old + gain
         if not (np.isfinite(by_model.max()) and np.isfinite(by_guide.max())):
             return
         weights = normalise(by_model)
-        missed = float(weights[log_q == -np.inf].sum())
-        if missed > 1e-3:
-            site = next(c.what for c in runs[0].calls or () if (c.densities(c.value) == -np.inf).any())
-            raise InputError(
-                f"{site}: the guide never draws values that hold {missed:.1%} of the posterior probability",
-                "its distribution must reach wherever that of the model times the likelihood does",
-            )
+        with recorded() as runs, suppress(InputError):  # the guide draws sites that the model does not reach
+            run(self.guide, GivenHandler(drawn.values, weigh=False), self.previous, self.observation, n)
+        for call in runs[0].calls or ():
+            never = call.densities(call.value) == -np.inf
+            missed = float(weights[call.reached][never].sum())
+            if missed > 1e-3:
+                raise InputError(
+                    f"{call.what}: the guide never draws values that hold {missed:.1%} of the posterior probability",
+                    "its distribution must reach wherever that of the model times the likelihood does",
+                )
         spread, spread_guide = (float((w**2).sum()) - 1 / n for w in (weights, normalise(by_guide)))
         gap = log_mean_exp(by_guide) - log_mean_exp(by_model)
         both = spread + spread_guide

@@ -38,13 +38,10 @@ class SiteHandler(ABC):
         Whether the program may observe.
     draws : bool
         Whether the values are new rather than given.
-    strict : bool
-        Whether a log density of NaN or +inf is an error.
     """
 
     observes = True
     draws = True
-    strict = False
 
     @abstractmethod
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
@@ -135,20 +132,12 @@ class GivenHandler(SiteHandler):
         The rows of the values that belong to the n particles. By default, all rows.
     weigh : bool
         Whether the density of the values weights the particles.
-    strict : bool
-        Whether a log density of NaN or +inf is an error.
     """
 
     draws = False
 
-    def __init__(
-        self,
-        values: Mapping[str, np.ndarray],
-        rows: np.ndarray | None = None,
-        weigh: bool = True,
-        strict: bool = False,
-    ) -> None:
-        self.values, self.rows, self.weigh, self.strict = values, rows, weigh, strict
+    def __init__(self, values: Mapping[str, np.ndarray], rows: np.ndarray | None = None, weigh: bool = True) -> None:
+        self.values, self.rows, self.weigh = values, rows, weigh
         self.names: set[str] = set()  #: of the sites that the program has sampled
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
