@@ -122,50 +122,48 @@ class Contract:
     @prerequisite
     def test_depends_on_its_arguments_only(self) -> None:
         """Equal arguments and generators give equal results; with ``draws = False`` it does not use its generator."""
-        used, draws = self.fresh(), getattr(self.make(), "draws", True)
+        used, draws, found = self.fresh(), getattr(self.make(), "draws", True), []
         for inputs in (self.inputs(6, 1), *self.variants()):
             rngs = [seeded(7) for _ in range(3)]
+            components = self.fresh(), self.fresh(), used
             with skips_errors():
-                components = self.fresh(), self.fresh(), used
-                one, again, later = (_plain(self.call(*c, inputs)) for c in zip(components, rngs, strict=True))
-            assert same(one, again), "two runs with equal generators differ: a random number does not come from `rng`"
-            assert same(one, later), (
-                "a component that was used before gives another result than a new one: it keeps state, for example "
-                "values of its first call"
-            )
+                found.append([_plain(self.call(*c, inputs)) for c in zip(components, rngs, strict=True)])
             unused = rngs[0].bit_generator.state == seeded(7).bit_generator.state
             assert unused or draws, "it declares draws = False and draws from its generator"
+        assert all(same(one, again) for one, again, _ in found), (
+            "two runs with equal generators differ: a random number does not come from `rng`"
+        )
+        assert all(same(one, later) for one, _, later in found), (
+            "a component that was used before gives another result than a new one: it keeps state, for example "
+            "values of its first call"
+        )
 
 
 class ScaleContract(Contract):
     """Base class of contracts for components that take weighted particles."""
 
-    weighted: ClassVar[str] = "population"  #: name of the argument with the weights
-
-    def weighted_inputs(self) -> list[dict[str, Any]]:
-        """Arguments of calls in which only the argument `weighted` has weights."""
-        return self.variants()[:1]
+    #: Name of the argument with the weights; in the first of the variants, no other argument has weights.
+    weighted: ClassVar[str] = "population"
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights has no effect, except that the weights of the result have it too."""
-        component = self.make()
-        for inputs in self.weighted_inputs():
-            population, result = inputs[self.weighted], self.checked_call(component, inputs)
-            for shift in (0.5, 50.0, -50.0, 1e4, -1e4):
-                given = population.reweighted(np.full(len(population), shift))
-                fault = f"log weights + {shift:g} (overflow or underflow?)"
-                try:
-                    with np.errstate(all="ignore"):
-                        found = self.checked_call(component, {**inputs, self.weighted: given})
-                except AssertionError as error:
-                    raise AssertionError(f"{fault}: {error}") from error
-                if not isinstance(result, Population):
-                    assert result == found, f"{fault} change its answer"
-                    continue
-                a, b = (_selected(one) for one in (result, found))
-                assert all(map(close, a, b)), f"{fault} change the particles"
-                kept = close(found.log_weights - shift, result.log_weights)
-                assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
+        component, inputs = self.make(), self.variants()[0]
+        population, result = inputs[self.weighted], self.checked_call(component, inputs)
+        for shift in (0.5, 50.0, -50.0, 1e4, -1e4):
+            given = population.reweighted(np.full(len(population), shift))
+            fault = f"log weights + {shift:g} (overflow or underflow?)"
+            try:
+                with np.errstate(all="ignore"):
+                    found = self.checked_call(component, {**inputs, self.weighted: given})
+            except AssertionError as error:
+                raise AssertionError(f"{fault}: {error}") from error
+            if not isinstance(result, Population):
+                assert result == found, f"{fault} change its answer"
+                continue
+            a, b = (_selected(one) for one in (result, found))
+            assert all(map(close, a, b)), f"{fault} change the particles"
+            kept = close(found.log_weights - shift, result.log_weights)
+            assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
 
 
 def _selected(population: Population) -> list[np.ndarray]:
@@ -281,13 +279,9 @@ def skips_errors() -> Iterator[None]:
 
 def _description(inputs: dict[str, Any]) -> str:
     """The sizes of populations, and arguments that are None or numbers: "6 particles, observation=None"."""
-    words = []
-    for name, value in inputs.items():
-        if isinstance(value, Population):
-            words.append(f"{len(value)} {'' if name == 'population' else f'{name} '}particles")
-        elif value is None or isinstance(value, int):
-            words.append(f"{name}={value}")
-    return ", ".join(words)
+    sizes = [f"{len(value)} {name} particles" for name, value in inputs.items() if isinstance(value, Population)]
+    values = [f"{name}={value}" for name, value in inputs.items() if value is None or isinstance(value, int)]
+    return ", ".join(sizes + values).replace("population ", "")
 
 
 def _writes_to_read_only(error: Exception) -> bool:

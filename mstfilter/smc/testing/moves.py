@@ -105,9 +105,7 @@ class TransitionContract(ScaleContract, ExactContract):
         backwards = np.arange(_N)[::-1]
         a = self._moves(component, inputs)
         b = self._moves(component, {**inputs, "population": population.take(backwards)}, 1000)[:, ::-1]
-        noise = a - a.mean(axis=0)
-        spread = np.abs(noise).max(axis=(0, 1))
-        drawn = np.flatnonzero(spread[:-1] > 1e-6)  # the last column is the change of the log weight
+        drawn = np.flatnonzero(np.ptp(a, axis=0).max(axis=0)[:-1] > 1e-6)  # without the change of the log weight
         for c in drawn:
             both = np.concatenate([a[:, :, c], b[:, :, c]])
             for i, k in combinations(range(_N), 2):
@@ -242,9 +240,6 @@ class UpdateContract(ScaleContract, ExactContract):
         proposed = self.example(seeded(seed + 1), 4)[0]
         proposed = replace(proposed, log_weights=np.zeros(4), parents={"proposed": np.arange(4)})
         return {"predicted": predicted, "proposed": proposed, "observation": observation}
-
-    def weighted_inputs(self) -> list[dict[str, Any]]:
-        return [{**self.inputs(_N), "proposed": None}]
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.update(rng, **inputs)

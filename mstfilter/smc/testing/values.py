@@ -34,13 +34,13 @@ class RowsContract(Contract):
 
     compared: ClassVar[tuple[str, ...]] = ("in another order", "if there are copies")  #: keys of the selections
 
-    def relation(self, result: Any) -> Any:
+    def relation(self, result: Any) -> np.ndarray:
         """What is compared of a result."""
-        return result
+        return np.asarray(result)
 
-    def of_rows(self, relation: Any, rows: np.ndarray) -> Any:
-        """The part of the relation of nine particles that belongs to a selection of them."""
-        return relation[rows]
+    def of_rows(self, relation: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """The part of an answer (), scores (9,) or pairs (9, 9) that belongs to a selection of nine particles."""
+        return relation[np.ix_(*[rows] * relation.ndim)]
 
     def test_order_of_particles_is_irrelevant(self) -> None:
         """The result for a particle, or a pair, depends neither on the order of the particles nor on copies."""
@@ -62,18 +62,12 @@ class DecisionContract(ScaleContract, RowsContract):
 
     compared = ("in another order",)
 
-    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        return {"population": self.example(seeded(seed), n)[0], "t": 2}
-
-    def of_rows(self, relation: Any, rows: np.ndarray) -> Any:
-        return relation
-
 
 class TriggerContract(DecisionContract):
     """The contract of every `Trigger`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        return component.wants(inputs["population"], inputs["t"])
+        return component.wants(inputs["population"], 2)
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         assert isinstance(result, (bool, np.bool_)), f"it returns {result!r}, expected True or False"
@@ -117,20 +111,10 @@ class LookaheadContract(ScoreContract):
             )
 
 
-class ParticlesContract(Contract):
-    """Properties of components that take particles without weights."""
-
-    def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        return {"population": self.example(seeded(seed), n)[0].realised()}
-
-
-class PairsContract(ParticlesContract, RowsContract):
+class PairsContract(RowsContract):
     """Properties of similarities and equivalences, which relate pairs of particles."""
 
     compared = tuple(_SELECTIONS)
-
-    def of_rows(self, relation: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        return relation[np.ix_(rows, rows)]
 
 
 class SimilarityContract(PairsContract):
@@ -174,7 +158,7 @@ class EquivalenceContract(PairsContract):
         return result[:, None] == result
 
 
-class CodecContract(ParticlesContract):
+class CodecContract(Contract):
     """The contract of every `Codec`."""
 
     returns = Mapping
