@@ -278,17 +278,6 @@ def test_a_program_that_mixes_particles_is_named_by_its_first_batch():
         run_many(Program(program).bootstrap(30), [0.5, -0.3], range(5))
 
 
-@pytest.mark.parametrize("n", [3, 4])
-def test_programs_are_called_together_also_where_their_checks_are_due(n):
-    """The first steps of a program are checked; in a batch, the single runs that it is compared with are."""
-
-    def fresh(previous, y):
-        return walk(previous, y)
-
-    ys = np.random.default_rng(0).standard_normal(9).tolist()
-    assert keeps_its_promise(Program(fresh).bootstrap(n), ys, range(3)) == "together"
-
-
 def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
     def rounds(x, y):  # in another order for another number of rows, as matrix products of BLAS
         return -np.square(y - x) * (1 + 1e-15 * len(x))

@@ -96,17 +96,6 @@ def test_sums_over_groups_are_sums_over_pairs(scheme, lag):
         assert found.mean_variance[t] == pytest.approx(mean, abs=1e-12)
 
 
-def test_without_selections_it_is_the_variance_of_importance_sampling():
-    """(N sum W^2 - 1) / (N - 1): the sample variance of the weights over N mean^2."""
-    filter = bootstrap(AR1, 40, trigger=Never())
-    found, record = run_variance(filter, YS[:4], 1), keep(filter, YS[:4], 1)
-    for t, population in enumerate(record.populations):
-        w = np.exp(population.log_weights - population.log_weights.max())
-        assert found.log_evidence_variance[t] == pytest.approx(w.var(ddof=1) / 40 / w.mean() ** 2)
-        p, x = population.weights, population.particles
-        assert found.mean_variance[t] == pytest.approx(40 / 39 * (p**2 @ (x - p @ x) ** 2))
-
-
 @pytest.mark.parametrize(
     "filter",
     [

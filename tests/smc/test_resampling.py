@@ -16,7 +16,6 @@ from mstfilter.smc import (
     ClusterStratified,
     Coalesced,
     EssBelow,
-    ExactEquality,
     FearnheadClifford,
     Gaussian,
     KeepWeights,
@@ -33,7 +32,6 @@ from mstfilter.smc import (
     Systematic,
     Tempered,
     WeightResampler,
-    coalesce,
     log_mean_exp,
 )
 from mstfilter.smc.diverse_resampling import leader_clusters
@@ -207,25 +205,6 @@ def test_notes_come_along(scheme):
 
 
 # --- single schemes -----------------------------------------------------------------------------------------------
-@settings(max_examples=100, deadline=None)
-@given(
-    weights=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=30), n=st.integers(1, 50), u=st.floats(0.001, 0.999)
-)
-def test_three_ways_to_the_same_counts(weights, n, u):
-    """Bolic's one pass, systematic, and residual with systematic remainder: the same counts from the same uniform."""
-    W = np.array(weights) / np.sum(weights)
-    # Away from the points where rounding decides.
-    if np.abs(np.mod(n * np.cumsum(W)[:-1] - u + 0.5, 1) - 0.5).min(initial=1.0) < 1e-9:
-        return
-    loop, carried = [], u
-    for w in W:  # the published recursion
-        loop.append(int(np.floor(n * w - carried)) + 1)
-        carried += loop[-1] - n * w
-    loop[-1] += n - sum(loop)  # its last count is decided by rounding alone
-    found = np.bincount(Systematic().select(ConstantGenerator(u), np.log(weights), n)[0], minlength=len(W))
-    np.testing.assert_array_equal(found, loop)
-
-
 def test_residual_with_nearly_whole_copies_makes_exactly_n():
     """999 999 particles a millionth short of one copy each, and one that makes up for it."""
     weights = np.append(np.full(999_999, 1 - 1e-6), 1 + 0.999999)
@@ -305,31 +284,3 @@ def test_only_clusters_of_some_mass_are_sure_of_a_place():
             # A fifth of the total, as each of five places holds: the mean weight, which is kept.
             assert np.exp(chosen.log_weights[light]) == pytest.approx(0.25, rel=0.01)
     assert found[2:] / 2000 == pytest.approx([0.005, 0.005], abs=0.006)
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    lw=st.lists(st.floats(-5, 5), min_size=1, max_size=20),
-    labels=st.lists(st.integers(0, 4), min_size=20, max_size=20),
-)
-def test_coalescing_is_lossless(lw, labels):
-    lw, labels = np.array(lw), np.array(labels[: len(lw)])
-    classes = ExactEquality().classes(labels)
-    representatives, merged = coalesce(lw, classes)
-    assert log_mean_exp(merged) == pytest.approx(log_mean_exp(lw), abs=1e-9)
-    for i, total in zip(representatives, merged, strict=True):
-        mine = labels == labels[i]
-        assert lw[i] == lw[mine].max()
-        assert np.exp(total) / len(merged) == pytest.approx(np.exp(lw[mine]).sum() / len(lw))
-    chosen = Coalesced().resample(np.random.default_rng(0), Population(labels, lw), 5)
-    assert sorted(chosen.particles.tolist()) == sorted(set(labels.tolist()))
-
-
-def test_shuffling_changes_the_order_only():
-    """Systematic on sorted weights never takes two neighbours of weight 1/2 copy each; shuffled it does."""
-    lw, rng = np.zeros(8), np.random.default_rng(0)
-    population = Population(np.arange(8), lw)
-    plain = {tuple(Systematic().resample(rng, population, 4).particles.tolist()) for _ in range(200)}
-    mixed = {tuple(sorted(Shuffled().resample(rng, population, 4).particles.tolist())) for _ in range(200)}
-    assert len(plain) == 2
-    assert len(mixed) > 30

@@ -197,18 +197,6 @@ def test_fixed_lag_lies_between_the_filter_and_the_genealogy():
     assert np.abs(filtered - smoothed()[0]).max() > 0.1
 
 
-def test_paths_are_paths():
-    """Each row of the genealogy leads from parent to child."""
-    record = keep(bootstrap(AR1, 50), YS, 1)
-    paths = genealogy(record)
-    for k in range(50):
-        i = k
-        for t in range(T - 1, 0, -1):
-            assert paths[t].particles[k] == record.populations[t].particles[i]
-            i = record.parents(t)[i]
-        assert paths[0].particles[k] == record.populations[0].particles[i]
-
-
 def test_a_large_run_is_done_in_blocks(monkeypatch):
     record = keep(bootstrap(AR1, 40), YS, 1)
     whole = backward_paths(np.random.default_rng(0), record, Dynamics(AR1), 30)
