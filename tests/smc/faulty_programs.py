@@ -407,13 +407,6 @@ def vectors_with_a_shared_covariance(previous, y):
     observe("y", MultivariateNormal(v, 0.5 * cov), y)
 
 
-@correct(ys=[np.array([0.1, 0.2])] * 4)
-def vectors_with_covariances_of_particles(previous, y):
-    s = sample("s", stats.gamma(3.0, scale=1 / 3.0))
-    v = sample("v", Normal(np.zeros((1, 2)), 1.0))
-    observe("y", MultivariateNormal(v, (0.5 + s)[:, None, None] * np.eye(2)), y)
-
-
 WEIGHTS = np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32) / 8
 
 

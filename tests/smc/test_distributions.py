@@ -256,15 +256,6 @@ def test_scipy_distributions(frozen, log_prob):
     np.testing.assert_allclose(d.log_prob(a[:20]), log_prob(a[:20]))
 
 
-def test_scipy_rows_and_vectors():
-    rng, loc = np.random.default_rng(0), np.arange(7.0)
-    np.testing.assert_allclose(as_distribution(stats.norm(loc, 1e-9)).sample(rng, 7), loc, atol=1e-6)
-    vectors = as_distribution(stats.multivariate_normal([0.0, 5.0], COV))
-    assert vectors.sample(rng, 1).shape == (1, 2)
-    x = vectors.sample(rng, 9)
-    np.testing.assert_allclose(vectors.log_prob(x), MultivariateNormal([0.0, 5.0], COV).log_prob(x))
-
-
 def test_other_things_are_refused():
     with pytest.raises(InputError, match="expected a distribution, found a builtins.float"):
         as_distribution(3.0)

@@ -9,7 +9,6 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
-    Always,
     Branching,
     Dynamics,
     EssBelow,
@@ -17,12 +16,9 @@ from mstfilter.smc import (
     KeepWeights,
     Multinomial,
     Never,
-    StateSpaceModel,
     Systematic,
     bootstrap,
     keep,
-    log_evidence,
-    mean,
     run_many,
     run_variance,
 )
@@ -30,32 +26,6 @@ from tests.smc.models import AR1, ar1_observations, hmm
 from tests.smc.test_particle_filter import MODEL, observations
 
 YS = ar1_observations(9)
-
-
-VOLATILITY = StateSpaceModel(
-    lambda rng, n: rng.standard_normal(n),
-    lambda rng, x: 0.9 * x + 0.45 * rng.standard_normal(x.shape),
-    lambda x, y: -0.5 * (x + y * y * np.exp(-x)),
-    batched=True,
-)
-RETURNS = [0.3, -1.2, 2.5, 0.4, -0.1, 1.0, -3.0, 0.2, 0.5, -0.7]
-
-
-@pytest.mark.parametrize("arm", [(Multinomial(), Always()), (Systematic(), EssBelow(0.5))], ids=["multi", "default"])
-def test_the_variance_from_one_run_is_that_of_many_runs(arm):
-    """The mean of 40 runs (error 4 %, means 7 %) against the sample variance of 1,500 (error 4 %).
-
-    The bounds, 20 % and 30 %, are 3.5 standard deviations without a bias: false alarm 5e-4 a figure. The bound of the
-    default scheme is 30 %: its estimate is 16 % too high (150 runs against 2,500).
-    """
-    filter = bootstrap(VOLATILITY, 400, *arm)
-    runs = run_many(filter, RETURNS, range(1500), z=log_evidence, mean=mean)
-    variances = {name: runs[name][:, -1].var(ddof=1) for name in runs}
-    bound = 0.2 if isinstance(arm[1], Always) else 0.3
-    for lag in (None, 6):
-        found = [run_variance(filter, RETURNS, seed, lag) for seed in range(5000, 5040)]
-        assert np.mean([f.log_evidence_variance[-1] for f in found]) == pytest.approx(variances["z"], rel=bound)
-        assert np.mean([f.mean_variance[-1] for f in found]) == pytest.approx(variances["mean"], rel=0.3)
 
 
 def by_pairs(record, t, begin):

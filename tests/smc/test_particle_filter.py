@@ -100,36 +100,6 @@ def test_a_filter_that_starts_from_its_proposal():
     assert state2.log_evidence is None  # an improper component: no evidence
 
 
-def test_a_separate_initial_is_updated_before_any_prediction():
-    seen = []
-
-    @dataclass(frozen=True)
-    class Watch(Transition):
-        def predict(self, rng, population, observation):
-            seen.append(observation)
-            return population
-
-    filter = ParticleFilter(initial=Numbers(), transition=Watch(), update=None, n=2)
-    filter.run([1, 2, 3])
-    assert seen == [2, 3]
-
-
-def test_previous_parents_survive_resampling_before_prediction():
-    """Each particle's recorded parent is where it came from, through the resampling."""
-    filter = bootstrap(MODEL, 20, trigger=Always())
-    still = ParticleFilter(
-        initial=filter.initial, transition=Stay(), update=filter.update, trigger=Always(), n=20, resample="before"
-    )
-    ys = observations(T=4)
-    state = still.start(0)
-    for t, y in enumerate(ys):
-        new, _ = still.step(state, y)
-        if t:
-            parents = new.population.parents["previous"]
-            np.testing.assert_array_equal(new.population.particles, state.population.particles[parents])
-        state = new
-
-
 def test_wrong_filters_are_one_clear_error():
     with pytest.raises(InputError, match="neither"):
         ParticleFilter()

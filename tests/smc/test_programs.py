@@ -203,7 +203,6 @@ def changed(x):
         (r"alone: site 's': the values have shape", lambda s: {"t": sample("s", Normal(s.v + s.x, 1))[:, 0]}),
         (r"returned 's' has rows of shape \(4,\), alone \(3,\)", lambda s: {"s": s.v + s.x}),
         (r"'o': the value has shape \(4,\), expected \(\)", lambda s: observe("o", Normal(s.x, 1), s.y), np.zeros(4)),
-        (r"has shape \(4,\), expected \(\)", lambda s: observe("o", Normal(s.x, 1), s.y), [0.1, 0.2, 0.3, 0.4]),
         (
             "alone: the program fails .*broadcast together",
             lambda s: observe("o", Normal(0.0, 1), s.y - s.x),
@@ -212,7 +211,6 @@ def changed(x):
         (r"shape \(\), expected \(2,\)", lambda s: observe("o", Normal(np.zeros((1, 2)), 1), s.y)),
         (r"shape \(4,\), expected \(1,\)", lambda s: observe("o", Normal(s.v, 1), s.y), np.zeros(4)),
         (r"expected \(2,\)", lambda s: observe("o", MultivariateNormal([0, 0], np.eye(2)), s.y)),
-        (r"expected \(2,\)", lambda s: observe("o", stats.multivariate_normal([0, 0], np.eye(2)), s.y)),
         (r"'o': parameters of shape \(3,\) do not fit 4", lambda s: observe("o", Normal(np.zeros(3), 1), s.y)),
         (r"mean of shape \(4,\) does not fit", lambda s: observe("o", MultivariateNormal(s.x, [[1]]), s.y)),
         (r"'s': parameters of shapes \(4, 2\) and \(4,\)", lambda s: sample("s", Normal(np.zeros((4, 2)), s.z))),
@@ -225,7 +223,6 @@ def changed(x):
         # arrays of all particles used as one number
         (r"as one number .*after site 'k', line \d+ `.*float\(s.x\).*TypeError.*numpy", lambda s: float(s.x)),
         ("as one number .*after site 'k'.*numpy.exp", lambda s: math.exp(s.x)),
-        ("as one number .*after site 'k'.*", lambda s: list(range(s.k))),
         ("as one number .*after site 'k'.*an array as table", lambda s: ["a", "b"][s.k]),
         ("decides by an array .*after site 'k'.*use switch", lambda s: 1 if s.x > 0 else 2),
         ("changes an array of particles in place .*after site 'k'.*x = x \\+ 1", lambda s: changed(s.x)),

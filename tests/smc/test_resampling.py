@@ -268,19 +268,3 @@ def test_clusters_keep_their_mass_and_a_place(scheme, n):
                 mine = chosen.parents["ancestor"] // 6 == group
                 share = np.exp(chosen.log_weights[mine]).sum() / len(chosen)
                 assert share == pytest.approx(np.exp(lw[6 * group : 6 * group + 6]).sum() / 18, rel=1e-9)
-
-
-def test_only_clusters_of_some_mass_are_sure_of_a_place():
-    """Of four clusters two hold .1 % of the weight each: they come in .5 % of draws, and stand for one place."""
-    population = Population(np.array([0.0, 10.0, 20.0, 30.0]), np.log([0.698, 0.3, 0.001, 0.001]))
-    scheme = ClusterStratified(Gaussian(1.0), least_mass=0.05)
-    found = np.zeros(4)
-    for seed in range(2000):
-        chosen = scheme.resample(np.random.default_rng(seed), population, 5)
-        ancestors = chosen.parents["ancestor"]
-        found += np.bincount(ancestors, minlength=4)
-        assert {0, 1} <= set(ancestors.tolist())
-        for light in np.flatnonzero(ancestors >= 2):
-            # A fifth of the total, as each of five places holds: the mean weight, which is kept.
-            assert np.exp(chosen.log_weights[light]) == pytest.approx(0.25, rel=0.01)
-    assert found[2:] / 2000 == pytest.approx([0.005, 0.005], abs=0.006)

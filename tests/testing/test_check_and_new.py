@@ -71,13 +71,6 @@ def test_a_starting_file_is_for_scenes_if_there_is_one(tmp_path, monkeypatch, ca
         assert message in err
 
 
-def test_the_starting_resampler_has_three_lines_of_logic(tmp_path, capsys):
-    call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
-    body = (tmp_path / "mine.py").read_text().split("def select(")[1].split("if __name__")[0].split('"""')[2]
-    logic = [line for line in body.splitlines() if line.strip() and not line.strip().startswith("#")]
-    assert len(logic) == 4  # three and the return
-
-
 def test_nothing_is_overwritten(tmp_path, capsys):
     (tmp_path / "mine.py").write_text("x")
     code, _, err = call("new", "resampler", tmp_path / "mine.py", capsys=capsys)
