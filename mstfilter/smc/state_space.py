@@ -379,10 +379,7 @@ def guided(
         Other fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
     """
     return replace(
-        bootstrap(model, n),
-        initial=Prior(model, initial),
-        transition=Dynamics(model, proposal),
-        **components,
+        bootstrap(model, n), initial=Prior(model, initial), transition=Dynamics(model, proposal), **components
     )
 
 

@@ -288,8 +288,7 @@ def branches(x, y, other, probs=(0.5, 0.5)):
 
 
 after_the_walk(
-    faulty("the value is that of a site"),
-    a_draw_observed_by_accident=lambda x, y: observe("x", Normal(0.0, 1.0), x),
+    faulty("the value is that of a site"), a_draw_observed_by_accident=lambda x, y: observe("x", Normal(0.0, 1.0), x)
 )
 after_the_walk(
     faulty("returned 'x' with other values than site"), a_returned_value_over_a_site=lambda x, y: {"x": np.round(x)}

@@ -191,12 +191,7 @@ def test_a_number_out_of_range(value):
 def test_large_parameters_and_integers_are_in_range():
     huge = np.array([1e200, -1e300])  # the sum of their squares overflows
     assert Normal(huge, 1.0).sample(np.random.default_rng(0), 2).shape == (2,)
-    for d in (
-        Normal(0, 1),
-        Normal(np.arange(3), np.arange(1, 4)),
-        Uniform(0, 2),
-        Bernoulli(1),
-    ):
+    for d in (Normal(0, 1), Normal(np.arange(3), np.arange(1, 4)), Uniform(0, 2), Bernoulli(1)):
         assert np.isfinite(d.sample(np.random.default_rng(0), 3)).all()
     assert Normal(np.zeros(0), np.zeros(0)).sample(np.random.default_rng(0), 0).shape == (0,)
 

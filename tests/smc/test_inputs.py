@@ -215,8 +215,8 @@ def test_chains_whose_likelihood_changes_with_time_have_the_exact_evidence():
     total = np.array([p[paths[:, 3] == k].sum() for k in range(3)]) / p.sum()
     assert exact.log_evidence[-1] == pytest.approx(np.log(p.sum()), abs=1e-12)
     np.testing.assert_allclose(exact.smoothed[3], total, atol=1e-12)
-    filter = bootstrap(hidden_markov(start, moves, log_likelihood), 100)
-    mean, error, _ = mean_ratio(filter, ys, exact.log_evidence[-1], range(300))
+    model = hidden_markov(start, moves, log_likelihood)
+    mean, error, _ = mean_ratio(bootstrap(model, 100), ys, exact.log_evidence[-1], range(300))
     assert abs(mean - 1) < 5 * error < 0.3
 
 

@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import (
-    Always,
-    ParticleFilter,
-    Population,
-    Proposal,
-    Transition,
-    Update,
-    bootstrap,
-    linear_gaussian,
-)
+from mstfilter.smc import Always, ParticleFilter, Population, Proposal, Transition, Update, bootstrap, linear_gaussian
 
 F, Q = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.2, 0.05], [0.05, 0.3]])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.7]])

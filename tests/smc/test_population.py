@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import (
-    Always,
-    Candidates,
-    Population,
-    WeightResampler,
-    bootstrap,
-    log_mean_exp,
-)
+from mstfilter.smc import Always, Candidates, Population, WeightResampler, bootstrap, log_mean_exp
 from tests.smc.models import AR1
 
 

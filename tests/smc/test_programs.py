@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import runpy
 from collections import deque
 from itertools import product
 from types import SimpleNamespace
@@ -31,6 +32,7 @@ from mstfilter.smc import (
     sample,
     switch,
 )
+from tests.conftest import REPOSITORY
 from tests.smc.models import (
     AR1,
     RHO,
@@ -45,7 +47,6 @@ from tests.smc.models import (
 )
 
 YS = ar1_observations(8)
-EXACT = kalman_ar1(YS)[1]
 
 
 def ar1(previous, y):
@@ -150,10 +151,7 @@ def test_switch_agrees_with_enumeration(kind):
         switch("regime", [0.5, 0.5], [calm, wild], before)
 
     program = Program(regimes)
-    filter = {
-        "bootstrap": program.bootstrap(3000),
-        "guided": program.guided(guide, 3000),
-    }[kind]
+    filter = {"bootstrap": program.bootstrap(3000), "guided": program.guided(guide, 3000)}[kind]
     exact, calm = exact_regimes(TRACK)
     mean, standard, _ = mean_ratio(filter, TRACK, exact, range(90))
     assert abs(mean - 1) < 4 * standard
@@ -529,3 +527,41 @@ def test_a_program_with_time_and_inputs_is_the_state_space_model_with_both():
 
     with pytest.raises(InputError, match="step 1, transition: a function of the model has a parameter u, and step 1"):
         Program(needs).bootstrap(5).run([WithInput(0.1, 1.0), 0.2], 0)
+
+
+# --- example programs ----------------------------------------------------------------------------------------------
+PROGRAMS = sorted((REPOSITORY / "models" / "programs").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: p.stem)
+def test_every_filter_of_every_program_runs(path):
+    module = runpy.run_path(str(path))
+    if "filters" not in module:
+        pytest.skip("is no program with filters()")
+    observations = module["simulate"](6)[-1]
+    for filter in module["filters"](30).values():
+        state, _ = filter.run(observations, 0)
+        assert np.isfinite(state.log_evidence)
+        again, _ = filter.run(observations, 0)
+        assert again.log_evidence == state.log_evidence
+
+
+def test_the_object_chain_agrees_with_the_forward_algorithm():
+    """Only the number of boxes matters for the counts: a birth-death chain, summed exactly."""
+    from scipy import stats
+
+    module = runpy.run_path(str(REPOSITORY / "models" / "programs" / "object_hmm.py"))
+    counts = [1, 1, 2]
+    size = np.zeros(8)
+    size[0], total = 1.0, 0.0
+    for count in counts:
+        moved = 0.5 * size
+        moved[1:] += 0.3 * size[:-1]
+        moved[:-1] += 0.2 * size[1:]
+        moved[0] += 0.2 * size[0]
+        size = moved * stats.binom.pmf(count, np.arange(8), 0.8)
+        total += np.log(size.sum())
+        size /= size.sum()
+    filter = module["filters"](120)["bootstrap"]
+    ratios = np.exp([filter.run(counts, seed)[0].log_evidence - total for seed in range(60)])
+    assert abs(ratios.mean() - 1) < 4 * ratios.std(ddof=1) / np.sqrt(len(ratios))

@@ -84,11 +84,7 @@ FILTERS = {
 }
 
 
-METHODS = {
-    "exact": {},
-    "mcmc": {"method": "mcmc"},
-    "mcmc, 4 steps": {"method": "mcmc", "steps": 4},
-}
+METHODS = {"exact": {}, "mcmc": {"method": "mcmc"}, "mcmc, 4 steps": {"method": "mcmc", "steps": 4}}
 
 
 def small_record():

@@ -407,11 +407,7 @@ def antithetic(rng, y, n):
 
 plant(
     proposal,
-    OneTooFew=(
-        _VALID,
-        "asked for 2 particles it returns 1",
-        lambda rng, y, n: rng.standard_normal(max(n - 1, 1)),
-    ),
+    OneTooFew=(_VALID, "asked for 2 particles it returns 1", lambda rng, y, n: rng.standard_normal(max(n - 1, 1))),
     OneNumberForTwoAxes=(
         _DRAWN,
         "coordinate 0 of x +",
@@ -532,9 +528,7 @@ plant(
 _DECODED = "decoded_particles_are_equal"
 #: A codec that stores ``{"x": function(particles)}`` and returns it as double precision.
 encodes = of(
-    Codec,
-    encode=lambda f, particles: {"x": f(particles)},
-    decode=lambda f, arrays: arrays["x"].astype(np.float64),
+    Codec, encode=lambda f, particles: {"x": f(particles)}, decode=lambda f, arrays: arrays["x"].astype(np.float64)
 )
 plant(
     encodes,

@@ -11,15 +11,7 @@ import pytest
 
 from mstfilter import smc
 from mstfilter.presets import REGISTRY
-from mstfilter.smc import (
-    ClusterStratified,
-    Coalesced,
-    FearnheadClifford,
-    Gaussian,
-    Population,
-    Sorted,
-    Tempered,
-)
+from mstfilter.smc import ClusterStratified, Coalesced, FearnheadClifford, Gaussian, Population, Sorted, Tempered
 from mstfilter.smc.testing import ResamplerContract, WeightResamplerContract
 from mstfilter.testing import run_contract
 from tests.testing import faults, run_property

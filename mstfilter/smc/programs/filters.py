@@ -17,12 +17,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
-from mstfilter.smc.programs.handlers import (
-    GuideHandler,
-    ReplayHandler,
-    SampleHandler,
-    SiteHandler,
-)
+from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, SiteHandler
 from mstfilter.smc.programs.sites import ProgramRun, active_run
 from mstfilter.smc.streams import RunGenerators
 

@@ -22,15 +22,7 @@ from mstfilter.smc.testing.contract import (
     skip_unless_properly_weighted,
     statistical,
 )
-from mstfilter.smc.testing.copies import (
-    CASES,
-    MOST_CALLS,
-    Case,
-    ConstantGenerator,
-    Sample,
-    fault_message,
-    log_of,
-)
+from mstfilter.smc.testing.copies import CASES, MOST_CALLS, Case, ConstantGenerator, Sample, fault_message, log_of
 
 _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 

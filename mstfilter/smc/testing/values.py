@@ -10,15 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.smc import Population
-from mstfilter.smc.testing.contract import (
-    Contract,
-    ScaleContract,
-    close,
-    prerequisite,
-    reports_errors,
-    same,
-    seeded,
-)
+from mstfilter.smc.testing.contract import Contract, ScaleContract, close, prerequisite, reports_errors, same, seeded
 
 _SIZES = (1, 2, 9)
 #: Selections of nine particles.

@@ -1,4 +1,4 @@
-"""Single-run variances against their definition and against many runs."""
+"""Variances of single runs against their definition; energy distances against scipy and brute force."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
@@ -13,16 +14,19 @@ from mstfilter.smc import (
     Dynamics,
     EssBelow,
     FearnheadClifford,
+    Gaussian,
     KeepWeights,
     Multinomial,
     Never,
+    Population,
     Systematic,
     bootstrap,
+    energy_distance,
     keep,
     run_many,
     run_variance,
 )
-from tests.smc.models import AR1, ar1_observations, hmm
+from tests.smc.models import AR1, BOXES, ar1_observations, hmm
 from tests.smc.test_particle_filter import MODEL, observations
 
 YS = ar1_observations(9)
@@ -46,10 +50,7 @@ def by_pairs(record, t, begin):
     w, x = record.populations[t].weights, record.populations[t].particles
     different = line[:, None] != line
     centred = w * (x - w @ x)
-    return (
-        1 - f * (np.outer(w, w) * different).sum(),
-        -f * (np.outer(centred, centred) * different).sum(),
-    )
+    return (1 - f * (np.outer(w, w) * different).sum(), -f * (np.outer(centred, centred) * different).sum())
 
 
 @pytest.mark.parametrize("scheme", [Multinomial(), Systematic()], ids=["multinomial", "systematic"])
@@ -117,3 +118,48 @@ def test_wrong_calls_are_named():
     ):
         with pytest.raises(InputError, match=message):
             call()
+
+
+# --- energy distances ----------------------------------------------------------------------------------------------
+RNG = np.random.default_rng(0)
+
+
+def populations(shape, n=(7, 5)):
+    return [Population(RNG.normal(size=(k, *shape)), RNG.normal(size=k)) for k in n]
+
+
+def by_definition(a, b):
+    """2 E d(X, Y) - E d(X, X') - E d(Y, Y') by its definition."""
+
+    def mean(p, q):
+        d = np.linalg.norm(p.particles.reshape(len(p), 1, -1) - q.particles.reshape(1, len(q), -1), axis=2)
+        return p.weights @ d @ q.weights
+
+    return 2 * mean(a, b) - mean(a, a) - mean(b, b)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2,), (2, 3)])
+def test_it_is_its_definition(shape):
+    a, b = populations(shape)
+    assert energy_distance(a, b) == pytest.approx(by_definition(a, b), abs=1e-12)
+    assert energy_distance(a, a) == pytest.approx(0.0, abs=1e-12)
+    if shape == ():
+        scipy = stats.energy_distance(a.particles, b.particles, a.weights, b.weights)
+        assert energy_distance(a, b) == pytest.approx(scipy**2)
+
+
+def test_mappings_objects_and_other_distances():
+    a, b = populations((2,))
+    split = [Population({"x": p.particles[:, 0], "y": p.particles[:, 1]}, p.log_weights) for p in (a, b)]
+    assert energy_distance(*split) == pytest.approx(by_definition(a, b))
+    kernel = Gaussian(0.7).matrix  # 1 - kernel gives the squared maximum mean discrepancy
+    k = kernel(np.concatenate([a.particles, b.particles]))
+    masses = np.concatenate([a.weights, -b.weights])
+    assert energy_distance(a, b, lambda p: 1 - kernel(p)) == pytest.approx(masses @ k @ masses)
+    first, second = Population(BOXES[:2], np.log([0.3, 0.7])), Population(BOXES[1:], np.log([0.6, 0.4]))
+    found = energy_distance(first, second, lambda p: np.array([[x != y for y in p] for x in p]))
+    assert found == pytest.approx(0.3**2 + 0.1**2 + 0.4**2)
+    with pytest.raises(InputError, match="Box objects"):
+        energy_distance(first, second)
+    with pytest.raises(InputError, match=r"distances have shape \(4,\), expected \(4, 4\)"):
+        energy_distance(first, second, lambda p: np.zeros(len(p)))
