@@ -175,8 +175,13 @@ plant(
     OneNoise=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, rng.standard_normal())),
     OneNoiseOfMany=(_MOVES, "is below", lambda rng, x, y: walk(x, rng.standard_normal()), exact_moves),
     # Returns the moved particles in another order, without their weights.
-    Permutes=(_MOVES, "x_t - x_{t-1}", lambda rng, x, y: rng.permutation(step(rng, x)), exact_moves),
-    SharedByAxes=(_MOVES, "coordinate 0 of x_t + coordinate 1 of x_t", shared_by_axes, exact_plane),
+    Permutes=(
+        _MOVES,
+        "coordinate 1 of (x_t, x_t - x_{t-1})",
+        lambda rng, x, y: rng.permutation(step(rng, x)),
+        exact_moves,
+    ),
+    SharedByAxes=(_MOVES, "coordinate 0 of (x_t, x_t - x_{t-1}) + coordinate 1 of", shared_by_axes, exact_plane),
     SharedByPairs=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, in_blocks(rng, x, 2))),
     Mirrored=(_MOVES, "mirrored positions", mirrored, exact_walk),
     SharedByBlocks=(_MOVES, "of neighbours", lambda rng, x, y: walk(x, in_blocks(rng, x, 8)), exact_walk),
@@ -467,7 +472,7 @@ plant(
     PairsOfSteps=("of neighbours", pairs_of_steps),
     # Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong.
     ForgetsTheParent=(
-        "x_t - x_{t-1}",
+        "coordinate 1 of (x_t, x_t - x_{t-1})",
         lambda rng, x, previous, y: optimal(rng.normal(0.2, 1.0, len(x)), y).sample(rng, len(x)),
     ),
 )

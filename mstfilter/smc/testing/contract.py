@@ -49,11 +49,6 @@ def seeded(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def number_example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """`n` numbers with unequal weights, and a number as observation."""
-    return Population(rng.standard_normal(n), 0.5 * rng.standard_normal(n)), 0.5
-
-
 class Contract:
     """Base class of all contracts. Inherit one of its subclasses and define `make`. pytest does the rest.
 
@@ -67,8 +62,8 @@ class Contract:
         raise NotImplementedError(f"{type(self).__name__} needs a method make(self) that returns the component")
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """A population of `n` particles (by default numbers) that the component can handle, and an observation."""
-        return number_example(rng, n)
+        """A population of `n` weighted particles (by default numbers) for the component, and an observation."""
+        return Population(rng.standard_normal(n), 0.5 * rng.standard_normal(n)), 0.5
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         """Arguments of a typical call, without the generator: the example of `n` particles."""

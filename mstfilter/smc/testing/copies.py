@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
-from typing import Any
 from unittest import SkipTest
 
 import numpy as np
@@ -167,12 +166,6 @@ def fault_message(sample: Sample, column: int) -> str:
         f"{m} particles to {n}: copies are biased: {who} (W = {expected:.3g}) carries {n * mean:.3f} mean weights on "
         f"average, expected {n * expected:.3f}"
     )
-
-
-def log_of(weights: Any) -> np.ndarray:
-    """Log weights, -inf for zero."""
-    with np.errstate(divide="ignore"):
-        return np.log(np.asarray(weights, dtype=np.float64))
 
 
 class ConstantGenerator(np.random.Generator):

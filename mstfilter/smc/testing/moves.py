@@ -23,6 +23,7 @@ from mstfilter.smc.testing.copies import quantile
 from mstfilter.smc.testing.exact import (
     ExactContract,
     check_mean_weight,
+    check_parents,
     check_same_law,
     check_uncorrelated,
     compare_factors,
@@ -39,7 +40,7 @@ class TransitionContract(ScaleContract, ExactContract):
     transition weights by the observation, the population of x_t has these weights.
     """
 
-    moves = True
+    columns = "(x_t, x_t - x_{t-1})"
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.predict(rng, inputs["population"], inputs["observation"])
@@ -52,7 +53,7 @@ class TransitionContract(ScaleContract, ExactContract):
         assert len(result) == n or "previous" in result.parents, (
             f'{n} particles became {len(result)}, and there are no parents "previous"'
         )
-        self.check_parents(result, "previous", n)
+        check_parents(result, "previous", n)
         if same(np.sort(result.log_weights), np.sort(old)):
             parents = result.parents.get("previous", np.arange(n))
             assert np.array_equal(result.log_weights, np.where(parents < 0, result.log_weights, old[parents])), (
@@ -251,7 +252,7 @@ class UpdateContract(ScaleContract, ExactContract):
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         for name, given in (("previous", inputs["predicted"]), ("proposed", inputs["proposed"])):
             if given is not None:
-                self.check_parents(result, name, len(given))
+                check_parents(result, name, len(given))
 
     def test_parents_belong_to_their_particles(self) -> None:
         """A predicted particle that it keeps has that particle as parent "previous"."""
@@ -320,6 +321,8 @@ class RejuvenationContract(ExactContract):
     y_t.
     """
 
+    columns = "(x_t, x_t - x_{t-1})"
+
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {**super().inputs(n, seed), "previous": self.example(seeded(seed + 1), n)[0]}
 
@@ -359,10 +362,6 @@ class RejuvenationContract(ExactContract):
         except AssertionError as error:
             raise AssertionError(f"exact draws are no longer exact after five moves: {error}") from error
         self.check_independent(found)
-
-    @property
-    def moves(self) -> bool:  # type: ignore[override]
-        return self.exact_case(1, 1)[0] is not None
 
 
 def _columns(previous: Population | None, population: Population) -> np.ndarray:

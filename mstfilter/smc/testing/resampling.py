@@ -22,7 +22,7 @@ from mstfilter.smc.testing.contract import (
     skip_unless_properly_weighted,
     statistical,
 )
-from mstfilter.smc.testing.copies import CASES, MOST_CALLS, Case, ConstantGenerator, Sample, fault_message, log_of
+from mstfilter.smc.testing.copies import CASES, MOST_CALLS, Case, ConstantGenerator, Sample, fault_message
 
 _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 
@@ -47,7 +47,9 @@ class ResamplerContract(ScaleContract):
         n = len(weights)
         particles = self.example(seeded(0), n)[0].realised().particles
         index = np.arange(n)
-        return Population(particles, log_of(weights), {"previous": index[::-1], "proposed": index + n})
+        with np.errstate(divide="ignore"):
+            log_weights = np.log(weights)
+        return Population(particles, log_weights, {"previous": index[::-1], "proposed": index + n})
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {"population": self.population(np.linspace(1, 2 + seed, 40)), "n": 25}
