@@ -17,8 +17,8 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
-from mstfilter.smc.programs.handlers import GuideHandler, ReplayHandler, SampleHandler, SiteHandler
-from mstfilter.smc.programs.sites import ProgramRun, active_run
+from mstfilter.smc.programs.handlers import GivenHandler, GuideHandler, ReplayHandler, SampleHandler, SiteHandler
+from mstfilter.smc.programs.sites import ProgramRun, active_run, recorded
 from mstfilter.smc.streams import RunGenerators
 
 Model = Callable[..., Any]
@@ -85,7 +85,13 @@ class _ProgramStep(Component):
             if guard is not None:
                 self.schedule.clear()  # the next run is checked again
             raise
-        return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
+        try:
+            return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
+        except InputError:
+            if np.isnan(gain).any():
+                with recorded():  # a recorded run names the site
+                    run_program(model, GivenHandler(particles), previous, observation, n)
+            raise
 
 
 @dataclass(frozen=True)

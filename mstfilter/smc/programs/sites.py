@@ -281,7 +281,7 @@ class ProgramRun:
         log_prob = np.asarray(log_prob)
         if log_prob.shape not in ((size,), (), (1,)):
             raise InputError(f"log_prob has shape {log_prob.shape}, expected one number per particle, ({size},)")
-        if size and not log_prob.max() < np.inf:
+        if self.calls is not None and size and not log_prob.max() < np.inf:
             wrong = np.flatnonzero(~(np.atleast_1d(log_prob) < np.inf))
             raise InputError(
                 f"log density is {np.atleast_1d(log_prob)[wrong[0]]} for {len(wrong)} of {size} particles",
