@@ -275,3 +275,25 @@ def test_tempered_systematic_by_quadrature(weights, n, power):
     alpha = np.exp(power * lw)
     carried, _ = expectation(Tempered(Systematic(), power), lw, n, n * np.cumsum(alpha) / alpha.sum())
     np.testing.assert_allclose(carried, np.array(weights) / len(lw), rtol=1e-6)
+
+
+def test_shuffling_changes_neighbours():
+    """Systematic draws of equal weights take every second particle; shuffled ones take any half."""
+    population = of(np.arange(4.0), [1.0] * 4)
+    found = {
+        tuple(sorted(chosen.particles))
+        for _, chosen in outcomes(lambda rng: Shuffled().resample(rng, population, 2), cells=2)
+    }
+    assert len(found) == 6
+
+
+def test_light_clusters_have_no_sure_place():
+    """Of four clusters two hold .1 % of the weight each: they come in .5 % of draws, and stand for one place."""
+    population = of([0.0, 10.0, 20.0, 30.0], [0.698, 0.3, 0.001, 0.001])
+    scheme, n_light = ClusterStratified(Gaussian(1.0), least_mass=0.05), 0
+    for seed in range(1000):
+        chosen = scheme.resample(np.random.default_rng(seed), population, 5)
+        light = chosen.parents["ancestor"] >= 2
+        n_light += light.sum()
+        assert np.exp(chosen.log_weights[light]) == pytest.approx(0.25, rel=0.01)
+    assert 0 < n_light < 30
