@@ -19,7 +19,7 @@ from mstfilter.smc import (
     bootstrap,
 )
 from mstfilter.smc.testing import TransitionContract
-from tests.smc.models import AR1, ar1_observations, hmm, kalman_ar1, mean_ratio
+from tests.smc.models import AR1, ar1_observations, hmm, kalman_ar1, mean_ratio, optimal
 
 YS = ar1_observations(8)
 
@@ -59,6 +59,10 @@ def test_candidates_know_where_they_come_from():
         np.random.default_rng(0), bootstrap(hmm("objects"), 5).run([0], 0)[0].population, None
     )
     assert len(objects) == 10
+    inner, population = Dynamics(AR1, optimal), state.population
+    copies = inner.predict(np.random.default_rng(0), population.take(np.repeat(np.arange(20), 2)), 0.7)
+    moved = Branching(inner, 2).predict(np.random.default_rng(0), population, 0.7)
+    np.testing.assert_array_equal(moved.log_weights, copies.log_weights)
     with pytest.raises(InputError, match="branches is 0"):
         Branching(Dynamics(AR1), 0)
 
