@@ -220,7 +220,7 @@ plant(
 plant(
     selecting,
     "many_particles",
-    SixteenBits=("too few bits", lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int)),
+    SixteenBits=("expected 0 to 100000", lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int)),
 )
 plant(
     of(WeightResampler, {"exact_size": False}, select=selected),
