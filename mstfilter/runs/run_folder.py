@@ -366,7 +366,7 @@ class RunFolder:
         with reading(path, "a pause of a run"):
             now = path.stat()
         version = (str(path.resolve()), now.st_mtime_ns, now.st_size)
-        return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE)[0])
+        return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, to be scored by `mstfilter.scoring.score_pauses`."""

@@ -321,9 +321,7 @@ def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> 
     number[missing] = np.arange(np.count_nonzero(missing))
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float64)
     used = known | missing
-    pairs = [
-        (np.argwhere(missing & _moved(used, step)), step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0))
-    ]
+    pairs = [(np.argwhere(missing & _moved(used, step)), step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0))]
     here = np.concatenate([at for at, _ in pairs])
     there = np.concatenate([at + step for at, step in pairs])
     own, other = number[tuple(here.T)], number[tuple(there.T)]

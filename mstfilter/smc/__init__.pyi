@@ -4,7 +4,6 @@ from mstfilter.smc.components import (
     Bins as Bins,
     Branching as Branching,
     EssBelow as EssBelow,
-    EveryKth as EveryKth,
     ExactEquality as ExactEquality,
     Kld as Kld,
     Never as Never,
@@ -92,14 +91,8 @@ from mstfilter.smc.population import (
     normalise as normalise,
     union as union,
 )
-from mstfilter.smc.programs.filters import (
-    Program as Program,
-)
-from mstfilter.smc.programs.sites import (
-    observe as observe,
-    sample as sample,
-    switch as switch,
-)
+from mstfilter.smc.programs.filters import Program as Program
+from mstfilter.smc.programs.sites import observe as observe, sample as sample, switch as switch
 from mstfilter.smc.resampling import (
     Killing as Killing,
     LargestWeights as LargestWeights,

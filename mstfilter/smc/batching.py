@@ -358,11 +358,7 @@ class _Sweep:
         population = Population(of_runs(self.particles, row), self.log_weights[row], parents)
         info = object.__new__(_RunInfo)
         info.__dict__.update(
-            t=t,
-            n=filter.n,
-            n_candidates=filter.n,
-            ess=float(self.ess[row]),
-            resampled=bool(self.resampled[row]),
+            t=t, n=filter.n, n_candidates=filter.n, ess=float(self.ess[row]), resampled=bool(self.resampled[row])
         )
         return State(t + 1, population, self.streams.keys[self.runs[row]], filter.properly_weighted), info
 

@@ -2,7 +2,7 @@
 
 >>> for state, info in filter.iterate(observations, seed):
 ...     save_state(path, state)
->>> state, _ = load_state(path)                                      # later, or in another process
+>>> state = load_state(path)                                         # later, or in another process
 >>> state, infos = filter.run(observations[state.t:], state)
 
 The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
@@ -35,14 +35,11 @@ from mstfilter.smc.streams import Key
 _FORMAT = 1
 
 
-def save_state(
-    path: Path, state: State, codec: Codec | None = None, *, compress: bool = False, **description: Any
-) -> None:
+def save_state(path: Path, state: State, codec: Codec | None = None, *, compress: bool = False) -> None:
     """Write a state after at least one step to an .npz file, atomically. The folder must exist.
 
     `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and writing is
-    slower. Other values, of types that JSON represents, are stored by name. Raises InputError if the particles cannot
-    be stored or the file cannot be written.
+    slower. Raises InputError if the particles cannot be stored or the file cannot be written.
     """
     population = state.population
     if population is None:
@@ -53,7 +50,6 @@ def save_state(
         "seed": state.key.seed,
         "path": list(state.key.path),
         "properly_weighted": state.properly_weighted,
-        **description,
     }
     arrays = {
         "head": np.array(json.dumps(head)),
@@ -65,8 +61,8 @@ def save_state(
         (np.savez_compressed if compress else np.savez)(file, allow_pickle=False, **arrays)
 
 
-def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> tuple[State, dict[str, Any]]:
-    """The state in a file, and the description stored with it.
+def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> State:
+    """The state in a file.
 
     Raises InputError if the file is missing, damaged, not a checkpoint, or its arrays need more than `limit` bytes.
     """
@@ -80,7 +76,7 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
         particles = (codec or ArrayCodec()).decode(_below(arrays, "particles/"))
         population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
         key = Key(int(head["seed"]), tuple(head["path"]))
-        return State(int(head["t"]), population, key, bool(head["properly_weighted"])), head
+        return State(int(head["t"]), population, key, bool(head["properly_weighted"]))
 
 
 _DAMAGED = "remove it to start again, or choose another file"

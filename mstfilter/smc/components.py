@@ -138,17 +138,6 @@ class Never(Trigger):
         return False
 
 
-@dataclass(frozen=True)
-class EveryKth(Trigger):
-    """Resample at every k-th step."""
-
-    k: PositiveInt = 2
-    batched: ClassVar[bool] = True
-
-    def wants(self, population: Population, t: int) -> bool:
-        return t % self.k == 0
-
-
 def first_seen(keys: Iterable[Hashable]) -> np.ndarray:
     """(n,) int: equal keys get equal numbers, counted from 0 in the order of first occurrence."""
     numbers: dict[Hashable, int] = {}

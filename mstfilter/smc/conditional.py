@@ -21,7 +21,7 @@ from mstfilter.smc.inputs import split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, program_step, run_program
-from mstfilter.smc.programs.handlers import CopyHandler, ScoreHandler
+from mstfilter.smc.programs.handlers import GivenHandler
 from mstfilter.smc.resampling import Multinomial
 from mstfilter.smc.smoothing import draw_log
 from mstfilter.smc.state_space import Dynamics, Prior
@@ -109,10 +109,10 @@ def _ancestor(
 def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
     """(n,) log f(new | old), and for programs also log p(y | new, old); None if it is not known."""
     if isinstance(transition, ProgramTransition):
-        handler = ScoreHandler(dict(new))
+        handler = GivenHandler(dict(new))
         particles, density = run_program(transition.model, handler, old, y, count_particles(old))
         # A value that the program returns is a function of the previous particle, and has no density.
-        return density if {site.name for site in handler.sites} == set(particles) else None
+        return density if handler.names == set(particles) else None
     if isinstance(transition, Dynamics):
         found = transition.model.log_transition
         return None if found is None else np.asarray(found(old, new), np.float64)
@@ -168,10 +168,10 @@ def _drawn(
 def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:
     """The given particle (one row) with the values that the program returns, and its log weight."""
     if component.guide is None or y is None:
-        particle, gain = run_program(component.model, CopyHandler(given, _FIRST), old, y, 1)
+        particle, gain = run_program(component.model, GivenHandler(given, weigh=False), old, y, 1)
         return particle, gain[0]
-    _, log_q = run_program(component.guide, ScoreHandler(given), old, y, 1)
-    particle, log_p = run_program(component.model, ScoreHandler(given), old, y, 1)
+    _, log_q = run_program(component.guide, GivenHandler(given), old, y, 1)
+    particle, log_p = run_program(component.model, GivenHandler(given), old, y, 1)
     return particle, log_p[0] - log_q[0]
 
 
@@ -215,7 +215,7 @@ def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Part
     """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
     component = filter.initial if previous is None else filter.transition
     if isinstance(component, ProgramInitial | ProgramTransition):
-        _, gain = run_program(component.model, ScoreHandler(row), previous, y, 1)
+        _, gain = run_program(component.model, GivenHandler(row), previous, y, 1)
         return float(gain[0])
     if not isinstance(component, Prior | Dynamics):
         raise InputError("the filter is not made from a StateSpaceModel or a Program: its densities are not known")

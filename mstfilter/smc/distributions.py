@@ -287,25 +287,21 @@ def _cholesky(cov: np.ndarray) -> np.ndarray:
     """Lower triangular root of each covariance; in `hypothetical`, NaN for a row that is not positive definite."""
     if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
         raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
-    difference = cov - np.swapaxes(cov, -1, -2)
-    if (abs(difference) <= 1e-6 * abs(cov).max(initial=0.0)).all():
+    size = abs(cov).max(axis=(-1, -2), initial=0.0)
+    symmetric = abs(cov - np.swapaxes(cov, -1, -2)).max(axis=(-1, -2), initial=0.0) <= 1e-6 * size
+    if symmetric.all():
         try:
             return np.linalg.cholesky(cov)
         except np.linalg.LinAlgError:
             pass
-    matrices, roots = cov.reshape(-1, *cov.shape[-2:]), []
-    for row, matrix in enumerate(matrices):
-        size = abs(matrix).max()
-        symmetric = bool((abs(matrix - matrix.T) <= 1e-6 * size).all())
-        try:
-            roots.append(np.linalg.cholesky(matrix if symmetric else np.full_like(matrix, -1.0)))
-        except np.linalg.LinAlgError:
-            roots.append(np.full_like(matrix, np.nan))
-            if not (_HYPOTHETICAL.get() and cov.ndim == 3):
-                what = "positive definite" if symmetric else "symmetric"
-                where = f" in row {row}" if cov.ndim == 3 else ""
-                raise InputError(f"covariance is not {what}{where}: {matrix.tolist()}"[:300]) from None
-    return np.reshape(roots, cov.shape)
+    valid = symmetric & (np.linalg.eigvalsh(np.nan_to_num(cov))[..., 0] > 0) & np.isfinite(size)
+    if _HYPOTHETICAL.get() and cov.ndim == 3:
+        root = np.linalg.cholesky(np.where(valid[:, None, None], cov, np.eye(cov.shape[-1])))
+        return np.where(valid[:, None, None], root, np.nan)
+    row = int(np.argmin(valid))
+    what = "positive definite" if symmetric.flat[row] else "symmetric"
+    where = f" in row {row}" if cov.ndim == 3 else ""
+    raise InputError(f"covariance is not {what}{where}: {cov.reshape(-1, *cov.shape[-2:])[row].tolist()}"[:300])
 
 
 @dataclass(frozen=True, eq=False)

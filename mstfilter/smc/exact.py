@@ -9,8 +9,8 @@
 >>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
 
 The first observation updates the initial state before any prediction, as in all filters of this package. A missing
-observation is None. Matrices that change with time have a first axis of T entries. Entry t of a transition moves
-x_{t-1} to x_t, and entry 0 is not used.
+observation is None. Matrices of a linear model that change with time have a first axis of T entries. Entry t of F, Q
+and B moves x_{t-1} to x_t, and entry 0 is not used.
 """
 
 from __future__ import annotations
@@ -159,8 +159,7 @@ def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:
     """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
 
-    `initial` (K,) has the probabilities of x_0. Row i of `transition` (K, K) has those of x_t given x_{t-1} = i. If
-    `transition` has a first axis of T entries, entry t moves x_{t-1} to x_t, and entry 0 is not used.
+    `initial` (K,) has the probabilities of x_0. Row i of `transition` (K, K) has those of x_t given x_{t-1} = i.
     ``log_likelihood(y)`` (K,) is log p(y_t | x_t = 0 .. K-1, which is -inf if impossible. The function may also have
     the parameters ``t`` and ``u``.
     """
@@ -172,37 +171,31 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
     with np.errstate(divide="ignore"):
         log_start, log_moves = np.log(start), np.log(moves)
 
-    def move(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
-        return (_entry("transition", below, **step)[x] <= rng.random(len(x))[:, None]).sum(axis=-1)
-
-    def log_move(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
-        return _entry("transition", log_moves, **step)[old, new]
-
     def weigh(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
         return np.asarray(log_likelihood(y, **step), dtype=np.float64)[x]
 
     return StateSpaceModel(
         lambda rng, n: (below_start <= rng.random(n)[:, None]).sum(axis=-1),
-        with_step(move, _varies(moves)),
+        lambda rng, x: (below[x] <= rng.random(len(x))[:, None]).sum(axis=-1),
         with_step(weigh, step_parameters(log_likelihood, 1)),
         lambda x: log_start[x],
-        with_step(log_move, _varies(moves)),
+        lambda old, new: log_moves[old, new],
         batched=None,
     )
 
 
 def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Checked probabilities of the first state (K,), and of the moves (K, K) or (T, K, K)."""
+    """Checked probabilities of the first state (K,), and of the moves (K, K)."""
     found = []
-    for name, given, dimensions in (("initial", initial, (1,)), ("transition", transition, (2, 3))):
+    for name, given, axes in (("initial", initial, 1), ("transition", transition, 2)):
         p = np.asarray(given, dtype=np.float64)
-        if p.ndim not in dimensions or not p.size:
+        if p.ndim != axes or not p.size:
             raise InputError(f"{name} has shape {p.shape}, expected {'(K,)' if name == 'initial' else '(K, K)'}")
         if not ((p >= 0).all() and np.allclose(p.sum(axis=-1), 1.0)):
             raise InputError(f"{name} is {p.tolist()}, expected probabilities that sum to 1 in each row")
         found.append(p)
     start, moves = found
-    if moves.shape[-2:] != (len(start),) * 2:
+    if moves.shape != (len(start),) * 2:
         raise InputError(f"transition has shape {moves.shape}, expected {(len(start),) * 2} as initial")
     return start, moves
 
@@ -225,12 +218,9 @@ def forward_backward(
     start, moves = _chain(initial, transition)
     ys = [split_input(y) for y in check_observations(observations)]
     T, K, of_step = len(ys), len(start), step_parameters(log_likelihood, 1)
-    if moves.ndim == 3 and len(moves) != T:
-        raise InputError(f"transition has {len(moves)} entries, expected one for each of {T} observations")
-    moves = np.broadcast_to(moves, (T, K, K))
     filtered, likelihood, total = np.empty((T, K)), np.ones((T, K)), np.zeros(T)
     for t, (y, u) in enumerate(ys):
-        predicted = filtered[t - 1] @ moves[t] if t else start
+        predicted = filtered[t - 1] @ moves if t else start
         total[t] = total[t - 1] if t else 0.0
         filtered[t] = predicted
         if y is None:
@@ -247,7 +237,7 @@ def forward_backward(
         filtered[t] = joint / joint.sum()
     smoothed, later = filtered.copy(), np.ones(K)  # later is proportional to p(y_{t+1} .. | x_t)
     for t in range(T - 2, -1, -1):
-        later = moves[t + 1] @ (likelihood[t + 1] * later)
+        later = moves @ (likelihood[t + 1] * later)
         later /= later.max()
         smoothed[t] = filtered[t] * later / (filtered[t] @ later)
     return Marginals(filtered, smoothed, total)

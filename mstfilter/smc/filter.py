@@ -155,11 +155,7 @@ class ParticleFilter(AtStep):
             chosen = step.rejuvenate(chosen, past)
         return step.finish(past, fused, chosen, resampled_before, resampled_after)
 
-    def iterate(
-        self,
-        observations: Iterable[Any],
-        state: State | int = 0,
-    ) -> Iterator[tuple[State, Info]]:
+    def iterate(self, observations: Iterable[Any], state: State | int = 0) -> Iterator[tuple[State, Info]]:
         """Yield the state and the info of every step.
 
         Parameters

@@ -60,11 +60,9 @@ class Chains:
     def columns(self) -> dict[str, np.ndarray]:
         """Columns of a table: chain, draw, parameters, log evidence and log density, chain after chain."""
         numbers = np.indices(self.log_density.shape)
-        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta, **self._stats()}
+        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta}
+        arrays |= {"log_evidence": self.log_evidence, "log_density": self.log_density}
         return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
-
-    def _stats(self) -> dict[str, np.ndarray]:
-        return {"log_evidence": self.log_evidence, "log_density": self.log_density}
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
         """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
@@ -246,7 +244,6 @@ def ensemble(
     n_iterations: int,
     seed: int = 0,
     *,
-    moves: Any = None,
     batched: bool = False,
 ) -> Chains:
     """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
@@ -260,8 +257,6 @@ def ensemble(
         As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
     start : (n_walkers, d) array_like
         First parameters. At least 2 d different parameters are needed.
-    moves : optional
-        Moves of emcee; the default is its stretch move.
     """
     import emcee
 
@@ -276,7 +271,7 @@ def ensemble(
         found = posterior(rng, thetas)
         return np.stack([found["log_density"], found["log_evidence"]], axis=1)
 
-    sampler = emcee.EnsembleSampler(*theta.shape, log_density, moves=moves, vectorize=True)
+    sampler = emcee.EnsembleSampler(*theta.shape, log_density, vectorize=True)
     own = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))  # emcee draws from the legacy generator
     sampler.run_mcmc(emcee.State(theta, random_state=own.get_state()), n_iterations)
     evidence = sampler.get_blobs().reshape(n_iterations, len(theta))

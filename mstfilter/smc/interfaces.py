@@ -260,11 +260,6 @@ class Distribution(ABC):
         return np.shape(self.mean)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """(n,) if the parameters have one row per particle; () or (1,) if all particles share them."""
-        return self.parameter_shape[:1]
-
-    @property
     def event_shape(self) -> tuple[int, ...]:
         """Shape of the value of one particle."""
         return self.parameter_shape[1:]
@@ -356,7 +351,7 @@ class Infos(list[Info]):
     """The records of the steps of a run: a list that can be read as a table.
 
     >>> state, infos = filter.run(observations)
-    >>> pandas.DataFrame(infos.columns())
+    >>> pandas.DataFrame(infos.rows())
     """
 
     def rows(self) -> list[dict[str, Any]]:
@@ -370,11 +365,6 @@ class Infos(list[Info]):
             }
             for info in self
         ]
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """The `rows` by column."""
-        rows = self.rows()
-        return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def __repr__(self) -> str:
         if not self:

@@ -18,7 +18,7 @@ to an array after a population was made from it; pass ``array.copy()`` if you ne
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -29,7 +29,6 @@ from mstfilter.errors import InputError, LostRunError
 from mstfilter.lazy import late
 
 _T = TypeVar("_T")
-_U = TypeVar("_U")
 
 Particles = Any  # ndarray (n, ...) | mapping name -> ndarray (n, ...) | sequence of objects
 
@@ -82,9 +81,6 @@ class Candidates(Sequence[_T], Generic[_T]):
             self._built[index] = self._build(index)
         return self._built[index]
 
-    def __iter__(self) -> Iterator[_T]:
-        return (self[i] for i in range(len(self)))
-
     @property
     def n_built(self) -> int:
         """Number of distinct candidates built so far. Selections by `take` share built candidates."""
@@ -93,10 +89,6 @@ class Candidates(Sequence[_T], Generic[_T]):
     def take(self, positions: np.ndarray) -> Candidates[_T]:
         """Select candidates without building them."""
         return Candidates(self._build, self._indices[np.asarray(positions)], self._built)
-
-    def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
-        """Candidates ``function(candidate)``, computed on access."""
-        return Candidates(lambda position: function(self[position]), len(self))
 
 
 def count_particles(particles: Particles) -> int:
@@ -242,21 +234,6 @@ class Population:
 
     plot = late("mstfilter.report.display:plot_population", "Hypotheses by weight, or weighted histograms.")
     _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """Columns of a table: the particles, named as their arrays, else "x" or "particle"; weights."""
-        weights, columns = {"weight": self.weights, "log_weight": self.log_weights}, flat_columns(self._arrays())
-        if not weights.keys().isdisjoint(columns):
-            raise InputError(f"particles have arrays called {' and '.join(sorted(weights.keys() & columns))}")
-        return columns | weights
-
-    def _arrays(self) -> dict[str, np.ndarray]:
-        particles = self.realised().particles
-        if isinstance(particles, tuple):
-            objects = np.empty(len(particles), object)
-            objects[:] = particles
-            return {"particle": objects}
-        return dict(particles) if isinstance(particles, Mapping) else {"x": particles}
 
     def __len__(self) -> int:
         return len(self.log_weights)

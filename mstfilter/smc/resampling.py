@@ -7,15 +7,10 @@ W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. The sch
 scheme          N_i                                                variance of N_i
 ==============  =================================================  ====================================
 Multinomial     n independent draws                                n W_i (1 - W_i)
-
-Residual        floor(n W_i), the rest by another scheme           f (1 - f / R), R = sum of all f
-
+Residual        floor(n W_i), the rest by independent draws        f (1 - f / R), R = sum of all f
 Stratified      one draw in each of n equal strata of [0, 1)       sum over strata of p (1 - p)
-
 Systematic      one draw, shifted to each stratum                  f (1 - f)
-
 Ssp             floor or ceil, fractions decided pair by pair      f (1 - f)
-
 Killing         survive with w_i / max w, else multinomial         see `Killing`
 ==============  =================================================  ====================================
 
@@ -24,9 +19,9 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-The variance of `Residual` is given for its default, the multinomial remainder. Weights need not sum to 1, may have
-any float type, and may be zero (log weight -inf). n may differ from their number. A particle of weight zero is never
-selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights are zero.
+Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from their number.
+A particle of weight zero is never selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights
+are zero.
 
 All schemes share functions for the inverse of the cumulative weights, at the end of this module: `inverse_cdf` takes
 one point in each of n equal strata, `independent_draws` takes n independent points, and `draw_rows` takes one point
@@ -35,9 +30,6 @@ for each row of a matrix. A user's scheme is a `WeightResampler` whose `select` 
 Random schemes do not compare weights, so they have no ties. If weights are equal, `LargestWeights.select` (a stable
 sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first particle.
 
-Residual-systematic resampling (Bolic, Djuric, Hong 2004) has no class. In exact arithmetic this scheme selects the
-same particles as `Systematic` and as ``Residual("systematic")`` for the same uniform number.
-
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
 """
@@ -45,7 +37,7 @@ Liu and Chen (1998).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -106,24 +98,13 @@ def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) ->
 
 @dataclass(frozen=True)
 class Residual(WeightResampler):
-    """floor(n W_i) copies of each particle. The rest is drawn by another scheme (Liu and Chen 1998).
-
-    `remainder` is the scheme for the fractions frac(n W_i). The remainder `systematic` has the least variance, f (1 -
-    f).
-    """
-
-    remainder: Literal["multinomial", "stratified", "systematic"] = "multinomial"
+    """floor(n W_i) copies of each particle. The rest is drawn independently by frac(n W_i) (Liu and Chen 1998)."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)
         if rest > 0:
-            copies += np.bincount(self._draws(rng, fractions, rest), minlength=len(copies))
+            copies += np.bincount(independent_draws(rng, fractions, rest), minlength=len(copies))
         return expanded(np.cumsum(copies), n), None
-
-    def _draws(self, rng: np.random.Generator, fractions: np.ndarray, rest: int) -> np.ndarray:
-        if self.remainder == "multinomial":
-            return independent_draws(rng, fractions, rest)
-        return inverse_cdf(fractions, rng.random(1 if self.remainder == "systematic" else rest), rest)
 
 
 _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding

@@ -303,7 +303,6 @@ def metropolis(
     state: _Chains,
     propose: Callable[[np.random.Generator, _Chains], tuple[_Chains, np.ndarray]],
     steps: int = 1,
-    choose: Callable[[np.ndarray, _Chains, _Chains], _Chains] = choose_rows,
 ) -> Iterator[tuple[_Chains, np.ndarray]]:
     """Metropolis-Hastings steps of n chains.
 
@@ -315,8 +314,6 @@ def metropolis(
     propose : callable
         ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
         q(new | old)). A ratio of NaN (both states are impossible) is rejected.
-    choose : callable
-        ``(accepted, new, old) -> state`` of new and old rows.
 
     Yields
     ------
@@ -326,7 +323,7 @@ def metropolis(
     for _ in range(steps):
         new, log_ratio = propose(rng, state)
         accepted = np.log1p(-rng.random(len(log_ratio))) < log_ratio
-        state = choose(accepted, new, state)
+        state = choose_rows(accepted, new, state)
         yield state, accepted
 
 
@@ -335,11 +332,10 @@ def moved(
     state: _Chains,
     propose: Callable[[np.random.Generator, _Chains], tuple[_Chains, np.ndarray]],
     steps: int,
-    choose: Callable[[np.ndarray, _Chains, _Chains], _Chains] = choose_rows,
 ) -> tuple[_Chains, float]:
     """The state after `steps` steps of `metropolis`, and the share of accepted proposals."""
     taken = proposed = 0
-    for after, accepted in metropolis(rng, state, propose, steps, choose):
+    for after, accepted in metropolis(rng, state, propose, steps):
         state = after
         taken, proposed = taken + int(np.count_nonzero(accepted)), proposed + len(accepted)
     return state, taken / proposed
@@ -383,10 +379,7 @@ def guided(
         Other fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
     """
     return replace(
-        bootstrap(model, n),
-        initial=Prior(model, initial),
-        transition=Dynamics(model, proposal),
-        **components,
+        bootstrap(model, n), initial=Prior(model, initial), transition=Dynamics(model, proposal), **components
     )
 
 

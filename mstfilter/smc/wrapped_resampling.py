@@ -14,7 +14,7 @@ array([2., 1., 3.])
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
@@ -49,28 +49,16 @@ class ResamplerWrapper(Resampler):
 class Sorted(ResamplerWrapper):
     """Orders the particles before the selection, for schemes whose result depends on the order.
 
-    Parameters
-    ----------
-    order : {"position", "mean_partition"}
-        "position": by value, or along a Hilbert curve for particles that are vectors. In one dimension, the
-        distribution function of the particles that `Systematic` or `Stratified` select differs from the weighted one
-        by at most 1 / n. Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of
-        resampling methods"; Li, Wang, Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte
-        Carlo". With "mean_partition", particles of at most the mean weight are first, then the others. The order
-        inside each group does not change. `Systematic` then keeps the expected number of light particles, rounded up
-        or down. Chopin, Singh, Soto, Vihola (2022), "On resampling schemes for particle filters with weakly
-        informative observations".
+    The order is by value, or along a Hilbert curve for particles that are vectors. In one dimension, the distribution
+    function of the particles that `Systematic` or `Stratified` select differs from the weighted one by at most 1 / n.
+    Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of resampling methods"; Li, Wang,
+    Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte Carlo".
     """
 
     scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
-    order: Literal["position", "mean_partition"] = "position"
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        if self.order == "mean_partition":
-            weights = checked_weights(population.log_weights, n)
-            order = np.argsort(weights > weights.mean(), kind="stable")
-        else:
-            order = np.argsort(_line(as_matrix(population.particles)), kind="stable")
+        order = np.argsort(_line(as_matrix(population.particles)), kind="stable")
         chosen = self.scheme.resample(rng, population.take(order), n)
         return chosen.with_ancestors(order[chosen.parents["ancestor"]])
 

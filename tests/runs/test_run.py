@@ -111,9 +111,9 @@ def test_broken_input_and_useless_settings_make_no_folder(recording, tmp_path):
     image.write_bytes(image.read_bytes()[:-50])
     with pytest.raises(InputError, match="truncated"):
         filter_recording(open_recording(broken), load_config("mst"), tmp_path / "run")
-    for override in ("n=0", "n_proposed=-1", "update.n_views=-1", "update.quality_exponent=nan", "trigger.k=0"):
+    for override in ("n=0", "n_proposed=-1", "update.n_views=-1", "update.quality_exponent=nan", "trigger.share=0"):
         with pytest.raises(InputError):
-            filter_recording(recording, load_config("mst", ["trigger=every", override]), tmp_path / "run")
+            filter_recording(recording, load_config("mst", [override]), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -38,26 +38,24 @@ SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 REPEATED = "when (it|the step) is repeated with the same random numbers"
 
 
-def add(table, model, ys, n, kind, guide, options, *rest):
+def into(table, *rest, ys=YS, n=200, guide=None):
     """Add the filter of a program to a table; the name of the function is that of the fault."""
-    program, name = Program(model), getattr(model, "function", model).__name__
-    filter = program.guided(guide, n, **options) if guide else getattr(program, kind)(n, **options)
-    assert name not in table
-    table[name] = (filter, ys, *rest)
-    return model
+
+    def add(model):
+        program, name = Program(model), model.__name__
+        assert name not in table
+        table[name] = (program.guided(guide, n) if guide else program.bootstrap(n), ys, *rest)
+        return model
+
+    return add
 
 
-def faulty(expected, ys=YS, n=200, kind="bootstrap", guide=None, **options):
-    """Add a program to `FAULTY`."""
-    return lambda model: add(FAULTY, model, ys, n, kind, guide, options, expected)
+def faulty(expected, **options):
+    return into(FAULTY, expected, **options)
 
 
-def inherent(reason, guide):
-    return lambda model: add(INHERENT, model, YS, 200, "guided", guide, {}, reason)
-
-
-def correct(ys=YS, n=200, kind="bootstrap", guide=None, **options):
-    return lambda model: add(CORRECT, model, ys, n, kind, guide, options)
+def correct(**options):
+    return into(CORRECT, **options)
 
 
 def walk(previous, scale=0.6):
@@ -68,76 +66,35 @@ def seen(x, y, scale=0.5):
     observe("y", Normal(x, scale), y)
 
 
-def named(expected, programs, wrap=lambda program: program, **options):
-    """Add programs to `FAULTY` by name."""
-    for name, program in programs.items():
+def draw(name, distribution):
+    """`sample` for programs that return nothing."""
+    sample(name, distribution)
+
+
+def after_the_walk(add, **bodies):
+    """Programs that draw x by `walk` and then do what ``body(x, y)`` does."""
+
+    def program_of(body):
+        return lambda previous, y: body(walk(previous), y)
+
+    for name, body in bodies.items():
+        program = program_of(body)
         program.__name__ = name
-        faulty(expected, **options)(wrap(program))
+        add(program)
 
 
-def in_transition(expected, ys=YS, **functions):
+def in_transition(expected, **functions):
     """Programs with the transition density Normal(f(x_{t-1}), 0.6)."""
 
     def program_of(f):
-        def program(previous, y):
-            seen(sample("x", Normal(0.0, 1.0) if previous is None else Normal(f(previous["x"]), 0.6)), y)
+        return lambda previous, y: seen(
+            sample("x", Normal(0.0, 1.0) if previous is None else Normal(f(previous["x"]), 0.6)), y
+        )
 
-        return program
-
-    named(expected, {name: program_of(f) for name, f in functions.items()}, ys=ys)
-
-
-def in_likelihood(expected, kind="bootstrap", **functions):
-    """Programs whose observation has the density Normal(f(x), 0.5), or Normal(*f(x))."""
-
-    def program_of(f):
-        def program(previous, y):
-            found = f(walk(previous))
-            seen(*found[:1], y, *found[1:]) if isinstance(found, tuple) else seen(found, y)
-
-        return program
-
-    named(expected, {name: program_of(f) for name, f in functions.items()}, kind=kind)
-
-
-def in_site(expected, **distributions):
-    """Programs with a second site z of the distribution f(x), which is observed."""
-
-    def program_of(f):
-        def program(previous, y):
-            x = walk(previous)
-            with np.errstate(invalid="ignore"):
-                z = sample("z", f(x))
-            seen(z + 0.0 * x, y)
-
-        return program
-
-    named(expected, {name: program_of(f) for name, f in distributions.items()})
-
-
-def in_observation(expected, value, **distributions):
-    """Programs that observe a value of the distribution f(x)."""
-
-    def program_of(f):
-        def program(previous, y):
-            observe("y", f(walk(previous)), value)
-
-        return program
-
-    named(expected, {name: program_of(f) for name, f in distributions.items()})
-
-
-def in_branch(expected, probs=(0.5, 0.5), **functions):
-    """Programs with two branches: one observes its particles v, the other f(v, x) with x of all particles."""
-
-    def program_of(f):
-        def program(previous, y):
-            x = walk(previous)
-            switch("s", np.array(probs), [lambda v: seen(v, y), lambda v: seen(f(v, x), y)], x)
-
-        return program
-
-    named(expected, {name: program_of(f) for name, f in functions.items()})
+    for name, f in functions.items():
+        program = program_of(f)
+        program.__name__ = name
+        faulty(expected)(program)
 
 
 # --- reductions over the particles --------------------------------------------------------------------------------
@@ -148,30 +105,25 @@ in_transition(
     a_median=np.median,
     a_mean_at_later_steps_only=lambda x: x.mean() + 0.0 * x,
 )
-in_likelihood(
-    ALONE,
-    a_mean_in_the_likelihood=lambda x: 0.5 * x + 0.5 * x.mean(),
-    a_standardised_state=lambda x: (x - x.mean()) / x.std(),
-    a_maximum_decides=lambda x: (x, 2.0 if x.max() > 1.5 else 0.5),
-    any_decides=lambda x: x if not (x > 1.0).any() else x - 1.0,
-    a_dot_product_over_particles=lambda x: (x, 0.5 + 0.001 * (x @ x)),
-    the_length_of_the_population=lambda x: x.sum() / 200,
-    half_of_the_particles_differ=lambda x: np.where(np.arange(len(x)) < len(x) // 2, x, -x),
+after_the_walk(
+    faulty(ALONE),
+    a_mean_in_the_likelihood=lambda x, y: seen(0.5 * x + 0.5 * x.mean(), y),
+    a_standardised_state=lambda x, y: seen((x - x.mean()) / x.std(), y),
+    a_maximum_decides=lambda x, y: seen(x, y, 2.0 if x.max() > 1.5 else 0.5),
+    any_decides=lambda x, y: seen(x if not (x > 1.0).any() else x - 1.0, y),
+    a_dot_product_over_particles=lambda x, y: seen(x, y, 0.5 + 0.001 * (x @ x)),
+    the_length_of_the_population=lambda x, y: seen(x.sum() / 200, y),
+    half_of_the_particles_differ=lambda x, y: seen(np.where(np.arange(len(x)) < len(x) // 2, x, -x), y),
+    weights_normalised_over_particles=lambda x, y: observe("y", Bernoulli(np.exp(x) / np.exp(x).sum()), 1),
+    a_centred_state=lambda x, y: {"centred": x - x.mean()},
+    a_parameter_by_position=lambda x, y: {"scale": np.linspace(0.1, 1.0, len(x))},
 )
-in_observation(ALONE, 1, weights_normalised_over_particles=lambda x: Bernoulli(np.exp(x) / np.exp(x).sum()))
 
 
 @faulty(ALONE)
 def a_sum_without_axis(previous, y):
     v = sample("v", Normal(np.zeros((1, 2)) if previous is None else previous["v"], 1.0))
     observe("y", Normal(v.sum(), 1.0), y)
-
-
-@faulty(ALONE)
-def a_centred_state(previous, y):
-    x = walk(previous)
-    seen(x, y)
-    return {"centred": x - x.mean()}
 
 
 @faulty(ALONE, ys=[0.3, None, None, 0.2])
@@ -181,53 +133,43 @@ def a_mean_if_the_observation_is_missing(previous, y):
 
 
 @faulty(ALONE)
-def a_parameter_by_position(previous, y):
-    x = walk(previous)
+def a_number_of_particles_in_the_closure(previous, y):
+    x = sample("x", Normal(np.zeros(200) if previous is None else 0.9 * previous["x"], 0.6))
     seen(x, y)
-    return {"scale": np.linspace(0.1, 1.0, len(x))}
 
 
-# --- guides that mix particles ------------------------------------------------------------------------------------
+# --- guides -------------------------------------------------------------------------------------------------------
 def model(previous, y):
     seen(walk(previous), y)
 
 
-def guide_by(name, m):
-    def guide(previous, y):
-        sample("x", Normal(0.5 * y, 1.0) if previous is None else Normal(m(previous["x"], y), 0.5))
-
-    guide.__name__ = name
-    return guide
+def guided_by(expected, **guides):
+    for name, guide in guides.items():
+        FAULTY[name] = (Program(model).guided(guide, 200), YS, expected)
 
 
-def guided_by(expected, guide, name, ys=YS, n=200):
-    FAULTY[name] = (Program(model).guided(guide, n), ys, expected)
+def guide_by(m):
+    return lambda previous, y: draw(
+        "x", Normal(0.5 * y, 1.0) if previous is None else Normal(m(previous["x"], y), 0.5)
+    )
 
 
-guided_by(ALONE, guide_by("mean", lambda x, y: x.mean()), "a_guide_with_a_mean")
-guided_by(ALONE, guide_by("max", lambda x, y: x if x.max() < 1 else x + y), "a_guide_with_a_maximum")
-guided_by(REPEATED, guide_by("noise", lambda x, y: x + np.random.normal(size=len(x))), "a_guide_with_other_draws")
-
-
-def beyond(previous, y):
-    sample("x", Uniform(5.0, 6.0))
-
-
-def positive(previous, y):
-    sample("x", stats.gamma(2.0, scale=0.5))
-
-
-def near(previous, y):
-    sample("x", Uniform(y - 0.5, y + 0.5))
-
-
-guided_by("never draws", positive, "a_guide_of_positive_values")
-guided_by("never draws", near, "a_guide_with_a_bounded_interval")
-guided_by("never draws|no particle explains|estimates", beyond, "a_guide_far_away")
+guided_by(
+    ALONE,
+    a_guide_with_a_mean=guide_by(lambda x, y: x.mean()),
+    a_guide_with_a_maximum=guide_by(lambda x, y: x if x.max() < 1 else x + y),
+)
+guided_by(REPEATED, a_guide_with_other_draws=guide_by(lambda x, y: x + np.random.normal(size=len(x))))
+guided_by(
+    "never draws",
+    a_guide_of_positive_values=lambda previous, y: draw("x", stats.gamma(2.0, scale=0.5)),
+    a_guide_with_a_bounded_interval=lambda previous, y: draw("x", Uniform(y - 0.5, y + 0.5)),
+)
+guided_by("never draws|no particle explains", a_guide_far_away=lambda previous, y: draw("x", Uniform(5.0, 6.0)))
 
 
 def one_branch(previous, y):
-    switch("regime", [1.0, 0.0], [lambda: sample("x", Normal(y, 1.0))] * 2)
+    switch("regime", [1.0, 0.0], [lambda: draw("x", Normal(y, 1.0))] * 2)
 
 
 @faulty("never draws", guide=one_branch)
@@ -237,7 +179,7 @@ def a_guide_of_one_branch(previous, y):
 
 
 # --- draws outside of sample, and kept state ----------------------------------------------------------------------
-GENERATOR, COUNT = np.random.default_rng(1), itertools.count()
+GENERATOR, COUNT, LAST = np.random.default_rng(1), itertools.count(), {"x": 0.0}
 
 
 def kept_values(x, kept=[]):
@@ -245,17 +187,19 @@ def kept_values(x, kept=[]):
     return kept
 
 
-in_likelihood(
-    REPEATED,
-    draws_of_another_generator=lambda x: x + 0.3 * GENERATOR.standard_normal(len(x)),
-    draws_of_scipy=lambda x: x + stats.norm.rvs(size=len(x)),
-    draws_of_the_standard_library=lambda x: (x, 0.5 + random.random()),
-    the_time=lambda x: (x, 0.5 + time.perf_counter() % 1.0),
-    a_counter=lambda x: (x, 0.5 + 0.1 * next(COUNT)),
-    a_mutable_default=lambda x: x + 0.1 * len(kept_values(x)),
+after_the_walk(
+    faulty(REPEATED),
+    draws_of_another_generator=lambda x, y: seen(x + 0.3 * GENERATOR.standard_normal(len(x)), y),
+    draws_of_scipy=lambda x, y: seen(x + stats.norm.rvs(size=len(x)), y),
+    draws_of_the_standard_library=lambda x, y: seen(x, y, 0.5 + random.random()),
+    the_time=lambda x, y: seen(x, y, 0.5 + time.perf_counter() % 1.0),
+    a_counter=lambda x, y: seen(x, y, 0.5 + 0.1 * next(COUNT)),
+    a_mutable_default=lambda x, y: seen(x + 0.1 * len(kept_values(x)), y),
 )
-in_likelihood(ALONE, draws_of_a_new_generator=lambda x: x + 0.3 * np.random.default_rng(0).standard_normal(len(x)))
-LAST: dict = {"x": 0.0}
+after_the_walk(
+    faulty(ALONE),
+    draws_of_a_new_generator=lambda x, y: seen(x + 0.3 * np.random.default_rng(0).standard_normal(len(x)), y),
+)
 
 
 @faulty(REPEATED)
@@ -273,52 +217,40 @@ def a_changed_observation(previous, y):
 
 
 # --- parameters out of range, in some rows ------------------------------------------------------------------------
-in_site(r"p of a Bernoulli is 1\.\d+ in row", a_probability_above_one=lambda x: Bernoulli(0.8 + 0.5 * abs(x)))
-in_site(r"scale of a Normal is -\S+ in row", a_negative_scale=lambda x: Normal(0.0, x))
-in_site(r"scale of a Normal is 0\.0 in row", a_scale_of_zero=lambda x: Normal(x, np.maximum(x, 0.0)))
-in_site("loc of a Normal is nan in row", a_location_of_nan=lambda x: Normal(np.sqrt(x), 1.0))
-in_site(r"high of a Uniform is \S+ in row", an_empty_interval=lambda x: Uniform(0.0, x))
-in_site("df of a Student is -", negative_degrees_of_freedom=lambda x: Student(x, 0.0, 1.0))
-in_site("Domain error|is NaN|nan", a_negative_scale_of_scipy=lambda x: stats.norm(0.0, x))
-in_observation(r"p of a Bernoulli is \S+ in row", 1, a_negative_probability=Bernoulli)
-in_observation("log density is nan", 0, a_negative_rate=stats.poisson)
-in_observation(
-    "probabilities of a categorical are .* in row",
-    1,
-    negative_probabilities=lambda x: Categorical(np.stack([0.5 + x, 0.5 - x], axis=1)),
-)
-in_observation(
-    "covariance is not positive definite in row",
-    [0.3, 0.3],
-    a_covariance_of_a_row=lambda x: MultivariateNormal(np.zeros((1, 2)), np.eye(2) + x[:, None, None] * SWAP),
-)
-
-
-def draw_jump():
-    sample("jump", Normal(1.0, 0.5))
+for expected, bodies in {
+    r"p of a Bernoulli is 1\.\d+ in row": {
+        "a_probability_above_one": lambda x, y: draw("z", Bernoulli(0.8 + 0.5 * abs(x)))
+    },
+    r"scale of a Normal is -\S+ in row": {"a_negative_scale": lambda x, y: draw("z", Normal(0.0, x))},
+    r"scale of a Normal is 0\.0 in row": {"a_scale_of_zero": lambda x, y: draw("z", Normal(x, np.maximum(x, 0.0)))},
+    "loc of a Normal is nan in row": {"a_location_of_nan": lambda x, y: draw("z", Normal(np.sqrt(x), 1.0))},
+    r"high of a Uniform is \S+ in row": {"an_empty_interval": lambda x, y: draw("z", Uniform(0.0, x))},
+    "df of a Student is -": {"negative_degrees_of_freedom": lambda x, y: draw("z", Student(x, 0.0, 1.0))},
+    "Domain error|is NaN|nan": {"a_negative_scale_of_scipy": lambda x, y: draw("z", stats.norm(0.0, x))},
+    r"p of a Bernoulli is \S+ in row": {"a_negative_probability": lambda x, y: observe("y", Bernoulli(x), 1)},
+    "log density is nan": {
+        "a_negative_rate": lambda x, y: observe("y", stats.poisson(x), 0),
+        "an_observed_nan_of_some_particles": lambda x, y: observe("y", stats.gamma(2.0), np.log(x)),
+    },
+    "probabilities of a categorical are .* in row": {
+        "negative_probabilities": lambda x, y: observe("y", Categorical(np.stack([0.5 + x, 0.5 - x], axis=1)), 1)
+    },
+    "covariance is not positive definite in row": {
+        "a_covariance_of_a_row": lambda x, y: observe(
+            "y", MultivariateNormal(np.zeros((1, 2)), np.eye(2) + x[:, None, None] * SWAP), [0.3, 0.3]
+        )
+    },
+}.items():
+    after_the_walk(faulty(expected), **bodies)
 
 
 @faulty("loc of a Normal is nan")
 def a_value_of_another_branch(previous, y):
     x = walk(previous)
-    switch("s", [0.5, 0.5], [lambda: draw_jump(), lambda: None])
+    switch("s", [0.5, 0.5], [lambda: draw("jump", Normal(1.0, 0.5)), lambda: None])
     if previous is not None:
         sample("z", Normal(previous["jump"], 1.0))
     seen(x, y)
-
-
-@faulty("nan")
-def an_observed_nan_of_some_particles(previous, y):
-    x = walk(previous)
-    with np.errstate(invalid="ignore"):
-        observe("y", stats.gamma(2.0), np.log(x))
-
-
-@faulty("returned 'root' is NaN")
-def a_returned_nan(previous, y):
-    x = walk(previous)
-    seen(x, y)
-    return {"root": np.sqrt(x)}
 
 
 # --- values that copies share, and changes in place ---------------------------------------------------------------
@@ -349,44 +281,31 @@ def an_entry_of_previous_replaced(previous, y):
     seen(walk(previous), y)
 
 
-# --- shapes, names, sites -----------------------------------------------------------------------------------------
-@faulty("the value is that of a site")
-def a_draw_observed_by_accident(previous, y):
-    x = walk(previous)
-    observe("x", Normal(0.0, 1.0), x)
+# --- names, sites and branches ------------------------------------------------------------------------------------
+def branches(x, y, other, probs=(0.5, 0.5)):
+    """Two branches: one observes its particles v, the other ``other(v)``."""
+    switch("s", np.array(probs), [lambda v: seen(v, y), lambda v: seen(other(v), y)], x)
 
 
-@faulty("returned 'x' with other values than site")
-def a_returned_value_over_a_site(previous, y):
-    x = walk(previous)
-    seen(x, y)
-    return {"x": np.round(x)}
-
-
-@faulty("does not weight the particles")
-def weights_by_hand(previous, y):
-    x = walk(previous)
-    return {"log_weights": -0.5 * (x - y) ** 2}
-
-
-@faulty(ALONE)
-def an_argument_in_another_order(previous, y):
-    x = walk(previous)
-    switch("s", [0.5, 0.5], [lambda v: seen(v, y), lambda v: seen(-v, y)], x[::-1])
-
-
-in_branch(
-    ALONE,
-    a_branch_reduces_values_of_all=lambda v, x: x.mean() + 0.0 * v,
-    a_branch_takes_the_first_rows_of_all=lambda v, x: x[: len(v)],
+after_the_walk(
+    faulty("the value is that of a site"), a_draw_observed_by_accident=lambda x, y: observe("x", Normal(0.0, 1.0), x)
 )
-in_branch(ALONE, (0.95, 0.05), a_rare_branch_reduces=lambda v, x: v - v.mean())
-
-
-@faulty(ALONE)
-def a_branch_returns_a_reduction(previous, y):
-    x = walk(previous)
-    seen(switch("s", [0.5, 0.5], [lambda v: v, lambda v: np.full(len(v), v.max(initial=-9.0))], x), y)
+after_the_walk(
+    faulty("returned 'x' with other values than site"), a_returned_value_over_a_site=lambda x, y: {"x": np.round(x)}
+)
+after_the_walk(
+    faulty("does not weight the particles"), weights_by_hand=lambda x, y: {"log_weights": -0.5 * (x - y) ** 2}
+)
+after_the_walk(
+    faulty(ALONE),
+    an_argument_in_another_order=lambda x, y: branches(x[::-1], y, lambda v: -v),
+    a_branch_reduces_values_of_all=lambda x, y: branches(x, y, lambda v: x.mean() + 0.0 * v),
+    a_branch_takes_the_first_rows_of_all=lambda x, y: branches(x, y, lambda v: x[: len(v)]),
+    a_rare_branch_reduces=lambda x, y: branches(x, y, lambda v: v - v.mean(), (0.95, 0.05)),
+    a_branch_returns_a_reduction=lambda x, y: seen(
+        switch("s", [0.5, 0.5], [lambda v: v, lambda v: np.full(len(v), v.max(initial=-9.0))], x), y
+    ),
+)
 
 
 # --- distributions of the user ------------------------------------------------------------------------------------
@@ -411,13 +330,14 @@ def of_mine(expected, method, **functions):
     """Programs that sample from `Mine` with another method."""
 
     def program_of(kind):
-        def program(previous, y):
-            seen(sample("x", kind(np.zeros(1) if previous is None else 0.9 * previous["x"])), y)
+        return lambda previous, y: seen(
+            sample("x", kind(np.zeros(1) if previous is None else 0.9 * previous["x"])), y
+        )
 
-        return program
-
-    kinds = {name: type(name, (Mine,), {method: function}) for name, function in functions.items()}
-    named(expected, {f"a_distribution_{name}": program_of(kind) for name, kind in kinds.items()})
+    for name, function in functions.items():
+        program = program_of(type(name, (Mine,), {method: function}))
+        program.__name__ = f"a_distribution_{name}"
+        faulty(expected)(program)
 
 
 of_mine(
@@ -448,7 +368,7 @@ def narrow(previous, y):
     sample("x", Normal(0.3 if previous is None else 0.9 * previous["x"], 0.4))
 
 
-@inherent("the guide has lighter tails than the posterior: the evidence has infinite variance", narrow)
+@into(INHERENT, "the guide has lighter tails than the posterior: the evidence has infinite variance", guide=narrow)
 def a_guide_with_light_tails(previous, y):
     seen(walk(previous), y, 2.0)
 
@@ -458,7 +378,7 @@ def cut(previous, y):
     sample("x", Uniform(m - 5.0, m + 5.0))
 
 
-@inherent("the guide never draws values that hold less than a thousandth of the probability", cut)
+@into(INHERENT, "the guide never draws values that hold less than a thousandth of the probability", guide=cut)
 def a_guide_without_far_tails(previous, y):
     seen(walk(previous, 1.0), y)
 
@@ -484,13 +404,6 @@ def vectors_with_a_shared_covariance(previous, y):
         "v", MultivariateNormal(np.zeros(2), cov) if previous is None else MultivariateNormal(previous["v"], cov)
     )
     observe("y", MultivariateNormal(v, 0.5 * cov), y)
-
-
-@correct(ys=[np.array([0.1, 0.2])] * 4)
-def vectors_with_covariances_of_particles(previous, y):
-    s = sample("s", stats.gamma(3.0, scale=1 / 3.0))
-    v = sample("v", Normal(np.zeros((1, 2)), 1.0))
-    observe("y", MultivariateNormal(v, (0.5 + s)[:, None, None] * np.eye(2)), y)
 
 
 WEIGHTS = np.random.default_rng(0).standard_normal((64, 64)).astype(np.float32) / 8
@@ -589,14 +502,6 @@ def a_shift_that_cancels(previous, y):
     w = np.exp(v - v.max())
     k = sample("k", Categorical(w))
     seen(v[np.arange(len(k)), k], y)
-
-
-@correct(n=200)
-def a_number_of_particles_in_the_closure(previous, y):
-    x = sample("x", Normal(np.zeros(200) if previous is None else 0.9 * previous["x"], np.full(200, 0.6)))
-    age = np.zeros(200, int) if previous is None else previous["age"] + 1
-    seen(x, y)
-    return {"age": age}
 
 
 CALLS: list = []

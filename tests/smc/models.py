@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mstfilter.smc import Normal, StateSpaceModel, forward_backward, kalman_filter, run_many
+from mstfilter.smc import Normal, StateSpaceModel, kalman_filter, run_many
 
 
 def filterpy_class(name: str):
@@ -60,12 +60,6 @@ START = np.array([0.6, 0.3, 0.1])
 MOVES = np.array([[0.7, 0.2, 0.1], [0.05, 0.8, 0.15], [0.3, 0.1, 0.6]])
 EMIT = np.array([[0.6, 0.3, 0.1, 0.0], [0.1, 0.2, 0.3, 0.4], [0.25, 0.05, 0.6, 0.1]])
 SYMBOLS = [0, 2, 2, 1, 3, 1, 0, 2]
-
-
-def forward(symbols=SYMBOLS):
-    """Filtered marginals (T, 3) and the log evidence; None is missing."""
-    found = forward_backward(START, MOVES, lambda y: _log_emit(np.arange(3), y), symbols)
-    return found.filtered, float(found.log_evidence[-1])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from mstfilter.smc import (
     Always,
     Branching,
     EssBelow,
-    EveryKth,
     FearnheadClifford,
     Multinomial,
     Never,
@@ -31,10 +30,8 @@ from mstfilter.smc import (
     Systematic,
     Uniform,
     WeightResampler,
-    WithInput,
     bootstrap,
     collect,
-    ensemble,
     ess,
     guided,
     hidden_markov,
@@ -174,7 +171,7 @@ SEEDS = [3, 1, 4, 1_000_003, 2**40 + 1]
 FILTERS = {
     "always": bootstrap(raw(1), 20, Stratified(), Always()),
     "after": replace(bootstrap(raw(1), 20, Ssp(), EssBelow(0.9)), resample="after"),
-    "every third": bootstrap(raw(1), 20, Multinomial(), EveryKth(3)),
+    "independent": bootstrap(raw(1), 20, Multinomial()),
     "many draws": bootstrap(raw(1), 2100, Multinomial(), Always()),
     "many strata": bootstrap(raw(1), 1100, Stratified(), Always()),
     "never": bootstrap(raw(1), 20, Systematic(), Never()),
@@ -186,7 +183,7 @@ FILTERS = {
     "fewer particles": bootstrap(AR1, 20, FearnheadClifford()),
     "moves": resample_move(AR1, RandomWalkMove(AR1, 0.5), 20),
 }
-TOGETHER = ("always", "after", "every third", "many draws", "many strata", "never", "rows", "vectors")
+TOGETHER = ("always", "after", "independent", "many draws", "many strata", "never", "rows", "vectors")
 
 
 @pytest.mark.parametrize("name", sorted(smc.__components__["resampler"]))
@@ -279,17 +276,6 @@ def test_a_program_that_mixes_particles_is_named_by_its_first_batch():
         run_many(Program(program).bootstrap(30), [0.5, -0.3], range(5))
 
 
-@pytest.mark.parametrize("n", [3, 4])
-def test_programs_are_called_together_also_where_their_checks_are_due(n):
-    """The first steps of a program are checked; in a batch, the single runs that it is compared with are."""
-
-    def fresh(previous, y):
-        return walk(previous, y)
-
-    ys = np.random.default_rng(0).standard_normal(9).tolist()
-    assert keeps_its_promise(Program(fresh).bootstrap(n), ys, range(3)) == "together"
-
-
 def test_a_batch_says_and_warns_that_components_are_called_for_each_run():
     def rounds(x, y):  # in another order for another number of rows, as matrix products of BLAS
         return -np.square(y - x) * (1 + 1e-15 * len(x))
@@ -334,13 +320,6 @@ def test_all_runs_are_lost_at_the_first_step():
     runs = run_many(Program(program).bootstrap(5), [100.0, 0.0], range(3), **ALL)
     assert runs.single == {} and runs["all"].shape[:2] == (3, 2) and np.isneginf(runs["z"]).all()
     assert runs.lost[1].startswith("step 0, initial: ")
-
-
-def test_inputs_are_given_to_all_runs():
-    model = linear_gaussian(*vectors(2, 1), B=np.array([[1.0, 0.5, 0.2], [0.3, 1.0, 0.1]]))
-    rng = np.random.default_rng(0)
-    ys = [WithInput(float(y), u) for y, u in zip(rng.standard_normal(T), rng.standard_normal((T, 3)), strict=True)]
-    assert keeps_its_promise(bootstrap(model, 6), ys, range(4)) == "together"
 
 
 # --- generators ---------------------------------------------------------------------------------------------------
@@ -418,36 +397,6 @@ def test_chains_equal_single_chains_or_refuse(kind, n):
     np.testing.assert_array_equal(one.log_evidence, many.log_evidence)
 
 
-def test_chains_of_which_one_run_is_lost_stay_in_one_sweep():
-    calls = []
-
-    def fragile(theta):
-        calls.append(np.ndim(theta))
-        filter = chain_model("scalar", theta, 4)
-        return replace(
-            filter, update=Reweight(lambda x, y: np.where(np.abs(x - y) < 1.0, 0.0, -np.inf), batched=True)
-        )
-
-    many = pmmh(fragile, [0.1, 0.2, 0.3], flat, START * 3, 0.2, 20, 1, batched=True)
-    together = len(calls)
-    one = pmmh(fragile, [0.1, 0.2, 0.3], flat, START * 3, 0.2, 20, 1)
-    np.testing.assert_array_equal(one.theta, many.theta)
-    assert (many.accepted < 1).all() and together < 2 * (len(calls) - together)
-
-
-def test_chains_say_that_they_are_run_singly():
-    def mixing(theta):
-        (rho,) = theta
-        model = StateSpaceModel.of(
-            Normal(0.0, 1.0), lambda x: Normal(rho * (x - x.mean()), 0.5), lambda x: Normal(x, 1.0)
-        )
-        return bootstrap(model, 4)
-
-    with pytest.warns(UserWarning, match="run one by one: transition"):
-        many = pmmh(mixing, YS, flat, START, 0.2, 4, batched=True)
-    np.testing.assert_array_equal(many.theta, pmmh(mixing, YS, flat, START, 0.2, 4).theta)
-
-
 @pytest.mark.parametrize("field", ["n", "resampler", "trigger"])
 def test_chains_whose_filters_differ_in_more_than_numbers_are_run_singly(field):
     def filter_of(theta):
@@ -469,9 +418,9 @@ def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():
             filter, update=Reweight(lambda x, y: np.where(np.abs(x - y) < 0.9, 0.0, -np.inf), batched=True)
         )
 
-    for batched in (False, True):
-        chains = pmmh(fragile, [0.1, 0.2], flat, START, 0.2, 4, 2, batched=batched)
-        assert np.isfinite(chains.log_evidence).all()
+    one, many = (pmmh(fragile, [0.1, 0.2], flat, START, 0.2, 4, 2, batched=batched) for batched in (False, True))
+    assert np.isfinite(one.log_evidence).all() and (many.accepted < 1).all()
+    np.testing.assert_array_equal(one.theta, many.theta)
     with pytest.raises(InputError, match=r"of chain 1 has log density -inf: 20 estimates"):
         pmmh(
             lambda theta: chain_model("scalar", theta, 3) if theta[0] < 0.4 else fragile_never(theta),
@@ -487,14 +436,3 @@ def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():
 
 def fragile_never(theta):
     return replace(chain_model("scalar", theta, 3), update=Reweight(lambda x, y: np.full(len(x), -np.inf)))
-
-
-def test_walkers_of_emcee_are_the_same_in_one_sweep():
-    start = np.linspace(0.1, 0.9, 6)[:, None]
-
-    def walkers(batched):
-        return ensemble(lambda theta: chain_model("of", theta, 5), YS, flat, start, 4, 1, batched=batched)
-
-    one, many = walkers(False), walkers(True)
-    np.testing.assert_array_equal(one.theta, many.theta)
-    np.testing.assert_array_equal(one.log_evidence, many.log_evidence)

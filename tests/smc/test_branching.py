@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Always, Branching, Coalesced, Dynamics, FearnheadClifford, Never, bootstrap
+from mstfilter.smc import (
+    Always,
+    Branching,
+    ClusterStratified,
+    Coalesced,
+    Dynamics,
+    FearnheadClifford,
+    Never,
+    bootstrap,
+)
 from mstfilter.smc.testing import TransitionContract
-from tests.smc.models import AR1, ar1_observations, hmm
+from tests.smc.models import AR1, ar1_observations, hmm, kalman_ar1, mean_ratio, optimal
 
 YS = ar1_observations(8)
 
@@ -24,6 +33,13 @@ def branching(scheme, n, model=AR1, branches=4):
 class TestBranching(TransitionContract):
     def make(self):
         return Branching(Dynamics(AR1), 3)
+
+
+@pytest.mark.parametrize("scheme", [FearnheadClifford(), ClusterStratified()], ids=lambda s: type(s).__name__)
+def test_selections_from_more_candidates_leave_the_evidence_unbiased(scheme):
+    """Mean of L_hat / L within 4 standard errors of 1 (false alarm 6e-5 a case)."""
+    mean, standard, _ = mean_ratio(branching(scheme, 100), YS[:4], kalman_ar1(YS[:4])[1], range(500))
+    assert abs(mean - 1) < 4 * standard < 0.05
 
 
 def test_candidates_know_where_they_come_from():
@@ -43,6 +59,10 @@ def test_candidates_know_where_they_come_from():
         np.random.default_rng(0), bootstrap(hmm("objects"), 5).run([0], 0)[0].population, None
     )
     assert len(objects) == 10
+    inner, population = Dynamics(AR1, optimal), state.population
+    copies = inner.predict(np.random.default_rng(0), population.take(np.repeat(np.arange(20), 2)), 0.7)
+    moved = Branching(inner, 2).predict(np.random.default_rng(0), population, 0.7)
+    np.testing.assert_array_equal(moved.log_weights, copies.log_weights)
     with pytest.raises(InputError, match="branches is 0"):
         Branching(Dynamics(AR1), 0)
 

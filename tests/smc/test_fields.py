@@ -12,7 +12,6 @@ from mstfilter.fields import Bounded
 from mstfilter.smc import (
     Coalesced,
     EssBelow,
-    EveryKth,
     Gaussian,
     Kld,
     Normal,
@@ -38,7 +37,6 @@ from tests.smc.models import AR1
     [
         (lambda: EssBelow(2), "share is 2, expected a finite number above 0 and of at most 1"),
         (lambda: EssBelow(True), "share is True"),
-        (lambda: EveryKth(2.5), r"k is 2\.5"),
         (lambda: Kld(n_min=7, n_max=6), "n_max is 6, expected an integer of at least 7"),
         (lambda: Tempered(Systematic, 0.5), "scheme is the class Systematic, expected a Resampler"),
         (lambda: Coalesced(equivalence=Gaussian()), "expected an Equivalence"),
@@ -79,7 +77,6 @@ def decides(previous, y):
         (lambda: Normal(0.0, -1.0), r"scale of a Normal is -1\.0, expected a positive number"),
         (lambda: Student(0.0), "df of a Student"),
         (lambda: Uniform(1.0, 1.0), r"high of a Uniform is 1\.0, expected a finite number above low"),
-        (lambda: Program(3), "model is 3, expected a function"),
         (lambda: Program(decides).bootstrap(5).run([0.1], 0), "step 0, initial: the program decides by an array"),
         (lambda: linear_gaussian(**{**LG, "Q": [[-1.0]]}), "Q is .*positive semidefinite"),
         (lambda: linear_gaussian(**{**LG, "F": np.eye(2)}), r"F has shape \(2, 2\), expected \(1, 1\)"),

@@ -91,13 +91,6 @@ def test_a_fully_adapted_filter_has_equal_weights():
         np.testing.assert_allclose(state.population.log_weights, state.population.log_weights[0], atol=1e-9)
 
 
-def test_a_priority_that_says_nothing_changes_nothing():
-    plain, _ = bootstrap(AR1, 50).run(YS, 3)
-    flat, _ = auxiliary(AR1, lambda x, y: np.full(len(x), 2.5), 50).run(YS, 3)
-    np.testing.assert_allclose(plain.population.particles, flat.population.particles)
-    np.testing.assert_allclose(plain.population.log_weights, flat.population.log_weights)
-
-
 @pytest.mark.parametrize("kind", ["mapping", "objects"])
 def test_a_chain_is_the_same_with_any_kind_of_particle(kind):
     one, other = (bootstrap(hmm(k), 50).run(SYMBOLS, 2)[0].population for k in ("vector", kind))
@@ -119,6 +112,7 @@ def test_missing_observations(name):
     filter = replace(FILTERS[name](EssBelow(0.5)), n=200)
     mean, standard, _ = mean_ratio(filter, ys, exact, range(150))
     assert abs(mean - 1) < 4 * standard
+    assert "update" not in filter.run(ys[:2], 0)[1][-1].seconds
     state, _ = replace(filter, n=20000).run(ys, 0)
     w, x = state.population.weights, state.population.particles
     assert abs(w @ x - moments[-1, 0]) < 0.06

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import (
-    Always,
-    Candidates,
-    Population,
-    WeightResampler,
-    bootstrap,
-    log_mean_exp,
-)
+from mstfilter.smc import Always, Candidates, Population, WeightResampler, bootstrap, log_mean_exp
 from tests.smc.models import AR1
 
 
@@ -113,10 +106,6 @@ def test_candidates_are_built_once_and_only_when_looked_at():
     assert candidates[7] == "candidate 7"
     assert built == [7, 500]
     assert candidates.n_built == 2
-    mapped = candidates.map(str.upper)
-    assert candidates.n_built == 2
-    assert mapped.take(np.array([500]))[0] == "CANDIDATE 500"
-    assert built == [7, 500]
 
 
 def test_moved_particles_keep_weights_and_parents():

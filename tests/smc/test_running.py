@@ -1,17 +1,20 @@
-"""Collectors, many runs, checkpoints."""
+"""Collectors, many runs, tables, checkpoints."""
 
 from __future__ import annotations
 
 import io
 import os
+import sys
 import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.smc import (
+    Always,
+    Chains,
     Codec,
     Key,
     Multinomial,
@@ -104,21 +107,6 @@ def test_lost_runs_of_workers_are_those_of_one_process():
     np.testing.assert_array_equal(one["x"], two["x"])
 
 
-LINEAR = linear_gaussian(*np.array([[[0.9]], [[0.4]], [[1.0]], [[0.2]]]), [0.0], [[1.0]])
-
-
-def test_an_arm_that_is_processed_together_gives_the_numbers_of_single_runs():
-    arms = {"together": bootstrap(LINEAR, 20), "single": bootstrap(replace(LINEAR, batched=False), 20)}
-    kept = {"z": log_evidence, "ess": ess, "x": mean}
-    runs = run_many(arms, YS, range(5), **kept)
-    for name in kept:
-        np.testing.assert_array_equal(runs[name][0], runs[name][1])
-    assert runs.single == {"single": "initial: it is not batched"}
-    one = run_many(arms["together"], YS, range(5), **kept)
-    assert one.dims == ("seed", "time") and list(one.coords) == ["seed", "time"]
-    np.testing.assert_array_equal(one["x"], runs["x"][0])
-
-
 def ends_the_process(state, info):
     if state.key.seed == 5:
         os._exit(3)
@@ -141,31 +129,6 @@ class Boxes(Codec):
         return tuple(Box(tuple(grid)) for grid in arrays["grids"].tolist())
 
 
-@pytest.mark.parametrize(
-    "particles",
-    [
-        np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32),
-        {"x": np.arange(3.0), "k": np.array([True, False, True])},
-    ],
-    ids=["array", "mapping"],
-)
-def test_states_come_back_bit_for_bit(particles, tmp_path):
-    n = len(next(iter(particles.values()))) if isinstance(particles, dict) else len(particles)
-    population = Population(particles, np.linspace(-1e4, 1, n), {"previous": np.arange(n)})
-    save_state(tmp_path / "s.npz", State(7, population, Key(3), False))
-    state, _ = load_state(tmp_path / "s.npz")
-    found = state.population.particles
-    assert (state.t, state.key, state.properly_weighted) == (7, Key(3), False)
-    np.testing.assert_array_equal(state.population.log_weights, population.log_weights)
-    np.testing.assert_array_equal(state.population.parents["previous"], np.arange(n))
-    if isinstance(particles, np.ndarray):
-        assert found.dtype == particles.dtype
-        np.testing.assert_array_equal(found, particles)
-    else:
-        assert {k: a.dtype for k, a in found.items()} == {k: a.dtype for k, a in particles.items()}
-        np.testing.assert_array_equal(found["x"], particles["x"])
-
-
 def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
     def save(particles, codec=None):
         save_state(tmp_path / "s.npz", State(1, Population(particles), Key(0)), codec)
@@ -178,7 +141,7 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
         save((Box((1,)),))
     assert not list(tmp_path.iterdir()), "nothing is left behind"
     save((Box((1,)), Box((2,))), Boxes())
-    assert load_state(tmp_path / "s.npz", Boxes())[0].population.particles == (Box((1,)), Box((2,)))
+    assert load_state(tmp_path / "s.npz", Boxes()).population.particles == (Box((1,)), Box((2,)))
     whole = (tmp_path / "s.npz").read_bytes()
     other, single = io.BytesIO(), io.BytesIO()
     np.savez(other, x=np.zeros(3))
@@ -203,11 +166,16 @@ def test_what_cannot_be_stored_is_one_clear_error(tmp_path):
 )
 def test_a_run_goes_on_from_a_stored_state(filter, ys, codec, tmp_path):
     whole, _ = filter.run(ys, 5)
-    save_state(tmp_path / "run.npz", filter.run(ys[:4], 5)[0], codec)
-    state, _ = load_state(tmp_path / "run.npz", codec)
+    stored = filter.run(ys[:4], 5)[0]
+    save_state(tmp_path / "run.npz", replace(stored, properly_weighted=False), codec)
+    assert not load_state(tmp_path / "run.npz", codec).properly_weighted
+    save_state(tmp_path / "run.npz", stored, codec)
+    state = load_state(tmp_path / "run.npz", codec)
     state, infos = filter.run(ys[state.t :], state)
     assert [info.t for info in infos] == list(range(4, len(ys)))
-    assert state.log_evidence == whole.log_evidence and state.t == len(ys)
+    assert (state.log_evidence, state.t, state.key) == (whole.log_evidence, len(ys), whole.key)
+    for name, index in whole.population.parents.items():
+        np.testing.assert_array_equal(state.population.parents[name], index)
     for a, b in zip(state.population.particles, whole.population.particles, strict=True):
         assert a == b
 
@@ -245,3 +213,66 @@ def test_observations_that_cannot_be_meant_are_refused_before_the_first_step(obs
         with pytest.raises(InputError, match=message) as caught:
             call()
         assert hint in caught.value.hints[0]
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+RNG = np.random.default_rng(0)
+CHAINS = Chains(RNG.normal(size=(4, 2, 3)), RNG.normal(size=(4, 2)), RNG.normal(size=(4, 2)), np.array([0.25, 0.5]))
+
+
+def test_columns_of_chains():
+    columns = CHAINS.columns()
+    assert list(columns) == ["chain", "draw", "theta_0", "theta_1", "theta_2", "log_evidence", "log_density"]
+    for row in range(8):
+        chain, draw = columns["chain"][row], columns["draw"][row]
+        assert (chain, draw) == divmod(row, 4)
+        assert columns["theta_2"][row] == CHAINS.theta[draw, chain, 2]
+        assert columns["log_density"][row] == CHAINS.log_density[draw, chain]
+
+
+def test_data_frames():
+    pandas, _ = pytest.importorskip("pandas"), pytest.importorskip("xarray")
+    ys = ar1_observations(5)
+    _, infos = bootstrap(AR1, 8).run(ys, 1)
+    history = run_many(
+        {"a": bootstrap(AR1, 8), "b": bootstrap(AR1, 9)}, ys, [4, 5], ess=ess, n=lambda state, info: info.n
+    )
+    for table in (history, CHAINS):
+        frame = pandas.DataFrame(table.columns())
+        for name, column in table.columns().items():
+            np.testing.assert_array_equal(frame[name].to_numpy(), column)
+    frame = pandas.DataFrame(infos.rows())
+    assert frame["ess"].tolist() == [info.ess for info in infos] and frame["resampled"].dtype == bool
+    row = pandas.DataFrame(history.columns()).query("arm == 'b' and seed == 5 and time == 3").iloc[0]
+    assert (row["ess"], row["n"]) == (history["ess"][1, 1, 3], 9)
+    table = history.to_xarray()
+    assert table["ess"].dims == ("arm", "seed", "time") and float(table["n"].sel(arm="b", seed=5, time=3)) == 9
+
+
+def test_a_missing_library(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(MissingLibraryError, match="this export needs xarray"):
+        collect([]).to_xarray()
+
+
+def test_a_history_shows_itself_in_five_lines():
+    filter, ys = bootstrap(AR1, 8, trigger=Always()), ar1_observations(5)
+    few = collect(filter.iterate(ys, 0), ess=ess, resampled=resampled)
+    low, high = few["ess"].min(), few["ess"].max()
+    assert repr(few) == f"History: time 5\n  ess float64 (5,), {low:.4g} to {high:.4g}\n  resampled bool (5,)"
+    collectors = {
+        "ess": ess,
+        "n": lambda state, info: info.n,
+        "unique": unique_ancestors,
+        "mean": mean,
+        "fired": resampled,
+    }
+    many = run_many({"a": filter}, [*ys, 1e200], [1, 2], **collectors)
+    lines = repr(many).splitlines()
+    assert lines[0] == "History: arm 1, seed 2, time 6, 2 runs lost" and len(lines) == 5
+    assert lines[-1] == "  also mean, fired"
+    assert repr(collect([])) == "History: time 0"
+
+
+def test_chains_show_themselves():
+    assert repr(CHAINS) == "Chains: 4 iterations of 2 chains, 3 parameters, accepted 0.25 to 0.50"

@@ -1,4 +1,4 @@
-"""KLD size against drawing one by one; similarities and classes of equal particles."""
+"""KLD size; similarities and classes of equal particles."""
 
 from __future__ import annotations
 
@@ -20,34 +20,6 @@ from mstfilter.smc import (
     bootstrap,
     linear_gaussian,
 )
-
-
-def sequential(rng, mass, epsilon, delta):
-    """Fox's sampler: draw until the number of draws reaches the bound of the bins met so far."""
-    draws, n = rng.choice(len(mass), size=1000, p=mass), np.arange(1, 1001)
-    new = np.isin(np.arange(1000), np.unique(draws, return_index=True)[1])
-    bounds = np.append([0.0, 2.0], stats.chi2.ppf(1 - delta, np.arange(1, len(mass))) / (2 * epsilon))
-    return n[n >= bounds[np.cumsum(new)]][0]
-
-
-@pytest.mark.parametrize("epsilon", [0.5, 0.2, 0.1])
-def test_kld_agrees_with_drawing_one_by_one(epsilon):
-    """Drawing one by one stops at the first lucky moment, so on average a little earlier; never later.
-
-    200 runs; their mean has a standard error of about 1 %.
-    """
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=4000)
-    population = Population(x, -0.5 * (x - 0.5) ** 2 / 0.8)
-    classes = Bins(0.25).classes(x)
-    mass = np.bincount(classes, population.weights)
-    drawn = np.mean([sequential(rng, mass, epsilon, 0.01) for _ in range(200)])
-    size = Kld(Bins(0.25), epsilon=epsilon, delta=0.01, n_min=2)
-    assert 0.97 * drawn <= size.choose(population) <= 1.2 * drawn
-    # The number of bins that is put into the bound is the one that so many draws do meet.
-    n = size.choose(population)
-    met = np.mean([len(set(rng.choice(len(mass), size=n, p=mass).tolist())) for _ in range(100)])
-    assert size.bound(met) == pytest.approx(n, rel=0.05)
 
 
 def test_one_bin_wants_the_least_not_the_most():

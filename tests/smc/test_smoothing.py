@@ -40,7 +40,6 @@ from tests.smc.models import (
     TAU,
     ar1_observations,
     hmm,
-    kalman_ar1,
     optimal,
     optimal_initial,
     predictive,
@@ -85,11 +84,7 @@ FILTERS = {
 }
 
 
-METHODS = {
-    "exact": {},
-    "mcmc": {"method": "mcmc"},
-    "mcmc, 4 steps": {"method": "mcmc", "steps": 4},
-}
+METHODS = {"exact": {}, "mcmc": {"method": "mcmc"}, "mcmc, 4 steps": {"method": "mcmc", "steps": 4}}
 
 
 def small_record():
@@ -188,25 +183,6 @@ def test_fixed_lag_lies_between_the_filter_and_the_genealogy():
         np.testing.assert_array_equal(a.particles, b.particles)
     distinct = [len(set(s[0].particles.tolist())) for s in (fixed_lag(record, 2), genealogy(record))]
     assert distinct[0] > 1.3 * distinct[1]
-    # A lag of three forgets little here: close to the exact smoothed means.
-    means = np.array(
-        [[p.weights @ p.particles for p in fixed_lag(keep(bootstrap(AR1, 200), YS, s), 3)] for s in range(40)]
-    )
-    assert np.abs(means.mean(axis=0) - smoothed()[0]).max() < 0.05
-    filtered = kalman_ar1(YS)[0][:, 0]
-    assert np.abs(filtered - smoothed()[0]).max() > 0.1
-
-
-def test_paths_are_paths():
-    """Each row of the genealogy leads from parent to child."""
-    record = keep(bootstrap(AR1, 50), YS, 1)
-    paths = genealogy(record)
-    for k in range(50):
-        i = k
-        for t in range(T - 1, 0, -1):
-            assert paths[t].particles[k] == record.populations[t].particles[i]
-            i = record.parents(t)[i]
-        assert paths[0].particles[k] == record.populations[0].particles[i]
 
 
 def test_a_large_run_is_done_in_blocks(monkeypatch):

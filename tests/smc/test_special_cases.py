@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.smc import (
-    Always,
-    ConditionallyLinear,
-    EssBelow,
-    Linear,
-    rao_blackwellised,
-)
-from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, kalman, observations
+from mstfilter.smc import Always, ConditionallyLinear, EssBelow, Linear, kalman_filter, rao_blackwellised
+from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, observations
 
 YS = observations(6)
 P_STAY = 0.8
@@ -28,12 +22,12 @@ def test_nothing_drawn_is_kalman_itself():
     model = ConditionallyLinear(
         lambda rng, n: rng.random(n), lambda rng, u: rng.random(len(u)), lambda u: Linear(F, Q, H, R), M0, P0
     )
-    means, cov, exact = kalman(YS)
+    exact = kalman_filter(F, Q, H, R, M0, P0, YS)
     for n in (1, 3):
         state, _ = rao_blackwellised(model, n).run(YS, 0)
-        assert state.log_evidence == pytest.approx(exact, abs=1e-9)
-        np.testing.assert_allclose(state.population.particles["mean"], np.tile(means[-1], (n, 1)), atol=1e-9)
-        np.testing.assert_allclose(state.population.particles["cov"][0], cov, atol=1e-9)
+        assert state.log_evidence == pytest.approx(exact.log_evidence[-1], abs=1e-9)
+        np.testing.assert_allclose(state.population.particles["mean"], np.tile(exact.means[-1], (n, 1)), atol=1e-9)
+        np.testing.assert_allclose(state.population.particles["cov"][0], exact.covariances[-1], atol=1e-9)
 
 
 def switching():

@@ -103,7 +103,7 @@ def SizeChanging(rng, lw, n):
 
 CORRECT = (RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
 
-_CARRIED, _NUMBER, _ZERO = "carried_weight", "gives_n_particles", "zero_weights_are_never_chosen"
+_CARRIED, _VALID, _ZERO = "carried_weight", "result_is_valid", "zero_weights_are_never_chosen"
 _SCALE, _PARENTS = "scale_of_weights_is_irrelevant", "keeps_parents"
 
 
@@ -186,79 +186,81 @@ def module_cache(rng, lw, n):
 
 plant(
     selecting,
-    BiasedResidual=(_CARRIED, "copies are biased", biased_residual),
-    IgnoresN=(_NUMBER, "asked to make", lambda rng, lw, n: by_weight(rng, lw, len(lw))),
-    NoDuplicates=(_NUMBER, "asked to make", lambda rng, lw, n: np.unique(by_weight(rng, lw, n))),
+    IgnoresN=(_VALID, "asked to make", lambda rng, lw, n: by_weight(rng, lw, len(lw))),
+    NoDuplicates=(_VALID, "asked to make", lambda rng, lw, n: np.unique(by_weight(rng, lw, n))),
     PicksZeroWeights=(_ZERO, "weight 0", rest_to_the_last),
     ZeroAtTheEdge=(_ZERO, "gives 0, of weights (0, 0, 1, 2, 3) it selects particle 0, weight 0", zero_at_the_edge),
-    FirstAlwaysStays=(_CARRIED, "copies are biased", first_always_stays),
-    # Counts particles from 1; and the same inside the range.
-    OffByOne=(_NUMBER, "expected 0 to", lambda rng, lw, n: by_weight(rng, lw, n) + 1),
-    OffByOneClipped=(_CARRIED, "off by one", lambda rng, lw, n: (by_weight(rng, lw, n) + 1) % len(lw)),
-    KeepsAll=(
-        _CARRIED,
-        "n = m must be resampled",
-        lambda rng, lw, n: np.arange(n) if n == len(lw) else by_weight(rng, lw, n),
-    ),
-    SingleIsHeaviest=(
-        _CARRIED,
-        "5 particles to 1",
-        lambda rng, lw, n: np.array([np.argmax(lw)]) if n == 1 else by_weight(rng, lw, n),
-    ),
-    EightBits=(
-        _CARRIED,
-        "300 particles to 300",
-        lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
-    ),
-    SixteenBits=(
-        "many_particles",
-        "too few bits",
-        lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int),
-    ),
-    AsFloats=(_NUMBER, "float64, expected integers", lambda rng, lw, n: by_weight(rng, lw, n).astype(float)),
-    TiesToTheFirst=(_CARRIED, "copies are biased", ties_to_the_first),
-    OnePosition=(_CARRIED, "copies are biased", one_position),
-    Halves=(_CARRIED, "copies are biased", halves),
-    OddIsSpecial=(_CARRIED, "copies are biased", odd_is_special),
-    MoreThanThereAre=(_CARRIED, "copies are biased", more_than_there_are),
-    WinnerTakesAll=(_CARRIED, "particles to 3", winner_takes_all),
-    ModuleCache=(_CARRIED, "copies are biased", module_cache),
+    # Counts particles from 1.
+    OffByOne=(_VALID, "expected 0 to", lambda rng, lw, n: by_weight(rng, lw, n) + 1),
+    AsFloats=(_VALID, "float64, expected integers", lambda rng, lw, n: by_weight(rng, lw, n).astype(float)),
+)
+plant(
+    selecting,
+    _CARRIED,
+    "copies are biased",
+    BiasedResidual=biased_residual,
+    FirstAlwaysStays=first_always_stays,
+    # Counts particles from 1, inside the range.
+    OffByOneClipped=lambda rng, lw, n: (by_weight(rng, lw, n) + 1) % len(lw),
+    KeepsAll=lambda rng, lw, n: np.arange(n) if n == len(lw) else by_weight(rng, lw, n),
+    TiesToTheFirst=ties_to_the_first,
+    OnePosition=one_position,
+    Halves=halves,
+    OddIsSpecial=odd_is_special,
+    MoreThanThereAre=more_than_there_are,
+    ModuleCache=module_cache,
+    SeedIgnored=lambda rng, lw, n: by_weight(np.random.default_rng(0), lw, n),
+    CopiesTheGenerator=lambda rng, lw, n: by_weight(copy.deepcopy(rng), lw, n),
+    # Selects by weight and keeps the weight, so the weight counts twice.
+    OldWeightsKept=lambda rng, lw, n: (ancestors := by_weight(rng, lw, n), lw[ancestors]),
+    EightBits=lambda rng, lw, n: by_weight(rng, lw, n).astype(np.uint8).astype(int),
+    WinnerTakesAll=winner_takes_all,
+    SingleIsHeaviest=lambda rng, lw, n: np.array([np.argmax(lw)]) if n == 1 else by_weight(rng, lw, n),
+)
+plant(
+    selecting,
+    "many_particles",
+    SixteenBits=("expected 0 to 100000", lambda rng, lw, n: by_weight(rng, lw, n).astype(np.int16).astype(int)),
 )
 plant(
     of(WeightResampler, {"exact_size": False}, select=selected),
-    MoreThanAsked=(_NUMBER, "asked to make", lambda rng, lw, n: by_weight(rng, lw, n + 1)),
+    MoreThanAsked=(_VALID, "asked to make", lambda rng, lw, n: by_weight(rng, lw, n + 1)),
 )
 #: Schemes that select by changed weights, ``function(W, n)`` of the normalised ones.
 weighing = of(WeightResampler, select=lambda f, rng, lw, n: (systematic(rng, f(normalise(lw), n), n), None))
 plant(
     weighing,
-    AtMostHalf=(_CARRIED, "heaviest particle gets -11 %", lambda W, n: np.minimum(W, 0.5)),
-    FloorOfWeights=(_CARRIED, "copies are biased", lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0)),
+    _CARRIED,
+    "copies are biased",
+    AtMostHalf=lambda W, n: np.minimum(W, 0.5),
+    FloorOfWeights=lambda W, n: np.where(W > 0, np.maximum(W, 0.02), 0.0),
     # Particles below a thousandth of the largest weight are dropped, if n = m.
-    DropsLight=(_CARRIED, "copies are biased", lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W)),
+    DropsLight=lambda W, n: W * ((1e-3 if n == len(W) else 0.0) * W.max() <= W),
     # A power of the weights, if n = m, or if there are more than a hundred.
-    Flattens=(_CARRIED, "copies are biased", lambda W, n: W ** (0.9 if n == len(W) else 1.0)),
-    SharpensMany=(_CARRIED, "125 particles to 5", lambda W, n: W ** (1.1 if len(W) > 100 else 1.0)),
+    Flattens=lambda W, n: W ** (0.9 if n == len(W) else 1.0),
+    SharpensMany=lambda W, n: W ** (1.1 if len(W) > 100 else 1.0),
     # If there are more than twenty times as many as are selected, the light ones are left out.
-    HeaviestOfMany=(
-        _CARRIED,
-        "100 particles to 2",
-        lambda W, n: np.where(np.sort(W)[-20 * n] <= W, W, 0.0) if len(W) > 20 * n else W,
-    ),
+    HeaviestOfMany=lambda W, n: np.where(np.sort(W)[-20 * n] <= W, W, 0.0) if len(W) > 20 * n else W,
     # Sorts by weight and forgets to sort back.
-    OrderMatters=(_CARRIED, "are the particles sorted, and not the ancestors?", lambda W, n: np.sort(W)[::-1]),
-    # Cumulates in single precision: small weights are lost.
-    SinglePrecisionSum=("many_particles", "single precision", lambda W, n: W.astype(np.float32)),
+    OrderMatters=lambda W, n: np.sort(W)[::-1],
 )
+# Cumulates in single precision: small weights are lost.
+plant(weighing, "many_particles", SinglePrecisionSum=("single precision", lambda W, n: W.astype(np.float32)))
 # Independent draws hide a small bias best: the largest weight is 1 % too large, or 5 % if it is above 0.6.
 plant(
     of(WeightResampler, select=lambda f, rng, lw, n: (multinomial(rng, f(normalise(lw)), n), None)),
-    OnePercent=(_CARRIED, "heaviest particle gets +", lambda W: np.where(W.max() == W, 1.01, 1.0) * W),
-    HeavyGains=(_CARRIED, "heaviest particle gets +", lambda W: np.where(W > 0.6, 1.05, 1.0) * W),
+    _CARRIED,
+    "copies are biased",
+    OnePercent=lambda W: np.where(W.max() == W, 1.01, 1.0) * W,
+    HeavyGains=lambda W: np.where(W > 0.6, 1.05, 1.0) * W,
 )
 
 
 # --- scale, generators and state ----------------------------------------------------------------------------------
+def dropped_by_absolute_weight(rng, lw, n):
+    return systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n)
+
+
 def single_precision_overflow(rng, lw, n):
     """exp in single precision overflows at 88."""
     weights = np.exp(lw.astype(np.float32))
@@ -278,37 +280,24 @@ def in_place_if_equal(rng, lw, n):
 
 
 _OWN = np.random.default_rng(5)
-_GLOBAL, _REPEATS = "does_not_use_global_generators", "repeats_with_the_same_generator"
+_REPEATS = "depends_on_its_arguments_only"
 plant(
     selecting,
-    DroppedByAbsoluteWeight=(
-        _SCALE,
-        "log weights",
-        lambda rng, lw, n: systematic(rng, np.where(lw > -50, np.exp(lw), 0.0), n),
-    ),
+    _REPEATS,
+    "come from `rng`",
+    GlobalIfMore=lambda rng, lw, n: by_weight(np.random if n > len(lw) else rng, lw, n),
+    PythonGenerator=python_generator,
+    OwnGenerator=lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n),
+    ModuleGenerator=lambda rng, lw, n: by_weight(_OWN, lw, n),
+)
+plant(
+    selecting,
+    DroppedByAbsoluteWeight=(_SCALE, "log weights", dropped_by_absolute_weight),
     SinglePrecisionOverflow=(_SCALE, "overflow", single_precision_overflow),
     SinglePrecisionOutput=(
         _SCALE,
         "do not add it",
         lambda rng, lw, n: (by_weight(rng, lw, n), np.full(n, log_mean_exp(lw)).astype(np.float32)),
-    ),
-    GlobalIfMore=(
-        _GLOBAL,
-        "numpy's global generator",
-        lambda rng, lw, n: by_weight(np.random if n > len(lw) else rng, lw, n),
-    ),
-    PythonGenerator=(_GLOBAL, "Python's global generator", python_generator),
-    OwnGenerator=(_REPEATS, "come from `rng`", lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n)),
-    ModuleGenerator=(_REPEATS, "come from `rng`", lambda rng, lw, n: by_weight(_OWN, lw, n)),
-    SeedIgnored=(
-        "depends_on_the_generator",
-        "ignores `rng`",
-        lambda rng, lw, n: by_weight(np.random.default_rng(0), lw, n),
-    ),
-    CopiesTheGenerator=(
-        "depends_on_the_generator",
-        "does not advance",
-        lambda rng, lw, n: by_weight(copy.deepcopy(rng), lw, n),
     ),
     InPlaceIfEqual=("does_not_change_input", "in place", in_place_if_equal),
 )
@@ -318,7 +307,7 @@ plant(
 )
 
 
-@faulty("keeps_no_state", "keeps state")
+@faulty(_REPEATS, "keeps state")
 @dataclass(frozen=True)
 class FirstCallCached(WeightResampler):
     """The weights of the first call are used for ever, if there are as many."""
@@ -331,16 +320,9 @@ class FirstCallCached(WeightResampler):
 
 
 # --- output, particles and parents --------------------------------------------------------------------------------
-def old_weights_kept(rng, lw, n):
-    """Selects by weight and keeps the weight, so the weight counts twice."""
-    ancestors = by_weight(rng, lw, n)
-    return ancestors, lw[ancestors]
-
-
 plant(
     selecting,
     _CARRIED,
-    OldWeightsKept=("output weights are wrong", old_weights_kept),
     # Equal weights, but not those that keep the evidence.
     WeightsForgotten=(
         "mean weight after selection",
@@ -367,7 +349,7 @@ def without_proposed(chosen, rng):
 plant(
     of(Resampler, resample=correctly_chosen),
     ForgetsAncestors=(
-        _NUMBER,
+        _VALID,
         'no parents "ancestor"',
         lambda chosen, rng: Population(chosen.particles, chosen.log_weights),
     ),
@@ -384,4 +366,4 @@ plant(
         lambda chosen, rng: chosen.with_ancestors(np.sort(chosen.parents["ancestor"])),
     ),
 )
-BiasedResidual = FAULTS[0][0]
+BiasedResidual = next(fault for fault, *_ in FAULTS if fault.__name__ == "BiasedResidual")

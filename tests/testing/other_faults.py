@@ -125,6 +125,7 @@ def exact_prior_in_plane(rng, n):
 # --- transitions --------------------------------------------------------------------------------------------------
 _MOVES = "weighted_moves_are_those_of_the_model"
 _ORDER = "order_of_particles_is_irrelevant"
+_VALID = "result_is_valid"
 
 
 def walk(x, noise):
@@ -169,13 +170,18 @@ def shared_by_axes(rng, x, y):
 
 plant(
     move,
-    NeedsObservation=("parents_are_valid", "observation=None", lambda rng, x, y: x + float(y)),
+    NeedsObservation=(_VALID, "observation=None", lambda rng, x, y: x + float(y)),
     FirstIsSpecial=(_ORDER, "moves differently", first_is_special),
-    OneNoise=(_ORDER, "the same noise", lambda rng, x, y: walk(x, rng.standard_normal())),
+    OneNoise=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, rng.standard_normal())),
     OneNoiseOfMany=(_MOVES, "is below", lambda rng, x, y: walk(x, rng.standard_normal()), exact_moves),
     # Returns the moved particles in another order, without their weights.
-    Permutes=(_MOVES, "x_t - x_{t-1}", lambda rng, x, y: rng.permutation(step(rng, x)), exact_moves),
-    SharedByAxes=(_MOVES, "coordinate 0 of x_t + coordinate 1 of x_t", shared_by_axes, exact_plane),
+    Permutes=(
+        _MOVES,
+        "coordinate 1 of (x_t, x_t - x_{t-1})",
+        lambda rng, x, y: rng.permutation(step(rng, x)),
+        exact_moves,
+    ),
+    SharedByAxes=(_MOVES, "coordinate 0 of (x_t, x_t - x_{t-1}) + coordinate 1 of", shared_by_axes, exact_plane),
     SharedByPairs=(_ORDER, "do not move independently", lambda rng, x, y: walk(x, in_blocks(rng, x, 2))),
     Mirrored=(_MOVES, "mirrored positions", mirrored, exact_walk),
     SharedByBlocks=(_MOVES, "of neighbours", lambda rng, x, y: walk(x, in_blocks(rng, x, 8)), exact_walk),
@@ -202,7 +208,7 @@ def permuted(rng, population, observation):
 plant(
     predict,
     DropsParticles=(
-        "parents_are_valid",
+        _VALID,
         'parents "previous"',
         lambda rng, population, y: population.take(np.arange(len(population) // 2 + 1), None).labelled({}),
     ),
@@ -211,8 +217,8 @@ plant(
         "do not add it",
         lambda rng, population, y: replace(population, log_weights=np.log(population.weights)),
     ),
-    PermutesAll=("weights_stay_with_their_particles", "another order", permuted),
-    NoisyIfHeavy=(_ORDER, "if the weights are others", noisy_if_heavy),
+    PermutesAll=(_VALID, "another order", permuted),
+    NoisyIfHeavy=(_MOVES, "is below", noisy_if_heavy, exact_walk),
 )
 
 
@@ -326,7 +332,7 @@ plant(
     TooWide=(_POSTERIOR, "is below", lambda x, y: Normal(x, 1.1 * TAU).log_prob(y), exact_posterior),
     TooWideByWeight=(_POSTERIOR, "of a particle is", lambda x, y: Normal(x, 1.1 * TAU).log_prob(y), exact_weights),
     Twice=(_POSTERIOR, "constant factors", lambda x, y: log_g(x, y) + np.log(2), exact_evidence),
-    TwiceByWeight=(_POSTERIOR, "2 times the exact ones", lambda x, y: log_g(x, y) + np.log(2), exact_weights),
+    TwiceByWeight=(_POSTERIOR, "constant factor", lambda x, y: log_g(x, y) + np.log(2), exact_weights),
     DividedByMean=(_OTHERS, "not normalised or ranked", lambda x, y: log_g(x, y) - log_mean_exp(log_g(x, y))),
     Ranks=(_OTHERS, "not normalised or ranked", lambda x, y: np.log1p(np.argsort(np.argsort(log_g(x, y))))),
 )
@@ -339,7 +345,7 @@ def strange_parents(rng, predicted, proposed, observation):
 
 plant(
     update,
-    "takes_any_of_its_inputs",
+    _VALID,
     NeedsPrediction=(
         "proposed particles",
         lambda rng, predicted, proposed, observation: predicted.reweighted(np.zeros(len(predicted))),
@@ -406,11 +412,7 @@ def antithetic(rng, y, n):
 
 plant(
     proposal,
-    OneTooFew=(
-        "gives_n_particles",
-        "asked for 2 particles it returns 1",
-        lambda rng, y, n: rng.standard_normal(max(n - 1, 1)),
-    ),
+    OneTooFew=(_VALID, "asked for 2 particles it returns 1", lambda rng, y, n: rng.standard_normal(max(n - 1, 1))),
     OneNumberForTwoAxes=(
         _DRAWN,
         "coordinate 0 of x +",
@@ -432,7 +434,6 @@ correct_draws, correct_weighed, correct_antithetic = map(
 
 # --- rejuvenations ------------------------------------------------------------------------------------------------
 _KEPT = "keeps_the_distribution"
-_NUMBER = "keeps_number_and_weights"
 
 
 def _metropolis(rng, x, previous, y, shift=0.0, temperature=1.0):
@@ -471,16 +472,16 @@ plant(
     PairsOfSteps=("of neighbours", pairs_of_steps),
     # Draws from p(x_t | y_t): the marginal is right, the joint distribution with x_{t-1} is wrong.
     ForgetsTheParent=(
-        "x_t - x_{t-1}",
+        "coordinate 1 of (x_t, x_t - x_{t-1})",
         lambda rng, x, previous, y: optimal(rng.normal(0.2, 1.0, len(x)), y).sample(rng, len(x)),
     ),
 )
 plant(
     rejuvenation,
-    _NUMBER,
+    _VALID,
     WeighsMoves=("changes log weights", lambda rng, p, previous, y: p.reweighted(rng.standard_normal(len(p)))),
     NeedsAPast=("previous=None", lambda rng, p, previous, y: p.moved(p.particles + 0 * previous.particles)),
-    LosesOne=("2 particles became 1", lambda rng, p, previous, y: p.take(np.arange(max(1, len(p) - 1)))),
+    LosesOne=("6 particles became 5", lambda rng, p, previous, y: p.take(np.arange(max(1, len(p) - 1)))),
 )
 
 
@@ -492,25 +493,25 @@ def distances(particles):
 plant(
     of(Trigger, wants=plainly),
     AbsoluteWeight=("scale_of_weights_is_irrelevant", "change its answer", lambda p, t: p.log_weights.max() < 0),
-    MaybeTrigger=("answers", "True or False", lambda p, t: p.ess),
+    MaybeTrigger=(_VALID, "True or False", lambda p, t: p.ess),
 )
-plant(of(Size, choose=plainly), HalfSize=("answers", "at least 1", lambda population: len(population) // 2))
+plant(of(Size, choose=plainly), HalfSize=(_VALID, "at least 1", lambda population: len(population) // 2))
 plant(
     of(Similarity, matrix=plainly),
-    Distance=("similarities_are_shares", "to itself", distances),
+    Distance=(_VALID, "expected finite ones in [0, 1]", distances),
     RelativeSimilarity=(_ORDER, "if only these", lambda x: 1 - distances(x) / max(distances(x).max(), 1e-12)),
-    OneSided=("similarities_are_shares", "similarity of particles", lambda x: np.tril(np.ones((len(x), len(x))))),
+    OneSided=(_VALID, "similarity of particles", lambda x: np.tril(np.ones((len(x), len(x))))),
 )
 plant(
     of(Equivalence, classes=plainly),
-    CountsFromOne=("classes_are_numbered", "classes are", lambda particles: np.arange(1, len(particles) + 1)),
+    CountsFromOne=(_VALID, "classes are", lambda particles: np.arange(1, len(particles) + 1)),
     AllDifferent=(_ORDER, "if there are copies", lambda particles: np.arange(len(particles))),
 )
 plant(
     of(Lookahead, log_priority=plainly),
     LooksAtWeights=("ignores_weights", "change the priorities", lambda p, y: p.log_weights + p.particles),
-    RulesOut=("scores_are_finite", "-inf", lambda p, y: np.where(p.particles > 1, -np.inf, 0.0)),
-    OneForAll=("scores_are_finite", "shape (1,)", lambda p, y: np.zeros(1)),
+    RulesOut=(_VALID, "-inf", lambda p, y: np.where(p.particles > 0.5, -np.inf, 0.0)),
+    OneForAll=(_VALID, "shape (1,)", lambda p, y: np.zeros(1)),
     ByPlace=(_ORDER, "in another order", lambda p, y: 0.1 * np.arange(len(p))),
 )
 
@@ -532,9 +533,7 @@ plant(
 _DECODED = "decoded_particles_are_equal"
 #: A codec that stores ``{"x": function(particles)}`` and returns it as double precision.
 encodes = of(
-    Codec,
-    encode=lambda f, particles: {"x": f(particles)},
-    decode=lambda f, arrays: arrays["x"].astype(np.float64),
+    Codec, encode=lambda f, particles: {"x": f(particles)}, decode=lambda f, arrays: arrays["x"].astype(np.float64)
 )
 plant(
     encodes,

@@ -11,15 +11,7 @@ import pytest
 
 from mstfilter import smc
 from mstfilter.presets import REGISTRY
-from mstfilter.smc import (
-    ClusterStratified,
-    Coalesced,
-    FearnheadClifford,
-    Gaussian,
-    Population,
-    Sorted,
-    Tempered,
-)
+from mstfilter.smc import ClusterStratified, Coalesced, FearnheadClifford, Gaussian, Population, Sorted, Tempered
 from mstfilter.smc.testing import ResamplerContract, WeightResamplerContract
 from mstfilter.testing import run_contract
 from tests.testing import faults, run_property
@@ -58,7 +50,6 @@ def test_no_planted_fault_is_lost():
 
 OURS = {
     **{name: REGISTRY.build("resampler", name) for name in smc.__components__["resampler"]},
-    "mean partition": Sorted(order="mean_partition"),
     "tempered optimal": Tempered(FearnheadClifford(), 0.0),
     "clusters, optimal inside": ClusterStratified(Gaussian(0.5), 0.3, FearnheadClifford()),
     "clusters, tempered inside": ClusterStratified(Gaussian(0.5), 0.3, Tempered()),

@@ -104,12 +104,6 @@ def test_strange_results_are_warned_of_once(name):
     assert words in str(caught[0].message) and "scene_faults.py, line " in str(caught[0].message)
 
 
-def test_scores_of_other_types_become_floats():
-    population, clip = scene_example(np.random.default_rng(1), 4)
-    for change in faults.GOOD_SCORES.values():
-        assert faults.Scores(change=change).log_score(population.particles, clip).dtype == np.float64
-
-
 @pytest.mark.parametrize("component", [*faults.CORRECT, *faults.OTHER_TYPES], ids=lambda c: type(c).__name__)
 def test_correct_components_pass(component):
     assert failures_of(component) == ""

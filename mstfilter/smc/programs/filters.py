@@ -17,14 +17,8 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.population import Particles, Population
 from mstfilter.smc.programs.guard import Schedule
-from mstfilter.smc.programs.handlers import (
-    GuideHandler,
-    ReplayHandler,
-    SampleHandler,
-    ScoreHandler,
-    SiteHandler,
-)
-from mstfilter.smc.programs.sites import ProgramRun, active_run
+from mstfilter.smc.programs.handlers import GivenHandler, GuideHandler, ReplayHandler, SampleHandler, SiteHandler
+from mstfilter.smc.programs.sites import ProgramRun, active_run, recorded
 from mstfilter.smc.streams import RunGenerators
 
 Model = Callable[..., Any]
@@ -41,12 +35,6 @@ class Program:
     """
 
     model: Model
-
-    def __post_init__(self) -> None:
-        if not callable(self.model):
-            raise InputError(
-                f"model is {self.model!r}, expected a function of the previous state and the observation"
-            )
 
     def bootstrap(self, n: int, **components: Any) -> ParticleFilter:
         """Bootstrap filter, which draws from the model and weights by the observations."""
@@ -100,8 +88,9 @@ class _ProgramStep(Component):
         try:
             return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
         except InputError:
-            if np.isnan(gain).any():  # name the site
-                run_program(model, ScoreHandler(particles, strict=True), previous, observation, n)
+            if np.isnan(gain).any():
+                with recorded():  # a recorded run names the site
+                    run_program(model, GivenHandler(particles), previous, observation, n)
             raise
 
 
@@ -186,10 +175,6 @@ _RAW_ERRORS = {
         "the program uses an array that holds all particles as one number (float, int, range, math, list index)",
         "use numpy (numpy.exp, x.astype(int)) or an array as table",
     ),
-    "unhashable": (
-        "the program uses an array that holds all particles as a key",
-        "use an array as table, table[x]",
-    ),
     "read-only": (
         "the program changes an array of particles in place",
         "write x = x + 1 for x += 1 and numpy.where for x[i] = ..., and return the result under another name",
@@ -201,10 +186,6 @@ _RAW_ERRORS = {
     "zero-size array": (
         "the program reduces an array without entries",
         "a branch of switch is also called when no particle reaches it",
-    ),
-    "broadcast": (
-        "the program combines arrays that do not fit together",
-        "the first axis is that of the particles: write x[:, None] to combine (n,) with (n, d)",
     ),
 }
 
@@ -250,7 +231,6 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
             raise InputError(
                 f"a program returned {name!r} of shape {value.shape}, expected one row per particle ({run.n})"
             )
-        run.returns(name, value)
         if name in run.values and not _equal(value, run.values[name]):
             raise InputError(
                 f"a program returned {name!r} with other values than site {name!r}",
@@ -260,10 +240,9 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
     return out
 
 
-def _equal(a: Any, b: Any) -> bool:
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two arrays are equal, where NaN equals NaN."""
-    a, b = np.asarray(a), np.asarray(b)
-    return a is b or (a.shape == b.shape and bool(np.all((a == b) | ((a != a) & (b != b)))))
+    return a is b or np.array_equal(a, b, equal_nan=a.dtype.kind in "fc" and b.dtype.kind in "fc")
 
 
 def _values_of(run: ProgramRun) -> dict[str, Any]:

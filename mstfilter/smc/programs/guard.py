@@ -9,6 +9,7 @@ the 9th, 66th, 515th, ... (8^k + k, which also detects a fault of every third st
    first run.
 2. A few particles run alone with the values that they had: their distributions and returned values must be those of
    the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
+   Their number differs from that of the step, so that an axis of events cannot be mistaken for that of the particles.
 3. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
    the evidence must agree.
 
@@ -30,7 +31,7 @@ import numpy as np
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
-from mstfilter.smc.programs.handlers import CopyHandler, SampleHandler, ScoreHandler
+from mstfilter.smc.programs.handlers import GivenHandler, SampleHandler
 from mstfilter.smc.programs.sites import Call, ProgramRun, recorded
 from mstfilter.smc.streams import child
 
@@ -41,6 +42,7 @@ _LOG_DENSITY, _VALUE = 1e-3, 1e-5
 _ALONE = (
     "each particle is processed as if it were alone: reduce over entries with axis=1, not over the particles",
     'previous["x"] has one row for each particle, in a branch of switch as an argument; draw by sample(...) only',
+    "arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]",
 )
 _REPEAT = (
     "draw by sample(...) only, not by numpy.random, random or another generator",
@@ -67,7 +69,7 @@ class Guard:
         with recorded() as runs:
             particles, gain = step()
         if self.count <= 2:
-            self._repeat(step, particles, gain, runs)
+            self._repeat(step, particles, gain)
         for whole in runs:
             for rows in _groups(whole) if whole.n > 1 else ():
                 self._check_alone(run, whole, rows)
@@ -76,29 +78,21 @@ class Guard:
         return particles, gain
 
     # --- the same random numbers ------------------------------------------------------------------------------------
-    def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray, runs: list[ProgramRun]) -> None:
+    def _repeat(self, step: Callable[[], Any], particles: Any, gain: np.ndarray) -> None:
         self.rng.bit_generator.state = self.state
-        invalid: list[str] = []
-        with recorded() as repeated, np.errstate(invalid="call", call=lambda kind, _: invalid.append(kind)):
-            try:
-                again, gain_again = step()
-            except Exception as error:
-                message = f"the step fails when it is repeated with the same random numbers: {error}"
-                raise InputError(message, *_REPEAT) from error
-        what = _first_difference(particles, again)
-        if what is None and not _close(gain, gain_again, 1e-9).all():
-            what = _first_call_that_differs(runs, repeated) or "log weights"
+        try:
+            again, gain_again = step()
+        except Exception as error:
+            message = f"the step fails when it is repeated with the same random numbers: {error}"
+            raise InputError(message, *_REPEAT) from error
+        what = _first_difference({**particles, "log weights": gain}, {**again, "log weights": gain_again})
         if what is not None:
             raise InputError(f"{what} differ when the step is repeated with the same random numbers", *_REPEAT)
-        if invalid:
-            _check_returned(repeated[-1])
 
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
         """Compare some particles in a run with the same particles in a separate run."""
-        if any(call.ambiguous for call in whole.calls or ()):
-            rows = rows[:1]
-        few, rows = self._run_alone(run, whole, rows)
+        few = self._run_alone(run, whole, rows)
         for call in few.calls or ():
             if call.distribution is not None:
                 _check_density(call.what, call.distribution, self.rng)
@@ -111,49 +105,42 @@ class Guard:
         for name, values in whole.returned.items():
             _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
 
-    def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> tuple[ProgramRun, np.ndarray]:
-        """A run of some particles, and their rows, repeated to n rows if the program needs n particles."""
-        with recorded() as runs:
-            try:
-                few = self._run_again(run, whole, rows)
-                _check_shapes(whole, few, "")
-            except Exception as error:
-                _check_shapes(whole, runs[0], str(error))
-                try:
-                    rows = np.resize(rows, whole.n)
-                    few = self._run_again(run, whole, rows)
-                except Exception as again:
-                    message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {again}"
-                    raise InputError(message, *_ALONE) from again
-        return few, rows
-
-    def _run_again(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
+    def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
+        """A run of some particles, with the values that they had."""
         previous = None if self.previous is None else take(self.previous, rows)
-        handler, arguments = CopyHandler(whole.values, rows), (previous, self.observation, len(rows))
+        handler = GivenHandler(whole.values, rows, weigh=False)
         fresh = self.fresh.get(id(whole.function))
-        return run(whole.function if fresh is None else _copy(fresh), handler, *arguments)
+        function = whole.function if fresh is None else _copy(fresh)
+        try:
+            with recorded():
+                return run(function, handler, previous, self.observation, len(rows))
+        except Exception as error:
+            hints = error.hints if isinstance(error, InputError) else ()
+            message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {error}"
+            raise InputError(message, *hints, *_ALONE) from error
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
         """Compare the guide with draws of the model."""
         n, old = len(gain), 0.0 if self.past is None else self.past.log_weights
-        drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
         try:
-            with recorded() as runs:
-                log_q = run(self.guide, ScoreHandler(drawn.values), self.previous, self.observation, n).gain
+            drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
         except InputError:
-            return  # the guide draws sites that the model does not reach
+            return  # the model cannot weight its own draws
         by_model, by_guide = old + drawn.gain, old + gain
         if not (np.isfinite(by_model.max()) and np.isfinite(by_guide.max())):
             return
         weights = normalise(by_model)
-        missed = float(weights[log_q == -np.inf].sum())
-        if missed > 1e-3:
-            site = next(c.what for c in runs[0].calls or () if (c.densities(c.value) == -np.inf).any())
-            raise InputError(
-                f"{site}: the guide never draws values that hold {missed:.1%} of the posterior probability",
-                "its distribution must reach wherever that of the model times the likelihood does",
-            )
+        with recorded() as runs, suppress(InputError):  # the guide draws sites that the model does not reach
+            run(self.guide, GivenHandler(drawn.values, weigh=False), self.previous, self.observation, n)
+        for call in runs[0].calls or ():
+            never = call.densities(call.value) == -np.inf
+            missed = float(weights[call.reached][never].sum())
+            if missed > 1e-3:
+                raise InputError(
+                    f"{call.what}: the guide never draws values that hold {missed:.1%} of the posterior probability",
+                    "its distribution must reach wherever that of the model times the likelihood does",
+                )
         spread, spread_guide = (float((w**2).sum()) - 1 / n for w in (weights, normalise(by_guide)))
         gap = log_mean_exp(by_guide) - log_mean_exp(by_model)
         both = spread + spread_guide
@@ -216,17 +203,6 @@ def _copy(function: Any) -> Any:
         return function
 
 
-def _check_returned(run: ProgramRun) -> None:
-    """Raise if a returned value is NaN after an invalid operation. A NaN that the program writes is allowed."""
-    for name, value in run.returned.items():
-        if np.asarray(value).dtype.kind == "f" and np.isnan(value).any():
-            n = int(np.isnan(value).reshape(run.n, -1).any(axis=1).sum())
-            raise InputError(
-                f"returned {name!r} is NaN for {n} of {run.n} particles, by an operation such as log(-1) or 0/0",
-                "write numpy.nan by numpy.where(valid, value, numpy.nan) if it marks a value that is absent",
-            )
-
-
 def _groups(run: ProgramRun) -> list[np.ndarray]:
     """Two groups of particles to run alone, of small and of large values, with particles of every branch."""
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
@@ -236,13 +212,13 @@ def _groups(run: ProgramRun) -> list[np.ndarray]:
 
 
 def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
-    """Some rows of a part of the particles. There are at least two, since one row might be broadcast."""
+    """Some rows of a part of the particles: at least two, since one row might be broadcast, but not all."""
     rows = list(part[[len(part) // 2, 0, len(part) // 4]])
     for call in run.calls or ():
         if call.rows is not None and len(rows) < 8:
             reached = part[np.isin(part, call.rows)]
             rows += [*reached[len(reached) // 2 :][:1]]
-    return np.array(rows)
+    return np.array(rows[: len(rows) - (len(rows) == run.n)])
 
 
 def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
@@ -278,33 +254,6 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
     return a.shape == b.shape and bool(_close(a, b, 1e-9).all())
 
 
-def _first_call_that_differs(one: list[ProgramRun], two: list[ProgramRun]) -> str | None:
-    for a, b in zip(one, two, strict=False):
-        for x, y in zip(a.calls or (), b.calls or (), strict=False):
-            if x.what != y.what or not _close(x.densities(x.value), y.densities(y.value), 1e-9).all():
-                return f"log densities of {x.what}"
-    return None
-
-
-def _check_shapes(whole: ProgramRun, alone: ProgramRun, raised: str) -> None:
-    """Raise if the shape of an event depends on the number of particles.
-
-    A vector with as many entries as there are particles looks like one number per particle. An array (n, n) made from
-    (n, 1) and (n,) looks like n vectors. `raised` is the message of the error in the run `alone`, if any.
-    """
-    calls = alone.calls or []
-    for k, found in enumerate(whole.calls or ()):
-        if not found.ambiguous:
-            continue
-        if raised and k == len(calls):
-            raise InputError(
-                f"{found.what}: an error with one particle, and none with {whole.n}: "
-                + raised.removeprefix(f"{found.what}: ")
-            )
-        if k < len(calls) and not (found.event == calls[k].event and calls[k].fits):
-            raise found.shape_error(f"{found.what}: ")
-
-
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
     """Raise unless particles have the same distributions in a call of all particles and alone."""
     position = call.positions(rows)
@@ -320,10 +269,6 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
     k = position[here]
     pairs = [(among, alone.densities(alone.value))]
     if call.distribution is not None:
-        events = call.value.shape[1:], alone.value.shape[1:]
-        if events[0] != events[1]:
-            fact = f"{call.what}: an event has shape {events[0]} among the others, {events[1]} alone"
-            raise InputError(fact, *_ALONE)
         other = call.value[k[0] - 1]  # the value of another particle
         values = [np.full(c.value.shape, other, c.value.dtype) for c in (call, alone)]
         pairs.append((call.densities(values[0]), alone.densities(values[1])))
@@ -341,7 +286,7 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
 def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np.ndarray) -> None:
     """Raise unless particles have the same returned values among the others and alone."""
     if alone.shape[1:] != values.shape[1:]:
-        raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}")
+        raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}", *_ALONE)
     different = ~_close(values[rows], alone, _VALUE, _spread(values))
     if different.any():
         i = tuple(np.argwhere(different)[0])
@@ -365,22 +310,24 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
     the uniform distribution is below .12 for 1000 draws of the true distribution, with a false-alarm rate of 1e-12
     (Dvoretzky, Kiefer, Wolfowitz).
     """
+    from scipy.integrate import cumulative_trapezoid
+
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:
         return
-    n = (distribution.batch_shape or (1,))[0]
+    n = (distribution.parameter_shape or (1,))[0]
     if n == 0:
         return
     generator, row = child(rng, "guard", "density"), n // 2
-    per_call = n if n > 1 else 1000
-    draws = [distribution.sample(generator, per_call) for _ in range(1000 if n > 1 else 1)]
-    x = np.sort(np.array([d[row] for d in draws]) if n > 1 else draws[0])
+    # Draws of one row; a distribution that all particles share draws them in one call.
+    calls, size = (1000, n) if n > 1 else (1, 1000)
+    draws = np.array([distribution.sample(generator, size) for _ in range(calls)])
+    x = np.sort(draws[:, row] if n > 1 else draws[0])
 
     def density(values: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            if n == 1:
-                return np.exp(np.broadcast_to(distribution.log_prob(values), values.shape))
-            return np.array([np.exp(distribution.log_prob(np.full(n, v, values.dtype))[row]) for v in values])
+            found = [np.broadcast_to(distribution.log_prob(np.full(n, v, x.dtype)), n)[row] for v in values]
+        return np.exp(found)
 
     if distribution.discrete:
         values, counts = np.unique(x, return_counts=True)
@@ -388,9 +335,9 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
         distance, total = float(abs(counts / len(x) - p).max()), float(p.sum())
     else:
         width = max(x[-1] - x[0], 1e-12)
-        x = np.concatenate([x[0] - width * np.linspace(1, 0, 50)[:-1], x, x[-1] + width * np.linspace(0, 1, 50)[1:]])
-        p = density(x)
-        mass = np.append(0.0, np.cumsum(np.diff(x) * (p[1:] + p[:-1]) / 2))
+        tail = width * np.linspace(0, 1, 50)[1:]
+        x = np.concatenate([x[0] - tail[::-1], x, x[-1] + tail])
+        mass = cumulative_trapezoid(density(x), x, initial=0.0)
         middle = (np.arange(1000) + 0.5) / 1000
         distance, total = float(abs(mass[49:-49] - middle).max()), float(mass[-1])
     if not distance < 0.12:

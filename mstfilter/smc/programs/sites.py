@@ -94,44 +94,15 @@ def _current() -> ProgramRun:
 
 
 class Call(NamedTuple):
-    """A call of `sample` or `observe`, a branch of `switch`, or a returned value, in a run."""
+    """A call of `sample` or `observe`, or a branch of `switch`, in a run."""
 
     what: str  #: description, for messages
     k: int  #: number among the calls of this description
     rows: np.ndarray | None  #: (size,) indices of the particles, ascending; None stands for all
     size: int
-    event: tuple[int, ...] = ()  #: event shape
-    observed: tuple[int, ...] | None = None  #: shape of the observed value
     log_prob: Any = 0.0  #: of an observation; (size,), or one for all
     distribution: Distribution | None = None  #: of a site
     value: Any = None  #: (size, ...) of a site
-
-    @property
-    def fits(self) -> bool:
-        """Whether an observed value is one event, or one for each particle; a number is an event of shape (1,)."""
-        event, value = self.event, self.observed
-        return value in (None, event, (1, *event), (self.size, *event)) or (value == () and event == (1,))
-
-    @property
-    def ambiguous(self) -> bool:
-        """Whether the axis of the particles might be an axis of the event, or the reverse."""
-        return self.size > 1 and (self.size in self.event or self.observed == (self.size, *self.event))
-
-    def shape_error(self, prefix: str = "") -> InputError:
-        """The error of a wrong shape."""
-        hints = []
-        if self.size > 1 and self.size in self.event:
-            hints += ["arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]"]
-        if self.observed is None:
-            fact = f"an event has shape {self.event}, which changes with the number of particles"
-        else:
-            fact = f"the value has shape {self.observed}, expected {self.event}"
-            hints += [
-                "give all entries of the vector, or observe one entry by its parameters, such as x[:, 0]"
-                if len(self.observed) < len(self.event)
-                else "a vector of k entries needs parameters (n, k) or (1, k), such as Normal(x[:, None], 1.0)"
-            ]
-        return InputError(f"{prefix}{fact}", *hints)
 
     @property
     def reached(self) -> np.ndarray:
@@ -187,23 +158,18 @@ class ProgramRun:
         """Number of particles of the branch."""
         return self.n if self._rows is None else len(self._rows)
 
-    def returns(self, name: str, value: np.ndarray) -> None:
-        """Store the shape of a returned value."""
-        self._last = ("returned", name, "")
-        self._note(event=value.shape[1:])
-
-    def sample(self, name: str, distribution: Any, branch: bool = False) -> Any:
+    def sample(self, name: str, distribution: Any) -> Any:
         self._last, self.inside = ("site", name, self._where), True
         rows, size, distribution = self._rows, self._size, as_distribution(distribution)
         self._check_name(name)
-        value, gain = self.handler.value(Site(name, distribution, size, rows, branch))
+        value, gain = self.handler.value(Site(name, distribution, size, rows))
         value = frozen_view(np.asarray(value))
         if gain is None:
             if value.shape != (size,):
                 check_shape("its draws", value, distribution, size)
             if self.handler.draws and not distribution.draws_numbers:
                 _check_draws(value, distribution)
-        self._note(event=value.shape[1:], distribution=distribution, value=value)
+        self._note(distribution=distribution, value=value)
         self._store(name, value, rows)
         if gain is not None:
             self._add(gain, size)
@@ -217,12 +183,7 @@ class ProgramRun:
         if value is not None:
             distribution = as_distribution(distribution)
             found: tuple[int, ...] = () if isinstance(value, float) else np.shape(value)
-            event = self._event_shape(distribution, found)
-            if found != event:
-                call = Call(self.what, 0, self._rows, self._size, event, found)
-                if not call.fits:
-                    self._note(event=event, observed=found)
-                    raise call.shape_error()
+            self._check_event(distribution, found)
             if found and any(value is v for v in self.values.values()):
                 raise InputError(
                     "the value is that of a site, which is drawn and not observed",
@@ -231,15 +192,24 @@ class ProgramRun:
             if self.calls is not None:
                 distribution.check_parameters()
             log_prob = distribution.log_prob(value)
-            self._note(event=event, observed=found, log_prob=log_prob)
+            self._note(log_prob=log_prob)
             self._add(log_prob, self._size)
         self.inside = False
 
-    def _event_shape(self, distribution: Distribution, found: tuple[int, ...]) -> tuple[int, ...]:
-        """Event shape of a distribution of which a value of shape `found` is observed."""
-        event = distribution.value_shape(self._size)[1:]
-        independent = len(found) > 1 and found[0] == self._size and not distribution.parameter_shape
-        return found[1:] if independent else event  # entries with the same parameters
+    def _check_event(self, distribution: Distribution, found: tuple[int, ...]) -> None:
+        """Raise unless an observed value of shape `found` is one event, or one for each particle."""
+        size = self._size
+        event = distribution.value_shape(size)[1:]
+        if found == event or found in ((1, *event), (size, *event)) or (found, event) == ((), (1,)):
+            return
+        if len(found) > 1 and found[0] == size and not distribution.parameter_shape:
+            return  # the entries of each particle have the same parameters
+        hints = ["a vector of k entries needs parameters (n, k) or (1, k), such as Normal(x[:, None], 1.0)"]
+        if len(found) < len(event):
+            hints = ["give all entries of the vector, or observe one entry by its parameters, such as x[:, 0]"]
+        if size in event:
+            hints.append("arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]")
+        raise InputError(f"the value has shape {found}, expected {event}", *hints)
 
     def switch(self, name: str, probs: Any, branches: Sequence[Callable[..., Any]], args: tuple[Any, ...]) -> Any:
         self._last, self.inside = ("switch", name, ""), True
@@ -248,7 +218,7 @@ class ProgramRun:
             raise InputError(f"{distribution.probs.shape[-1]} probabilities for {len(branches)} branches")
         for k, argument in enumerate(args):
             _check_rows(argument, self._size, k)
-        index = self.sample(name, distribution, branch=True)
+        index = self.sample(name, distribution)
         outer, path, where, results, groups = self._rows, self._path, self._where, [], []
         for k, branch in enumerate(branches):  # also empty groups: the sites of all branches exist at every step
             group = np.flatnonzero(index == k)
@@ -311,7 +281,7 @@ class ProgramRun:
         log_prob = np.asarray(log_prob)
         if log_prob.shape not in ((size,), (), (1,)):
             raise InputError(f"log_prob has shape {log_prob.shape}, expected one number per particle, ({size},)")
-        if self.handler.strict and size and not log_prob.max() < np.inf:
+        if self.calls is not None and size and not log_prob.max() < np.inf:
             wrong = np.flatnonzero(~(np.atleast_1d(log_prob) < np.inf))
             raise InputError(
                 f"log density is {np.atleast_1d(log_prob)[wrong[0]]} for {len(wrong)} of {size} particles",

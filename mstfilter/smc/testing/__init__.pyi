@@ -3,7 +3,6 @@ from mstfilter.smc.testing.contract import (
     CheckResult as CheckResult,
     Contract as Contract,
     check_properties as check_properties,
-    number_example as number_example,
 )
 from mstfilter.smc.testing.moves import (
     DensityTransitionContract as DensityTransitionContract,

@@ -1,16 +1,13 @@
 """Common parts of all contracts: the base class, its run without pytest, and helpers that describe failures.
 
-A contract is a test class for pytest. It defines the arguments of a call (`inputs`), the call (`call`), and the
-requirements of every result (`check_result`). Each ``test_`` method checks one more property. The first line of its
-docstring states the property, and the message of a failed assertion states how it is violated:
+A contract is a test class for pytest. It defines the arguments of calls (`inputs`, `variants`), the call (`call`),
+and the requirements of every result (`check_result`). Each further ``test_`` method checks one more property. The
+first line of its docstring states the property, and the message of a failed assertion states how it is violated:
 
 >>> class TriggerContract(Contract):
 ...     returns = bool
 ...     def call(self, component, rng, inputs):
 ...         return component.wants(inputs["population"], 0)
-...     def test_answers_yes_or_no(self):
-...         \"\"\"It returns True or False.\"\"\"
-...         self.checked_call(self.make(), self.inputs(5))
 
 pytest is not imported: `SkipTest` skips a test, in pytest too.
 """
@@ -19,7 +16,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
@@ -53,11 +49,6 @@ def seeded(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def number_example(rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-    """`n` numbers with unequal weights, and a number as observation."""
-    return Population(rng.standard_normal(n), 0.5 * rng.standard_normal(n)), 0.5
-
-
 class Contract:
     """Base class of all contracts. Inherit one of its subclasses and define `make`. pytest does the rest.
 
@@ -71,8 +62,8 @@ class Contract:
         raise NotImplementedError(f"{type(self).__name__} needs a method make(self) that returns the component")
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """A population of `n` particles (by default numbers) that the component can handle, and an observation."""
-        return number_example(rng, n)
+        """A population of `n` weighted particles (by default numbers) for the component, and an observation."""
+        return Population(rng.standard_normal(n), 0.5 * rng.standard_normal(n)), 0.5
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         """Arguments of a typical call, without the generator: the example of `n` particles."""
@@ -106,16 +97,10 @@ class Contract:
         return copied(self.make())
 
     @prerequisite
-    def test_does_not_use_global_generators(self) -> None:
-        """It does not use the global generators of numpy and Python."""
+    def test_result_is_valid(self) -> None:
+        """Every result has the type, the size and the values that the interface requires."""
         for inputs in self.variants():
-            of_numpy, of_python = np.random.get_state(), random.getstate()  # noqa: NPY002
-            with skips_errors():
-                self.call(self.make(), seeded(7), inputs)
-            unused = same(of_numpy, np.random.get_state())  # noqa: NPY002
-            assert unused, "it draws from numpy's global generator (np.random.*): draw from `rng`"
-            unused = of_python == random.getstate()
-            assert unused, "it draws from Python's global generator (random.*): draw from `rng`"
+            self.checked_call(self.make(), inputs)
 
     @prerequisite
     def test_does_not_change_input(self) -> None:
@@ -130,61 +115,50 @@ class Contract:
                 assert same(value, before[name]), f"it changes its input in place ({name}): make a copy first"
 
     @prerequisite
-    def test_repeats_with_the_same_generator(self) -> None:
-        """Equal generators give equal results; with ``draws = False`` it does not use its generator."""
-        for inputs in self.variants():
-            rng = seeded(7)
+    def test_depends_on_its_arguments_only(self) -> None:
+        """Equal arguments and generators give equal results; with ``draws = False`` it does not use its generator."""
+        used, draws, found = self.fresh(), getattr(self.make(), "draws", True), []
+        for inputs in (self.inputs(6, 1), *self.variants()):
+            rngs = [seeded(7) for _ in range(3)]
+            components = self.fresh(), self.fresh(), used
             with skips_errors():
-                a, b = (_plain(self.call(self.fresh(), r, inputs)) for r in (rng, seeded(7)))
-            assert same(a, b), "two runs with equal generators differ: a random number does not come from `rng`"
-            unused = rng.bit_generator.state == seeded(7).bit_generator.state
-            assert unused or getattr(self.make(), "draws", True), (
-                "it declares draws = False and draws from its generator"
-            )
-
-    @prerequisite
-    def test_keeps_no_state(self) -> None:
-        """A call does not change the result of later calls."""
-        used = self.fresh()
-        for n, seed in ((9, 1), (6, 0), (6, 2), (6, 0)):
-            inputs = self.inputs(n, seed)
-            with skips_errors():
-                found, expected = (_plain(self.call(c, seeded(1), inputs)) for c in (used, self.fresh()))
-            assert same(found, expected), (
-                "a component that was used before gives another result than a new one: it keeps state, for example "
-                "values of its first call"
-            )
+                found.append([_plain(self.call(*c, inputs)) for c in zip(components, rngs, strict=True)])
+            unused = rngs[0].bit_generator.state == seeded(7).bit_generator.state
+            assert unused or draws, "it declares draws = False and draws from its generator"
+        assert all(same(one, again) for one, again, _ in found), (
+            "two runs with equal generators differ: a random number does not come from `rng`"
+        )
+        assert all(same(one, later) for one, _, later in found), (
+            "a component that was used before gives another result than a new one: it keeps state, for example "
+            "values of its first call"
+        )
 
 
 class ScaleContract(Contract):
     """Base class of contracts for components that take weighted particles."""
 
-    weighted: ClassVar[str] = "population"  #: name of the argument with the weights
-
-    def weighted_inputs(self) -> list[dict[str, Any]]:
-        """Arguments of calls in which only the argument `weighted` has weights."""
-        return self.variants()
+    #: Name of the argument with the weights; in the first of the variants, no other argument has weights.
+    weighted: ClassVar[str] = "population"
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
         """A common factor of the weights has no effect, except that the weights of the result have it too."""
-        component = self.make()
-        for inputs in self.weighted_inputs():
-            population, result = inputs[self.weighted], self.checked_call(component, inputs)
-            for shift in (0.5, 50.0, -50.0, 1e4, -1e4):
-                given = population.reweighted(np.full(len(population), shift))
-                fault = f"log weights + {shift:g} (overflow or underflow?)"
-                try:
-                    with np.errstate(all="ignore"):
-                        found = self.checked_call(component, {**inputs, self.weighted: given})
-                except AssertionError as error:
-                    raise AssertionError(f"{fault}: {error}") from error
-                if not isinstance(result, Population):
-                    assert result == found, f"{fault} change its answer"
-                    continue
-                a, b = (_selected(one) for one in (result, found))
-                assert all(map(close, a, b)), f"{fault} change the particles"
-                kept = close(found.log_weights - shift, result.log_weights)
-                assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
+        component, inputs = self.make(), self.variants()[0]
+        population, result = inputs[self.weighted], self.checked_call(component, inputs)
+        for shift in (0.5, 50.0, -50.0, 1e4, -1e4):
+            given = population.reweighted(np.full(len(population), shift))
+            fault = f"log weights + {shift:g} (overflow or underflow?)"
+            try:
+                with np.errstate(all="ignore"):
+                    found = self.checked_call(component, {**inputs, self.weighted: given})
+            except AssertionError as error:
+                raise AssertionError(f"{fault}: {error}") from error
+            if not isinstance(result, Population):
+                assert result == found, f"{fault} change its answer"
+                continue
+            a, b = (_selected(one) for one in (result, found))
+            assert all(map(close, a, b)), f"{fault} change the particles"
+            kept = close(found.log_weights - shift, result.log_weights)
+            assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
 
 
 def _selected(population: Population) -> list[np.ndarray]:
@@ -255,14 +229,9 @@ def check_properties(
 
 
 def _test_names(tests: type) -> list[str]:
-    """The test methods in the order of pytest: those of the base classes first."""
-    names: dict[str, None] = {}
-    for cls in reversed(tests.__mro__):
-        for name in vars(cls):
-            if name.startswith("test_"):
-                names.pop(name, None)  # an overridden test is in the place of the derived class
-                names[name] = None
-    return list(names)
+    """The test methods: those of the base classes first."""
+    names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
+    return list(dict.fromkeys(names))
 
 
 def _outcome(test: Callable[[], None]) -> tuple[str | None, str | None]:
@@ -291,9 +260,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
         what = what if isinstance(what, str) else _description(what)
         if isinstance(error, InputError):  # says what is wrong and where, as in a run
             raise AssertionError("; ".join([f"{what}: {error.message}", *error.hints])) from error
-        number = isinstance(error, AttributeError) and "'float' object" in str(error)
-        hint = "; the input is a number: for scenes write `example = scene_example` in the file" if number else ""
-        raise AssertionError(f"{what}: it raises {describe_error(error)}{hint}") from error
+        raise AssertionError(f"{what}: it raises {describe_error(error)}") from error
 
 
 @contextmanager
@@ -307,13 +274,9 @@ def skips_errors() -> Iterator[None]:
 
 def _description(inputs: dict[str, Any]) -> str:
     """The sizes of populations, and arguments that are None or numbers: "6 particles, observation=None"."""
-    words = []
-    for name, value in inputs.items():
-        if isinstance(value, Population):
-            words.append(f"{len(value)} {'' if name == 'population' else f'{name} '}particles")
-        elif value is None or isinstance(value, int):
-            words.append(f"{name}={value}")
-    return ", ".join(words)
+    sizes = [f"{len(value)} {name} particles" for name, value in inputs.items() if isinstance(value, Population)]
+    values = [f"{name}={value}" for name, value in inputs.items() if value is None or isinstance(value, int)]
+    return ", ".join(sizes + values).replace("population ", "")
 
 
 def _writes_to_read_only(error: Exception) -> bool:

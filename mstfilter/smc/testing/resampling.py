@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
-from unittest import SkipTest
 
 import numpy as np
 
@@ -18,21 +17,12 @@ from mstfilter.smc import Population, Resampler, WeightResampler
 from mstfilter.smc.testing.contract import (
     FALSE_ALARM,
     ScaleContract,
-    prerequisite,
     same,
     seeded,
     skip_unless_properly_weighted,
     statistical,
 )
-from mstfilter.smc.testing.copies import (
-    CASES,
-    MOST_CALLS,
-    Case,
-    ConstantGenerator,
-    Sample,
-    fault_message,
-    log_of,
-)
+from mstfilter.smc.testing.copies import CASES, MOST_CALLS, Case, ConstantGenerator, Sample, fault_message
 
 _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 
@@ -57,15 +47,18 @@ class ResamplerContract(ScaleContract):
         n = len(weights)
         particles = self.example(seeded(0), n)[0].realised().particles
         index = np.arange(n)
-        return Population(particles, log_of(weights), {"previous": index[::-1], "proposed": index + n})
+        with np.errstate(divide="ignore"):
+            log_weights = np.log(weights)
+        return Population(particles, log_weights, {"previous": index[::-1], "proposed": index + n})
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
         return {"population": self.population(np.linspace(1, 2 + seed, 40)), "n": 25}
 
     def variants(self) -> list[dict[str, Any]]:
         """More particles than are selected, as many, and fewer; also weights of zero."""
-        weights = (np.linspace(1, 2, 40), (0.2, 0.5, 0.3, 0.9, 0.4, 0.6, 0.1), (0.5, 0.2, 0.7), _ZEROS[0], (0.4, 0.3))
-        return [{"population": self.population(w), "n": n} for w, n in zip(weights, (25, 7, 8, 5, 1), strict=True)]
+        cases = [(np.linspace(1, 2, m), n) for m, n in ((40, 25), (20, 20), (30, 80), (1, 3), (2, 1))]
+        cases.append((np.array(_ZEROS[0]), 5))
+        return [{"population": self.population(weights), "n": n} for weights, n in cases]
 
     def call(self, component: Resampler, rng: np.random.Generator, inputs: dict[str, Any]) -> Population:
         return component.resample(rng, inputs["population"], inputs["n"])
@@ -73,41 +66,26 @@ class ResamplerContract(ScaleContract):
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         ancestors = result.parents.get("ancestor")
         assert ancestors is not None, 'the result has no parents "ancestor"'
-        m = len(inputs["population"])
+        m, found, n = len(inputs["population"]), len(result), inputs["n"]
         wrong = ancestors[(ancestors < 0) | (ancestors >= m)]
         assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
+        enough = found == n if self.make().exact_size else 1 <= found <= n
+        assert enough, f"asked to make {n} particles of {m} it returns {found}"
 
     def resample(self, component: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
         return self.checked_call(component, {"population": population, "n": n}, rng)
 
-    @prerequisite
-    def test_gives_n_particles(self) -> None:
-        """It returns n particles for any n, at most n if ``exact_size`` is False; their ancestors exist."""
-        component = self.make()
-        for m in (1, 2, 4, 7):
-            for n in (1, 2, m, 2 * m + 3, 50):
-                for seed in range(10):
-                    found = len(self.resample(component, self.population(np.linspace(1, 3, m)), n, seeded(seed)))
-                    enough = found == n if component.exact_size else 1 <= found <= n
-                    assert enough, f"asked to make {n} particles of {m} it returns {found}"
-
     def test_zero_weights_are_never_chosen(self) -> None:
         """A particle of weight zero is never selected, also by the uniform numbers 0 and 1 - 2^-53."""
-        component, endless = self.make(), ""
-        for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
-            for when, rng, n in _typical_and_extreme():
-                try:
-                    ancestors = self.resample(component, self.population(weights), n, rng).parents["ancestor"]
-                except SkipTest:
-                    endless = f"it does not end if {when}"
-                    continue
+        component = self.make()
+        for when, rng, n in _typical_and_extreme():
+            for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
+                ancestors = self.resample(component, self.population(weights), n, rng).parents["ancestor"]
                 wrong = ancestors[np.asarray(weights)[ancestors] == 0]
                 assert not len(wrong), (
                     f"if {when}, of weights {weights} it selects particle {wrong[0]}, weight 0: use "
                     'np.searchsorted with side="right", and end at a particle with weight'
                 )
-        if endless:
-            raise SkipTest(endless)
 
     def test_keeps_parents(self) -> None:
         """Selected particles are those of the ancestors and keep their parents."""
@@ -124,32 +102,12 @@ class ResamplerContract(ScaleContract):
                 "the particles of the result are not those of the ancestors"
             )
 
-    def test_depends_on_the_generator(self) -> None:
-        """Different generators give different results, if n W_i are not integers."""
-        component = skip_unless_properly_weighted(self.make())
-        population = self.population((0.41, 0.24, 0.2, 0.1, 0.05))
-        one = seeded(0)
-        for fault, generators in (
-            ("forty generators with different seeds give", [seeded(seed) for seed in range(40)]),
-            ("it does not advance `rng`: forty calls with one generator give", [one] * 40),
-        ):
-            chosen = [self.resample(component, population, 2, rng) for rng in generators]
-            different = len({tuple(c.parents["ancestor"].tolist()) for c in chosen}) > 1
-            assert different, f"{fault} the same result: it ignores `rng`"
-
-    # --- proper weighting ---
-
     @statistical
     def test_carried_weight(self) -> None:
         """A particle gets n W_i copies on average, or copies that carry W_i if their weights differ."""
         component = skip_unless_properly_weighted(self.make())
         for seed, case in enumerate(self.cases):
             sample = self._carried(component, case, seed)
-            exact = not (sample.equal_weights and sample.all_n) or abs(sample.total - 1) <= 1e-9
-            assert exact, (
-                f"{len(case.weights)} particles to {case.n}: the mean weight after selection is {sample.total:.4g} "
-                "of the one before, expected the same: divide sums of weights by the number of all particles"
-            )
             assert self._excess(sample) <= 0, fault_message(sample, int(np.argmax(sample.evidence())))
 
     def _carried(self, component: Resampler, case: Case, seed: int) -> Sample:
@@ -192,26 +150,19 @@ class WeightResamplerContract(ResamplerContract):
     @statistical
     def test_many_particles(self) -> None:
         """Small weights are not lost by rounding among 100 000 particles."""
-        component: WeightResampler = self.make()
-        few = self._light_copies(component, 100, 60)
-        try:
-            many = self._light_copies(component, 100_000, 5)
-        except AssertionError as error:
-            raise AssertionError(f"single precision, or too few bits for the indices? {error}") from error
+        component = skip_unless_properly_weighted(self.make())
+        few, many = self._light_copies(component, 100, 60), self._light_copies(component, 100_000, 5)
         # If all are draws of one law, the five are above, or below, all sixty with probability 1 / C(65, 5) = 1.2e-7.
-        wrong = component.properly_weighted and (many.max() < few.min() - 80 or many.min() > few.max() + 80)
-        assert not wrong, (
+        assert many.max() >= few.min() - 80 and many.min() <= few.max() + 80, (
             f"100 000 particles that share a thousandth of the weight get {many.mean():.0f} copies in total, and 100 "
             f"particles that share it get {few.mean():.0f}: cumulated in single precision?"
         )
 
     def _light_copies(self, component: WeightResampler, n_light: int, calls: int) -> np.ndarray:
         """Copies of all particles but the first, which has 1000 times their total weight, among 100 000 copies."""
-        n, rng = 100_000, seeded(n_light)
-        weights = np.full(n_light + 1, 1e-3 / n_light)
-        weights[0] = 1.0
+        n, rng, copies = 100_000, seeded(n_light), []
+        weights = np.append(1.0, np.full(n_light, 1e-3 / n_light))
         population = Population(np.arange(float(len(weights))), np.log(weights))
-        copies = []
         for _ in range(calls):
             chosen = self.resample(component, population, n, rng)
             share = np.exp(chosen.log_weights - population.log_mean_weight)

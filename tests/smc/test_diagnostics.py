@@ -1,4 +1,4 @@
-"""Single-run variances against their definition and against many runs."""
+"""Variances of single runs against their definition; energy distances against scipy and brute force."""
 
 from __future__ import annotations
 
@@ -6,56 +6,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mstfilter.errors import InputError
 from mstfilter.smc import (
-    Always,
     Branching,
     Dynamics,
     EssBelow,
     FearnheadClifford,
+    Gaussian,
     KeepWeights,
     Multinomial,
     Never,
-    StateSpaceModel,
+    Population,
     Systematic,
     bootstrap,
+    energy_distance,
     keep,
-    log_evidence,
-    mean,
     run_many,
     run_variance,
 )
-from tests.smc.models import AR1, ar1_observations, hmm
+from tests.smc.models import AR1, BOXES, ar1_observations, hmm
 from tests.smc.test_particle_filter import MODEL, observations
 
 YS = ar1_observations(9)
-
-
-VOLATILITY = StateSpaceModel(
-    lambda rng, n: rng.standard_normal(n),
-    lambda rng, x: 0.9 * x + 0.45 * rng.standard_normal(x.shape),
-    lambda x, y: -0.5 * (x + y * y * np.exp(-x)),
-    batched=True,
-)
-RETURNS = [0.3, -1.2, 2.5, 0.4, -0.1, 1.0, -3.0, 0.2, 0.5, -0.7]
-
-
-@pytest.mark.parametrize("arm", [(Multinomial(), Always()), (Systematic(), EssBelow(0.5))], ids=["multi", "default"])
-def test_the_variance_from_one_run_is_that_of_many_runs(arm):
-    """The mean of 40 runs (error 4 %, means 7 %) against the sample variance of 1,500 (error 4 %).
-
-    The bounds, 20 % and 30 %, are 3.5 standard deviations without a bias: false alarm 5e-4 a figure. The bound of the
-    default scheme is 30 %: its estimate is 16 % too high (150 runs against 2,500).
-    """
-    filter = bootstrap(VOLATILITY, 400, *arm)
-    runs = run_many(filter, RETURNS, range(1500), z=log_evidence, mean=mean)
-    variances = {name: runs[name][:, -1].var(ddof=1) for name in runs}
-    bound = 0.2 if isinstance(arm[1], Always) else 0.3
-    for lag in (None, 6):
-        found = [run_variance(filter, RETURNS, seed, lag) for seed in range(5000, 5040)]
-        assert np.mean([f.log_evidence_variance[-1] for f in found]) == pytest.approx(variances["z"], rel=bound)
-        assert np.mean([f.mean_variance[-1] for f in found]) == pytest.approx(variances["mean"], rel=0.3)
 
 
 def by_pairs(record, t, begin):
@@ -76,10 +50,7 @@ def by_pairs(record, t, begin):
     w, x = record.populations[t].weights, record.populations[t].particles
     different = line[:, None] != line
     centred = w * (x - w @ x)
-    return (
-        1 - f * (np.outer(w, w) * different).sum(),
-        -f * (np.outer(centred, centred) * different).sum(),
-    )
+    return (1 - f * (np.outer(w, w) * different).sum(), -f * (np.outer(centred, centred) * different).sum())
 
 
 @pytest.mark.parametrize("scheme", [Multinomial(), Systematic()], ids=["multinomial", "systematic"])
@@ -94,17 +65,6 @@ def test_sums_over_groups_are_sums_over_pairs(scheme, lag):
         v, mean = by_pairs(record, t, begin)
         assert found.log_evidence_variance[t] == pytest.approx(past + v, abs=1e-12)
         assert found.mean_variance[t] == pytest.approx(mean, abs=1e-12)
-
-
-def test_without_selections_it_is_the_variance_of_importance_sampling():
-    """(N sum W^2 - 1) / (N - 1): the sample variance of the weights over N mean^2."""
-    filter = bootstrap(AR1, 40, trigger=Never())
-    found, record = run_variance(filter, YS[:4], 1), keep(filter, YS[:4], 1)
-    for t, population in enumerate(record.populations):
-        w = np.exp(population.log_weights - population.log_weights.max())
-        assert found.log_evidence_variance[t] == pytest.approx(w.var(ddof=1) / 40 / w.mean() ** 2)
-        p, x = population.weights, population.particles
-        assert found.mean_variance[t] == pytest.approx(40 / 39 * (p**2 @ (x - p @ x) ** 2))
 
 
 @pytest.mark.parametrize(
@@ -158,3 +118,48 @@ def test_wrong_calls_are_named():
     ):
         with pytest.raises(InputError, match=message):
             call()
+
+
+# --- energy distances ----------------------------------------------------------------------------------------------
+RNG = np.random.default_rng(0)
+
+
+def populations(shape, n=(7, 5)):
+    return [Population(RNG.normal(size=(k, *shape)), RNG.normal(size=k)) for k in n]
+
+
+def by_definition(a, b):
+    """2 E d(X, Y) - E d(X, X') - E d(Y, Y') by its definition."""
+
+    def mean(p, q):
+        d = np.linalg.norm(p.particles.reshape(len(p), 1, -1) - q.particles.reshape(1, len(q), -1), axis=2)
+        return p.weights @ d @ q.weights
+
+    return 2 * mean(a, b) - mean(a, a) - mean(b, b)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2,), (2, 3)])
+def test_it_is_its_definition(shape):
+    a, b = populations(shape)
+    assert energy_distance(a, b) == pytest.approx(by_definition(a, b), abs=1e-12)
+    assert energy_distance(a, a) == pytest.approx(0.0, abs=1e-12)
+    if shape == ():
+        scipy = stats.energy_distance(a.particles, b.particles, a.weights, b.weights)
+        assert energy_distance(a, b) == pytest.approx(scipy**2)
+
+
+def test_mappings_objects_and_other_distances():
+    a, b = populations((2,))
+    split = [Population({"x": p.particles[:, 0], "y": p.particles[:, 1]}, p.log_weights) for p in (a, b)]
+    assert energy_distance(*split) == pytest.approx(by_definition(a, b))
+    kernel = Gaussian(0.7).matrix  # 1 - kernel gives the squared maximum mean discrepancy
+    k = kernel(np.concatenate([a.particles, b.particles]))
+    masses = np.concatenate([a.weights, -b.weights])
+    assert energy_distance(a, b, lambda p: 1 - kernel(p)) == pytest.approx(masses @ k @ masses)
+    first, second = Population(BOXES[:2], np.log([0.3, 0.7])), Population(BOXES[1:], np.log([0.6, 0.4]))
+    found = energy_distance(first, second, lambda p: np.array([[x != y for y in p] for x in p]))
+    assert found == pytest.approx(0.3**2 + 0.1**2 + 0.4**2)
+    with pytest.raises(InputError, match="Box objects"):
+        energy_distance(first, second)
+    with pytest.raises(InputError, match=r"distances have shape \(4,\), expected \(4, 4\)"):
+        energy_distance(first, second, lambda p: np.zeros(len(p)))
