@@ -211,7 +211,7 @@ class Completer(Checked, ABC):
             filled = self.estimate([rngs[k] for k in missing], [seen for _, _, seen, _ in boxes])
             found = []
             for k, (offset, now, seen, used), p in zip(missing, boxes, filled, strict=True):
-                one = finish(offset, seen, p, names[k].hex()[:16], now)
+                one = finish(offset, seen, p, names[k].hex()[:16])
                 if views is not None:
                     latest = (ObjectView(offset, *encode_box(now), one.key),) if now.surface.any() else ()
                     one = replace(one, views=(*used, *latest))
@@ -257,32 +257,13 @@ def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str |
     return None
 
 
-_LAYER = 0.8  # voxels: the layer at the visible surface ends this far behind the measured surface
-_LARGE_SURFACE, _KEPT = 100, 2 / 3  # voxels of this layer; share of them that a usual completion keeps
-
-
-def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str, now: ObservedBox) -> Completion:
-    """A completion with the visible surface and without free space.
-
-    If a large visible surface is mostly left out, the layer of voxels at this surface has at least probability .5:
-    plates and walls that are thinner than a voxel contain the centres of few voxels. A visible object keeps its
-    surface if nothing else is left.
-    """
+def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
+    """A completion after the removal of free space. A visible object keeps its surface if nothing else is left."""
     p = np.array(filled, dtype=np.float32)
-    p[_left_out(p >= 0.5, now)] = 0.5
     p[seen.free] = 0
     if p.size and not (p >= 0.5).any():
         p[seen.surface] = 1
     return Completion(read_only(offset), read_only(p), read_only(seen.points), key)
-
-
-def _left_out(occupied: np.ndarray, now: ObservedBox) -> np.ndarray:
-    """Voxels (a, b, c) bool of a large visible surface, if `occupied` leaves out more than a third of it."""
-    with np.errstate(invalid="ignore"):
-        layer = now.surface & (now.signed < _LAYER)
-    n = np.count_nonzero(layer)
-    keeps = n < _LARGE_SURFACE or np.count_nonzero(layer & occupied) >= _KEPT * n
-    return np.zeros_like(layer) if keeps else layer & ~occupied
 
 
 class ClipCompleter(Completer):

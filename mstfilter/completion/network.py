@@ -16,16 +16,22 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from mstfilter.completion.completer import Completer, Completion, finish
 from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
 from mstfilter.completion.extrude import Extrude
 from mstfilter.completion.observed import ObservedBox, observed_in
 from mstfilter.errors import missing_library
+from mstfilter.fields import Share
 from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
 if TYPE_CHECKING:
     from mstfilter.completion.unet import TrainedNetwork
+
+
+_LAYER = 0.8  # voxels behind the measured surface: the end of the layer that is kept
+_LARGE_SURFACE = 100  # voxels of this layer
 
 
 @dataclass(frozen=True)
@@ -36,11 +42,16 @@ class NetworkCompleter(Completer, UsesFiles):
     ----------
     weights : str
         Name of a trained model of the package, the folder of a model (`mstfilter.trained`), or an ONNX file.
+    least_surface : float
+        If the network leaves out a large visible surface but for less than this share, the surface is kept with
+        probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
+        network removes much of their surface. With 0, the probabilities are those of the network.
     architecture : Architecture, optional
         The architecture of the model in the folder. By default the architecture is the architecture of this package.
     """
 
     weights: str = "completion"
+    least_surface: Share = 2 / 3
     architecture: Architecture | None = None
 
     @property
@@ -96,7 +107,7 @@ class NetworkCompleter(Completer, UsesFiles):
             index = np.indices(p.shape).reshape(3, -1).T + low
             at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
             p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
-        return replace(finish(low, seen, p, one.key, seen), views=one.views)
+        return replace(finish(low, seen, p, one.key), views=one.views)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return self.fill_many([rng], [seen])[0]
@@ -116,8 +127,17 @@ class NetworkCompleter(Completer, UsesFiles):
                 p = self.network.probabilities([seen[k] for k in chosen], edge)
                 for k, one in zip(chosen, p, strict=True):
                     a, b, c = seen[k].surface.shape
-                    results[k] = one[:a, :b, :c]
+                    results[k] = self._with_surface(one[:a, :b, :c], seen[k])
         return results
+
+    def _with_surface(self, p: np.ndarray, seen: ObservedBox) -> np.ndarray:
+        """Probabilities (a, b, c), of at least .5 at the surface of the latest frame if most of it is left out."""
+        with np.errstate(invalid="ignore"):
+            layer = seen.surface & (seen.signed < _LAYER) & binary_dilation(seen.points > 0, np.ones((3, 3, 3)))
+        n = np.count_nonzero(layer)
+        if n < _LARGE_SURFACE or np.count_nonzero(p[layer] >= 0.5) >= self.least_surface * n:
+            return p
+        return np.where(layer, np.maximum(p, np.float32(0.5)), p)
 
 
 def _lattice(grid: VoxelGrid) -> VoxelGrid:

@@ -147,30 +147,31 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
     The test uses the pixels that would show an object, without the outline, where a voxel can cover more than the
     object. A pixel with a reading in front of the surface is not used, since another object may stand there. At the
     others, the surface is at its place if the pixel belongs to an object (`foreground`) and its reading is at most a
-    voxel and three standard deviations of the sensor behind the surface. A pixel without a reading that belongs to no
-    object counts half.
+    voxel and three standard deviations of the sensor behind the surface. Pixels without a reading are not used.
 
     Returns
     -------
     of_objects : (k,) ndarray
-        Share of each label. NaN for label 0 and for objects with too few of these pixels.
+        Share of each label. NaN for label 0, and for objects with few of these pixels or with more pixels without a
+        reading.
     of_scene : float
         Share of all objects together. 1 if no pixel can be used.
     """
-    rendered, found = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid)
+    rendered, shown = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid).pixels
     would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])
     if frame.robot_mask is not None:
         would_show &= ~frame.robot_mask
     labels, depth = rendered.labels[would_show], rendered.depth[would_show]
     tolerance = hypothesis.grid.voxel_size + 3 * depth_sigma(depth)
     with np.errstate(invalid="ignore"):
-        behind = found.frame.depth[would_show] - depth
-        at_its_place = found.pixels[would_show] & (behind <= tolerance)
-        used = ~(behind < -tolerance)
-    agrees = np.where(np.isnan(behind), 0.5, at_its_place)[used]
+        behind = np.where(frame.valid, frame.depth, np.nan)[would_show] - depth
+        at_its_place = shown[would_show] & (behind <= tolerance)
+        used = behind >= -tolerance
+    agrees = at_its_place[used]
     n = int(hypothesis.labels.max(initial=0)) + 1
     total, pixels = np.bincount(labels[used], agrees, n), np.bincount(labels[used], minlength=n)
-    enough = pixels >= max(1.0, scaled_area(_LEAST_PIXELS, frame.depth.size))
+    enough = pixels >= max(scaled_area(_LEAST_PIXELS, frame.depth.size), 1)
+    enough &= pixels > np.bincount(labels[np.isnan(behind)], minlength=n)
     of_objects = np.divide(total, pixels, out=np.full(n, np.nan), where=enough)
     return of_objects, float(agrees.mean()) if len(agrees) else 1.0
 

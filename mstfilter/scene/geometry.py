@@ -197,9 +197,9 @@ _LEAST_SIDE, _LARGEST_SIDE = 1.0, 2.0  # metres
 def workspace(frame: Frame) -> VoxelGrid:
     """A grid in voxels of 1 cm around the visible part of the table, which is at z = 0.
 
-    The grid is .5 m high, and each side is 1 to 2 m long. Where the table is shorter or longer, the grid is centred on
-    the readings more than 1 cm above the table, as far as it covers as much of the table as possible. Readings beside
-    the visible table, for example on a wall behind it, are ignored.
+    The grid is .5 m high, and each side is 1 to 2 m long. The grid covers as much of the table as possible. Along a
+    side where the table is shorter or longer than the grid, the grid is centred on the readings more than 1 cm above
+    the table. Readings beside the visible table, for example on a wall behind it, are ignored.
     """
     voxel_size, height = 0.01, 50
     points = frame.points[frame.valid]

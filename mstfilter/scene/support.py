@@ -176,9 +176,9 @@ def _shadows(frame: Frame) -> np.ndarray:
 def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
     """The missing pixels (H, W) bool that belong to objects by their colour or by their outline.
 
-    The colour of the table is that of the table around a pixel. Where there is none, it is that of the whole table, and
-    the pixels belong to an object if its readings (H, W) bool `measured` enclose them. A solid gap in the table that
-    is no glare belongs to an object of any colour, for example to a glass.
+    The colour of the table is that of the table around a pixel. Far from the table, it is the colour of the whole
+    table, and a pixel belongs to an object if readings of objects (H, W) bool `measured` enclose its region. A solid
+    gap in the table that is no glare belongs to an object of any colour, for example to a glass.
     """
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
@@ -290,9 +290,9 @@ def _ellipse(radius: float) -> np.ndarray:
 def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
     """Depth (H, W) with estimates at pixels of objects without a reading; None if all of them have one.
 
-    The inverse of depth is interpolated between the readings of the object: it is a harmonic function, so that it is
-    exact on a plane. No estimate is behind the table. An object with fewer than ten readings gets one depth: that of
-    the nearest part of the table that its pixels hide.
+    The inverse of depth is interpolated between the readings of the object by a harmonic function. This is exact on
+    planes. No estimate is behind the table. An object with fewer than ten readings gets one depth: the depth of the
+    nearest part of the table that its pixels hide.
     """
     if not (pixels & ~frame.valid).any():
         return None

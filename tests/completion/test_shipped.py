@@ -18,12 +18,12 @@ SEED = 99  # of no training
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory) -> CompletionSamples:
-    files = CompletionSamples.write(tmp_path_factory.mktemp("samples"), SEED, 3, kinds=TRAINED + HELD_OUT)
+    files = CompletionSamples.write(tmp_path_factory.mktemp("samples"), SEED, 4, kinds=TRAINED + HELD_OUT)
     return CompletionSamples.read(files)
 
 
 def test_better_than_extrusion_on_new_scenes(samples):
-    """About 40 masks of each of three scenes. On the 50 test scenes of the card the difference is of similar size."""
+    """About 40 masks of each of four scenes. On the 50 test scenes of the card the difference is of similar size."""
     boxes = [samples.box(k) for k in range(len(samples))]
     p = np.stack(NetworkCompleter().fill_many([np.random.default_rng(0)] * len(boxes), boxes))
     p[Seen.FREE.among(samples.bits)] = 0

@@ -11,7 +11,7 @@ from scipy.special import expit
 from mstfilter.completion import Completion, Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.partition import PairEvidence, PartitionUpdate, Readings
-from mstfilter.scene import Clip, Hypothesis, Occupancy
+from mstfilter.scene import Clip, Hypothesis, Occupancy, surface_agreement
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
 from tests.completion.test_completion import masks_of
@@ -92,10 +92,11 @@ def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often()
     blind = frame_of(TWO, noise=0)
     depth = np.where(masks_of(TWO, blind)[1], np.nan, blind.depth)
     hidden = Clip([type(blind)(blind.rgb, depth, blind.camera)], GRID, 1)
-    left, quality = update.free_space.project(past, hidden.after)
+    left, _ = update.free_space.project(past, hidden.after)
+    of_objects, of_scene = surface_agreement(past, hidden.after)
     own = (left.labels == 2).sum() / (labels == 2).sum()
-    expected = (quality * own) ** update.quality_exponent
-    assert 0.3 < expected < 0.6 and quality * own > expected + 0.2 and own > 0.9
+    expected = (of_scene * own) ** update.quality_exponent
+    assert of_objects[1] > 0.9 and np.isnan(of_objects[2]) and of_objects[3] < 0.1 and own > 0.9 and expected > 0.02
     found = step(update, hidden, sample_of(hidden, masks_of(TWO, blind)[:1]), past).particles
     share = np.mean([past.record(2).id in {record.id for record in one.objects} for one in found])
     assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000

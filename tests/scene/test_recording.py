@@ -238,8 +238,10 @@ def test_no_plane_raises_an_error():
 def test_workspace_of_an_empty_table():
     rgb, depth, _ = table_scene(empty=True)
 
-    grid = workspace(Frame(rgb, depth, CAMERA))
-    assert grid.shape == (100, 100, 50)
+    frame = Frame(rgb, depth, CAMERA)
+    grid = workspace(frame)
+    assert all(100 <= n <= 200 for n in grid.shape[:2]) and grid.shape[2] == 50
+    assert grid.contains(grid.index_of(frame.points + [0, 0, 0.02]))[frame.valid].mean() > 0.95
     far = Camera(CAMERA.K, CAMERA.width, CAMERA.height, look_at((0, 0, 5), (0, 0.1, 9)))
     with pytest.raises(InputError, match="no workspace"):
         workspace(Frame(rgb, depth, far))

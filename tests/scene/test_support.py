@@ -56,12 +56,28 @@ def test_an_object_without_readings_is_found_by_its_colour(part):
     assert np.array_equal(found.frame.depth[~holes], frame.depth[~holes])
 
 
-def test_a_hole_in_the_table_is_no_object():
+def test_a_hole_in_the_table_is_an_object_by_its_colour_or_its_size():
     frame = frame_of(TWO, width=640, noise=0.3)
-    holes = np.zeros(SEEN.shape, bool)
-    holes[320:350, 290:330] = True  # on the table, before the objects
-    assert not SEEN[holes].any() and not foreground(without(frame, holes), GRID).pixels[holes].any()
-    assert foreground(without(frame, holes, (20, 20, 20)), GRID).pixels[holes].mean() > 0.9
+    small, large = np.zeros(SEEN.shape, bool), np.zeros(SEEN.shape, bool)
+    small[320:332, 290:330], large[320:350, 290:330] = True, True  # on the table, before the objects
+    assert not SEEN[large].any() and not foreground(without(frame, small), GRID).pixels[small].any()
+    assert foreground(without(frame, small, (20, 20, 20)), GRID).pixels[small].mean() > 0.9
+    assert foreground(without(frame, large), GRID).pixels[large].mean() > 0.9
+
+
+def test_readings_around_a_gap_give_its_depth():
+    """A dark gap in the side of a box is filled by the plane of the side."""
+    frame = frame_of(TWO, width=640, noise=0)
+    side = SEEN == 1
+    rows, columns = np.nonzero(side)
+    gap = np.zeros(SEEN.shape, bool)
+    gap[
+        int(np.percentile(rows, 60)) : int(np.percentile(rows, 75)), int(columns.mean()) - 6 : int(columns.mean()) + 6
+    ] = True
+    gap &= side
+    found = foreground(without(frame, gap, (20, 20, 20)), GRID)
+    assert gap.sum() > 50 and found.pixels[gap].all()
+    np.testing.assert_allclose(found.frame.depth[gap], frame.depth[gap], atol=0.004)
 
 
 def test_pixels_outside_the_workspace_are_no_objects():
