@@ -67,7 +67,7 @@ def _report(error: Exception, given: list[str]) -> int:
 def _execute(given: list[str]) -> None:
     """Execute a command. `list` and help also work without typer."""
     try:
-        from mstfilter.cli import running, studying, training, components  # noqa: F401, I001 (in the order of the help)
+        from mstfilter.cli import running, studying, components  # noqa: F401, I001 (in the order of the help)
         from mstfilter.cli.root import app
     except ModuleNotFoundError as error:
         command = [word for word in given if not word.startswith("-")]
