@@ -44,6 +44,7 @@ _ENCLOSED, _FEW_AROUND = 0.55, 0.1  # share of the readings around a region that
 _SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare, standard deviations above the table
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
+_NARROW = 6.0  # pixels between a reading and an estimate that is this reading
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
 _STANDS = 0.004  # metres: estimated readings are at least this much nearer than the table
 
@@ -290,9 +291,10 @@ def _ellipse(radius: float) -> np.ndarray:
 def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
     """Depth (H, W) with estimates at pixels of objects without a reading; None if all of them have one.
 
-    The inverse of depth is interpolated between the readings of the object by a harmonic function. This is exact on
-    planes. No estimate is behind the table. An object with fewer than ten readings gets one depth: the depth of the
-    nearest part of the table that its pixels hide.
+    An estimate beside a reading is that reading, since two objects can meet at a narrow gap. In wide gaps, the
+    inverse of depth is interpolated by a harmonic function, which is exact on planes. No estimate is behind the
+    table. An object with fewer than ten readings gets one depth: the depth of the nearest part of the table that its
+    pixels hide.
     """
     if not (pixels & ~frame.valid).any():
         return None
@@ -307,9 +309,26 @@ def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
         inside = regions[box] == k
         known, missing = inside & frame.valid[box], inside & ~frame.valid[box]
         if missing.any():
-            found = _interpolated(depth[box], known, missing) if known.sum() >= _FEW else table[box][inside].min()
+            found = (
+                _estimated(depth[box], known, missing, frame.camera.width)
+                if known.sum() >= _FEW
+                else table[box][inside].min()
+            )
             depth[box][missing] = np.minimum(found, table[box][missing] - _STANDS)
     return depth
+
+
+def _estimated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray, width: int) -> np.ndarray:
+    """Depth (n,) at the missing pixels of one connected region; `known` and `missing` are (H, W) bool.
+
+    `width` is the width of the whole image.
+    """
+    distance, (rows, columns) = ndimage.distance_transform_edt(~known, return_indices=True)
+    filled = np.array(depth[rows, columns])
+    wide = missing & (distance > scaled_length(_NARROW, width))
+    if wide.any():
+        filled[wide] = _interpolated(filled, (known | missing) & ~wide, wide)
+    return filled[missing]
 
 
 def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> np.ndarray:
