@@ -101,7 +101,7 @@ def train(
     use = {
         "completion": f"use it with update.completer=network update.completer.weights={folder}",
         "border": f"next: python experiments/segmentation_fit/run.py --border {folder}, then use it with "
-        f"proposal.tree=border proposal.tree.weights={folder}",
+        f"proposal.tree.weights={folder}",
     }
     print(f"model       {folder}; {use[part]}")
     for name, value in (figures or {}).items():
