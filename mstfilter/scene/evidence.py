@@ -145,9 +145,10 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
     """Share of the visible surface of each object that a frame shows at its place, and that of all objects together.
 
     The test uses the pixels that would show an object, without the outline, where a voxel can cover more than the
-    object. A pixel with a reading in front of the surface is not used, since another object may stand there. At the
-    others, the surface is at its place if the pixel belongs to an object (`foreground`) and its reading is at most a
-    voxel and three standard deviations of the sensor behind the surface. Pixels without a reading are not used.
+    object. A pixel with a reading in front of the surface is not used, since another object may stand there. Pixels
+    without a reading are not used. At each other pixel, the surface is at its place if the pixel belongs to an object
+    (`foreground`), and if its reading is not far behind the surface. The tolerance is a voxel and three standard
+    deviations of the sensor.
 
     Returns
     -------

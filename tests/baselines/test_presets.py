@@ -24,9 +24,9 @@ def differences(a, b, where=""):
 
 
 #: Where a preset on `base` differs from `mst`, beside the update and the completer of the proposal: `mst` completes
-#: in its update, the others complete samples by the same network (`mst_rules` by extrusion).
+#: in its update, the others complete samples by the same network (`mst_rules`, without networks, by extrusion).
 DIFFERENCES = {
-    "mst_rules": [],
+    "mst_rules": ["proposal.tree"],
     "union": [],
     "samples_only": ["transition"],
     "single_frame": ["proposal.sampler", "transition"],

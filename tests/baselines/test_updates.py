@@ -52,6 +52,7 @@ def test_another_seed_breaks_the_tie(recording):
 def test_samples_are_those_that_the_filter_draws_at_the_same_pause(recording):
     """The proposal's stream is the same in both arms at every pause."""
     seen, overrides = {}, ["proposal.sampler.temperature=8", "proposal.completer=network", "n_proposed=4"]
+    overrides += ["proposal.tree=learned"]
     for name in ("mst_rules", "samples_only"):
         filter = build_filter(load_config(name, overrides))
         recorder = ProposalRecorder(filter.proposal)
