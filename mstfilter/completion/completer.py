@@ -189,8 +189,8 @@ class Completer(Checked, ABC):
     ) -> list[Completion]:
         """`complete` with a given stream for each mask, and with earlier views of each object.
 
-        The result of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views are
-        those of the object, moved to its current pose. `Completion.views` has the views that were used. A completer
+        The result of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views
+        show the object, moved to its current pose. `Completion.views` has the views that were used. A completer
         that does not use views returns completions without views.
         """
         masks = [np.asarray(mask, dtype=bool) for mask in masks]

@@ -45,7 +45,7 @@ class NetworkCompleter(Completer, UsesFiles):
     least_surface : float
         If the network leaves out a large visible surface but for less than this share, the surface is kept with
         probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
-        network removes much of their surface. With 0, the probabilities are those of the network.
+        network removes much of their surface. With 0, the network's probabilities are used.
     architecture : Architecture, optional
         The architecture of the model in the folder. By default the architecture is the architecture of this package.
     """

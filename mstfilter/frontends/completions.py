@@ -2,7 +2,7 @@
 
 >>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
-In the layout, numbers are those of the pauses (`Clip.index`), from 0::
+In the layout, the numbers count the pauses (`Clip.index`), from 0::
 
     shapes/000001/cup/mask.png         the mask of the object in the image of the pause, not 0
 

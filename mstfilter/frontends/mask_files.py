@@ -5,7 +5,7 @@
 >>> len(masks.trees), masks.weights
 (2, array([0.7, 0.3]))
 
-In the layout, numbers are those of the pauses (`Clip.index`), from 0::
+In the layout, the numbers count the pauses (`Clip.index`), from 0::
 
     masks/000000.png              one segmentation of the image at pause 0
     masks/000001/a.png, b.npz     several alternatives of the whole image
@@ -58,7 +58,7 @@ class PauseMasks:
 
 
 def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
-    """Read the masks of a pause. `shape` is that of the image, (H, W).
+    """Read the masks of a pause. `shape` is the shape of the image, (H, W).
 
     Files are read at each call, but their content is parsed once. Raises InputError if the folder has no masks for
     the pause, or a file cannot be used.

@@ -132,8 +132,8 @@ class PartitionUpdate(Update):
     mend : bool
         Whether missing readings of objects are estimated, as in `ObjectRule`.
     least_agreement : float
-        Least share of the visible surface of a predicted object that the frame shows at its place. With 0, no object
-        is refuted.
+        Least share of the visible surface of a predicted object that the frame shows at its place. With 0, the update
+        refutes no object.
     """
 
     completer: Completer = field(default_factory=Extrude)

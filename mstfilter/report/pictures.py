@@ -6,8 +6,8 @@
 >>> colour(0), colour(1)                                                            # of identities
 ((51, 111, 185), (238, 145, 56))
 
-The first six colours of the palette were chosen by hand. Each further colour is the one that is farthest from all
-earlier colours. The distance is the smallest Oklab distance in three kinds of vision: normal, protanopia and
+The first six colours of the palette were chosen by hand. Each further colour is the farthest from all earlier
+colours. The distance is the smallest Oklab distance in three kinds of vision: normal, protanopia and
 deuteranopia (Machado, Oliveira, Fernandes 2009, severity 1).
 
 Voxels are rendered by ray casting. The brightness of a face depends on its normal. Lines are drawn where objects or

@@ -8,8 +8,8 @@
 >>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
 >>> rows = score_pauses(run.estimates(), read_truth(recording))
 
-The same call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. The result of a
-resumed run is that of an uninterrupted run. Modules: The module `run` has the loop, and `run_folder` the files.
+The same call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
+an uninterrupted run have the same result. Modules: The module `run` has the loop, and `run_folder` the files.
 """
 
 from mstfilter.lazy import attach

@@ -3,7 +3,7 @@
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
 All input is checked before the folder is made. An interrupted run is resumed by the same call with the same
-configuration, seed and recording. The result equals that of an uninterrupted run.
+configuration, seed and recording. An uninterrupted run has the same result.
 """
 
 from __future__ import annotations

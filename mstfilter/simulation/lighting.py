@@ -23,7 +23,7 @@ _FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
 
 
 class Stage:
-    """The poses that are rendered: those of the physics without tremor.
+    """The rendered poses: the poses of the physics without tremor.
 
     Soft contacts make bodies at rest move by micrometres between frames. A rendered pose is kept until a point of
     the body is farther than `tolerance` metres from it. Images, poses and volumes all use the rendered poses, so they

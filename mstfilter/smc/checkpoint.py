@@ -7,8 +7,8 @@
 
 The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
 renamed, so that a process that is killed leaves the state of a complete step. All draws depend on the seed and the
-step only, so a continued run equals an uninterrupted one. The file does not know the filter and the observations: the
-caller gives the same ones.
+step only, so a continued run equals an uninterrupted one. The file stores neither filter nor observations: the caller
+passes the same again.
 
 `ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another kind need a `Codec`; stored
 data never import code.

@@ -11,7 +11,7 @@ Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The ent
 their log densities are summed. `log_prob` is always (n,), or a number if no argument has rows.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
-of these (`as_distribution`); they take three to six times as long. The classes here are the most used ones. For a
+of these (`as_distribution`); they take three to six times as long. This module has the classes used most often. For a
 distribution of another library, write a `Distribution` whose `sample` draws by the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and

@@ -131,7 +131,7 @@ def backward_paths(
         parents. The chain need not converge. Given x_{t+1}, a parent already has the distribution of "exact" after
         independent selections of a bootstrap filter, and up to order 1 / N after other selections. So a small number
         of steps causes no additional bias (Dau and Chopin 2023). Steps reduce the variance. Without accepted steps,
-        the paths are those of `genealogy`.
+        the paths equal the paths of `genealogy`.
     steps : int
         Metropolis steps of "mcmc".
     """

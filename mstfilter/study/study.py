@@ -3,8 +3,8 @@
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
 
-The same call resumes an interrupted study and repeats failed runs. Runs with unchanged identity are not repeated. The
-tables equal those of an uninterrupted study.
+The same call resumes an interrupted study and repeats failed runs. Runs with unchanged identity are not repeated. An
+uninterrupted study has the same tables.
 """
 
 from __future__ import annotations

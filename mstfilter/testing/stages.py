@@ -158,7 +158,7 @@ class CompleterContract(StageContract):
         assert fault is None, f"{type(self.make()).__name__}.fill {fault}"
 
     def test_axes_are_those_of_the_grid(self) -> None:
-        """The axes of its result are those of the box: reversed, it fits the visible surface less well."""
+        """Its result has the axes of the box: a reversed result fits the visible surface less well."""
         seen, clip = self._seen(cut=True)
         filled = self._filled(seen, clip)
         choices = [axes for n in range(4) for axes in combinations(range(3), n)]
