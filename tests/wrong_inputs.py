@@ -44,7 +44,7 @@ def warped(images, T, fill=0.0):
 def shifted_camera():
     """From the second pause on, the image is that of a camera which is rolled and displaced."""
     arrays, _ = right()
-    T = [[1, -0.05, 14], [0.05, 1, -9]]
+    T = [[1, -0.05, 20], [0.05, 1, -14]]
     rgb, depth = warped(arrays["rgb"][1:], T), warped(arrays["depth"][1:], T, np.nan)
     return changed(rgb=np.r_[arrays["rgb"][:1], rgb], depth=np.r_[arrays["depth"][:1], depth])
 

@@ -1,6 +1,6 @@
 """The figure of the page on real images: quality of each method on each sequence, from results/sequences.csv.
 
-    python experiments/real/figure.py [--out docs/images/real.png]
+python experiments/real/figure.py [--out docs/images/real.png]
 """
 
 from __future__ import annotations

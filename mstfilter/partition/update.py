@@ -132,8 +132,8 @@ class PartitionUpdate(Update):
     mend : bool
         Whether missing readings of objects are estimated, as in `ObjectRule`.
     least_agreement : float
-        Least share of the visible surface of a predicted object that the frame shows at its place. With 0, the update
-        refutes no object.
+        Least share of the visible surface of a predicted object that the frame shows at its place. With 0, surfaces
+        are not tested: no object is refuted, and Q replaces A.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -195,13 +195,22 @@ class PartitionUpdate(Update):
         self, predicted: Population, projected: Population, readings: Readings, frame: Frame
     ) -> list[Prediction]:
         """The evidence about each prediction in the last frame."""
-        columns = predicted.particles, projected.particles, predicted.weights.tolist()
+        quality = projected.notes["quality"]
+        columns = predicted.particles, projected.particles, predicted.weights.tolist(), quality
         return [self._prediction(*one, readings, frame) for one in zip(*columns, strict=True)]
 
     def _prediction(
-        self, hypothesis: Hypothesis, refined: Hypothesis, weight: float, readings: Readings, frame: Frame
+        self,
+        hypothesis: Hypothesis,
+        refined: Hypothesis,
+        weight: float,
+        quality: float,
+        readings: Readings,
+        frame: Frame,
     ) -> Prediction:
-        of_objects, of_scene = surface_agreement(hypothesis, frame)
+        of_objects, of_scene = (
+            surface_agreement(hypothesis, frame) if self.least_agreement else (np.zeros(0), max(quality, 1e-3))
+        )
         refuted = np.flatnonzero(of_objects < self.least_agreement)  # NaN, unknown, is not refuted
         objects = readings.labels(hypothesis.labels, self.reach)
         objects[np.isin(objects, refuted)] = 0
