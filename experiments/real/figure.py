@@ -32,7 +32,9 @@ def main(out: Path) -> None:
     figure, axes = plt.subplots(figsize=(6.4, 0.32 * len(names) + 1.2), layout="constrained")
     for method, (label, marker, colour) in METHODS.items():
         found = {row["sequence"]: float(row["quality"]) for row in rows if row["method"] == method}
-        axes.scatter([found.get(name, np.nan) for name in names], range(len(names)), 36, colour, marker, label=label)
+        axes.scatter(
+            [found.get(name, np.nan) for name in names], range(len(names)), s=36, c=colour, marker=marker, label=label
+        )
     sizes = {row["sequence"]: row["pauses"] for row in rows}
     sources = {row["sequence"]: row["source"].upper() for row in rows}
     axes.set_yticks(range(len(names)), [f"{sources[n]} {n.removeprefix('learn')} ({sizes[n]})" for n in names])
