@@ -86,8 +86,8 @@ class MergeLogOdds(CutValue):
 
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. So exp(v(c)) is proportional to the probability
     that exactly the merges above the cut join different objects. The values are log probabilities, so cuts are
-    sampled at a temperature, without a scale sigma. Uses the odds of the tree if it has them (`LearnedTree`). Without
-    odds, `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
+    sampled at a temperature, without a scale sigma. If the tree has odds (`LearnedTree`), its odds are used.
+    Without odds, `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:

@@ -91,7 +91,7 @@ class ParticleFilter(AtStep):
         Number of particles that `proposal` draws at each step. 0 means `n`.
     resample : {"after", "before"}
         With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
-        before the next prediction, as in textbooks. The weights after a step then come from its observation.
+        before the next prediction, as in textbooks. The weights after a step are then those of its observation.
     """
 
     initial: Proposal | None = None
