@@ -1,6 +1,8 @@
 """The figure of the page on real images: quality of each method on each sequence, from results/sequences.csv.
 
-python experiments/real/figure.py [--out docs/images/real.png]
+    python experiments/real/figure.py [--out docs/images/real.png]
+
+Needs no images. Methods and colours are in `METHODS`.
 """
 
 from __future__ import annotations

@@ -195,8 +195,8 @@ class PartitionUpdate(Update):
         self, predicted: Population, projected: Population, readings: Readings, frame: Frame
     ) -> list[Prediction]:
         """The evidence about each prediction in the last frame."""
-        quality = projected.notes["quality"]
-        columns = predicted.particles, projected.particles, predicted.weights.tolist(), quality
+        quality = np.exp(log_quality(np.array(projected.notes["quality"])))
+        columns = predicted.particles, projected.particles, predicted.weights.tolist(), quality.tolist()
         return [self._prediction(*one, readings, frame) for one in zip(*columns, strict=True)]
 
     def _prediction(
@@ -208,9 +208,9 @@ class PartitionUpdate(Update):
         readings: Readings,
         frame: Frame,
     ) -> Prediction:
-        of_objects, of_scene = (
-            surface_agreement(hypothesis, frame) if self.least_agreement else (np.zeros(0), max(quality, 1e-3))
-        )
+        of_objects, of_scene = np.zeros(0), quality
+        if self.least_agreement:
+            of_objects, of_scene = surface_agreement(hypothesis, frame)
         refuted = np.flatnonzero(of_objects < self.least_agreement)  # NaN, unknown, is not refuted
         objects = readings.labels(hypothesis.labels, self.reach)
         objects[np.isin(objects, refuted)] = 0

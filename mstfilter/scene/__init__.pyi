@@ -75,6 +75,7 @@ from mstfilter.scene.support import (
     fill_from_nearest as fill_from_nearest,
     filled_above_table as filled_above_table,
     foreground as foreground,
+    pixel_graph as pixel_graph,
     pixels_above_table as pixels_above_table,
     posed_camera as posed_camera,
     readings_above_table as readings_above_table,

@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_array, diags_array
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import spsolve
 
 from mstfilter.scene.arrays import read_only
@@ -196,11 +197,11 @@ def _compared_with_table(lab: np.ndarray, table: np.ndarray) -> tuple[np.ndarray
 
     The difference is that of brightness in standard deviations, and the squared Mahalanobis distance, both (H, W).
     """
-    share = _surroundings(table.astype(np.float32), table.shape[1])
+    share = _surroundings(table.astype(np.float32))
     near = share > _TABLE_NEAR
     n = np.maximum(share, 1e-6)[..., None]
-    mean = _surroundings(lab * table[..., None], table.shape[1]) / n
-    variance = np.maximum(_surroundings(lab**2 * table[..., None], table.shape[1]) / n - mean**2, 0) + _COLOUR_NOISE
+    mean = _surroundings(lab * table[..., None]) / n
+    variance = np.maximum(_surroundings(lab**2 * table[..., None]) / n - mean**2, 0) + _COLOUR_NOISE
     if table.any():
         mean[~near], variance[~near] = lab[table].mean(axis=0), lab[table].var(axis=0) + _COLOUR_NOISE
     deviation = (lab - mean) / np.sqrt(variance)
@@ -232,12 +233,12 @@ def _measured_part(frame: Frame) -> np.ndarray:
     return part
 
 
-def _surroundings(image: np.ndarray, width: int) -> np.ndarray:
+def _surroundings(image: np.ndarray) -> np.ndarray:
     """Mean of an image (H, W, ...) around each pixel; computed at a quarter of the resolution."""
     size = image.shape[1], image.shape[0]
     small = cv2.resize(image, (max(1, size[0] // 4), max(1, size[1] // 4)), interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(
-        small, (0, 0), max(1.0, scaled_length(_COLOUR_REACH, width) / 4), borderType=cv2.BORDER_CONSTANT
+        small, (0, 0), max(1.0, scaled_length(_COLOUR_REACH, size[0]) / 4), borderType=cv2.BORDER_CONSTANT
     )
     return cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
 
@@ -336,24 +337,20 @@ def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> 
 
     `known` and `missing` (H, W) bool are the pixels of one connected region. Its outline has no other condition.
     """
-    number = np.full(depth.shape, -1)
-    number[missing] = np.arange(np.count_nonzero(missing))
-    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float64)
-    used = known | missing
-    pairs = [(np.argwhere(missing & _moved(used, step)), step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0))]
-    here = np.concatenate([at for at, _ in pairs])
-    there = np.concatenate([at + step for at, step in pairs])
-    own, other = number[tuple(here.T)], number[tuple(there.T)]
-    n = int(number.max()) + 1
-    inner = other >= 0
-    neighbours = coo_array((np.ones(inner.sum()), (own[inner], other[inner])), shape=(n, n))
-    given = np.bincount(own, weights=inverse[tuple(there.T)], minlength=n)
-    laplacian = (diags_array(np.bincount(own, minlength=n).astype(float)) - neighbours).tocsc()
-    return np.asarray(1 / spsolve(laplacian, given))
+    used, asked = known | missing, missing.ravel()
+    graph = pixel_graph(used[:, :-1] & used[:, 1:], used[:-1] & used[1:])
+    equations = laplacian(graph + graph.T).tocsr()[asked]
+    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float64).ravel()
+    return np.asarray(1 / spsolve(equations[:, asked].tocsc(), -(equations @ inverse)))
 
 
-def _moved(pixels: np.ndarray, step: tuple[int, int]) -> np.ndarray:
-    """Whether the neighbour of each pixel at a step (rows, columns) is one of the pixels (H, W) bool."""
-    rows, columns = step
-    padded = np.pad(pixels, 1)
-    return np.asarray(padded[1 + rows : 1 + rows + len(pixels), 1 + columns : 1 + columns + pixels.shape[1]])
+def pixel_graph(right: np.ndarray, down: np.ndarray) -> coo_array:
+    """The graph (H W, H W) of the pixels of an image, with one entry for each pair of neighbours that are joined.
+
+    `right` (H, W - 1) and `down` (H - 1, W) bool say whether a pixel is joined to its right or its lower neighbour.
+    """
+    shape = len(right), down.shape[1]
+    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
+    first = np.concatenate([pixel[:, :-1][right], pixel[:-1][down]])
+    second = np.concatenate([pixel[:, 1:][right], pixel[1:][down]])
+    return coo_array((np.ones(len(first)), (first, second)), shape=(pixel.size, pixel.size))

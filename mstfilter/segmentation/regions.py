@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mstfilter.scene import Frame, above_table, posed_camera, scaled_area, scaled_length
+from mstfilter.scene import Frame, above_table, pixel_graph, posed_camera, scaled_area, scaled_length
 from mstfilter.segmentation.boundary import curvature, filled_disparity
 
 #: Bin width of the height histogram in metres; the last bin has no upper limit.
@@ -109,14 +108,10 @@ def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def connected_pixels(right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Number (H, W) of the connected part of each pixel of an image.
 
-    `right` (H, W - 1) and `down` (H - 1, W) bool say whether a pixel is joined to its right or its lower neighbour.
+    `right` and `down` are as in `pixel_graph`.
     """
-    shape = len(right), down.shape[1]
-    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
-    first = np.concatenate([pixel[:, :-1][right], pixel[:-1][down]])
-    second = np.concatenate([pixel[:, 1:][right], pixel[1:][down]])
-    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(pixel.size, pixel.size))
-    return np.asarray(connected_components(graph, directed=False)[1].reshape(shape))
+    parts = connected_components(pixel_graph(right, down), directed=False)[1]
+    return np.asarray(parts.reshape(len(right), down.shape[1]))
 
 
 def measure_regions(
