@@ -54,7 +54,7 @@ class Recorder(PairOdds):
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
         terms = PairEvidence().terms(cells, weights)
-        counts = cells.counts(self.instance)[:, 1:]
+        counts = cells.counts(cells.readings.of_image(self.instance))[:, 1:]
         a, b = cells.pairs.T
         of_pair = counts[a].sum(axis=1) * counts[b].sum(axis=1)
         same = np.divide((counts[a] * counts[b]).sum(axis=1), of_pair, out=np.zeros(len(a)), where=of_pair > 0)

@@ -116,7 +116,7 @@ class TruePairs(UsesTruth, PairOdds):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
-        true = cells.counts(self.truth.instance(clip.index)).argmax(axis=1)
+        true = cells.counts(cells.readings.of_image(self.truth.instance(clip.index))).argmax(axis=1)
         a, b = cells.pairs.T
         return np.where(true[a] == true[b], _NATS, -_NATS)
 

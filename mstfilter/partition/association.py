@@ -1,6 +1,6 @@
 """Associates the segments of an image partition with the objects of a prediction.
 
->>> overlaps = Overlaps.of(segments, objects, 60)   # labels (m,) of the readings; 0 is none
+>>> overlaps = Overlaps.of(partition, counts, 60)   # segment (K,) and readings (K, objects + 1) of each cell
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
@@ -57,11 +57,14 @@ class Overlaps:
     least: float  #: an object that is the main object of no segment needs as many readings to be in conflict
 
     @classmethod
-    def of(cls, segments: np.ndarray, objects: np.ndarray, least: float) -> Overlaps:
-        """Count the readings by their segment and predicted object (m,). Readings without a segment are ignored."""
-        inside = segments > 0
-        shared = np.zeros((int(segments.max(initial=0)) + 1, int(objects[inside].max(initial=0)) + 1), np.int64)
-        np.add.at(shared, (segments[inside], objects[inside]), 1)
+    def of(cls, partition: np.ndarray, counts: np.ndarray, least: float) -> Overlaps:
+        """The overlaps of a partition, from the segment (K,) of each cell.
+
+        `counts` (K, objects + 1) has the number of readings of each cell with each predicted object; 0 is no object.
+        """
+        shared = np.zeros((int(partition.max(initial=0)) + 1, counts.shape[1]), np.int64)
+        np.add.at(shared, partition, counts)
+        shared[0] = 0
         return cls(shared, least)
 
     @cached_property

@@ -1,9 +1,10 @@
-"""Readings and cells of a depth image, and draws of partitions of the cells into objects.
+"""Readings and cells of a depth image, and probabilities of partitions of the cells into objects.
 
 >>> readings = Readings.of(frame, grid)
 >>> cells = Cells.of(readings, samples, predictions)
 >>> log_odds = PairEvidence().log_odds(cells, weights, clip)      # (e,) of "one object", for cells.pairs (e, 2)
->>> labels = cells.draw(rng, log_odds, 20)                        # (20, K) object of each cell in each draw
+>>> component = cells.alternatives()[0]                           # the partitions of the cells of one component
+>>> cells.probabilities(log_odds, component)                      # (p,) probability of each of these partitions
 
 A sample groups the readings by its segments. A prediction groups the readings by the objects that lie at the
 readings. A cell is a set of readings that no sample and no prediction separates: the cells are the common refinement
@@ -42,7 +43,6 @@ from scipy.special import expit
 from mstfilter.completion.observed import frame_points
 from mstfilter.results import Checked, check_array, returns
 from mstfilter.scene import Clip, Frame, VoxelGrid, canonical, common_refinement, scaled_area
-from mstfilter.smc import Systematic
 
 _LEAST_READINGS = 60  # of a region in an image of 640 x 480 pixels, as `ObjectRule.min_points`
 _SOFT = 0.02  # shares of samples and predictions are softened by as much
@@ -73,6 +73,10 @@ class Readings:
         mask.ravel()[self.pixels[chosen]] = True
         return mask
 
+    def of_image(self, image: np.ndarray) -> np.ndarray:
+        """Value (m,) of an image (H, W) at each reading."""
+        return np.asarray(image.ravel()[self.pixels])
+
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
         """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 if none."""
         occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
@@ -88,7 +92,7 @@ class Readings:
 
 
 class Alternatives(NamedTuple):
-    """The partitions of a component, one of which is drawn."""
+    """The partitions of a component."""
 
     cells: np.ndarray  #: (k,) cells of the component
     partitions: np.ndarray  #: (p, k) object of each cell in each partition, 1, 2, ...
@@ -138,13 +142,6 @@ class Cells:
         """Pairs (e, 2) of cells of one component."""
         return np.argwhere(np.triu(self.component[:, None] == self.component, 1))
 
-    def counts(self, image: np.ndarray) -> np.ndarray:
-        """Number of readings (K, m) of each cell with each label of an image (H, W) int."""
-        inside = self.of_reading >= 0
-        found = np.zeros((len(self.sizes), int(image.max()) + 1), np.int64)
-        np.add.at(found, (self.of_reading[inside], image.ravel()[self.readings.pixels[inside]]), 1)
-        return found
-
     def alternatives(self) -> list[Alternatives]:
         """The distinct partitions of each component."""
         found = []
@@ -179,20 +176,21 @@ class Cells:
         weights = self.sizes[self.pairs[inside]].prod(axis=1).astype(float)
         return _fitted_mixture(joined, expit(log_odds[inside]), weights / weights.sum())
 
-    def draw(self, rng: np.random.Generator, log_odds: np.ndarray, n: int) -> np.ndarray:
-        """n partitions (n, K). The components are drawn independently.
+    @staticmethod
+    def joined(components: Sequence[Alternatives], chosen: np.ndarray) -> np.ndarray:
+        """Segment (K,) of each cell, 1, 2, ..., from the chosen alternative (C,) of each component."""
+        partition, used = np.zeros(sum(len(one.cells) for one in components), np.int64), 0
+        for one, k in zip(components, chosen.tolist(), strict=True):
+            partition[one.cells] = one.partitions[k] + used
+            used += int(one.partitions.max())
+        return partition
 
-        In each component, the alternatives are drawn by systematic selection. The number of draws of each equals its
-        probability up to rounding.
-        """
-        drawn = np.zeros((n, self.samples.shape[1]), np.int64)
-        used = 0
-        for component in self.alternatives():
-            log_weights = np.log(np.maximum(self.probabilities(log_odds, component), 1e-300))
-            chosen = rng.permutation(Systematic().select(rng, log_weights, n)[0])
-            drawn[:, component.cells] = component.partitions[chosen] + used
-            used += int(component.partitions.max())
-        return drawn
+    def counts(self, labels: np.ndarray) -> np.ndarray:
+        """Number of readings (K, m) of each cell with each label, from the labels (readings,) of all readings."""
+        inside = self.of_reading >= 0
+        found = np.zeros((self.samples.shape[1], int(labels[inside].max(initial=0)) + 1), np.int64)
+        np.add.at(found, (self.of_reading[inside], labels[inside]), 1)
+        return found
 
     def to_readings(self, of_cells: np.ndarray) -> np.ndarray:
         """Labels (..., m) of the readings, from labels (..., K) of the cells; 0 for readings without a cell."""

@@ -39,16 +39,19 @@ no frame has shown.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from itertools import islice, zip_longest
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+from scipy.special import logsumexp
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, Share
+from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveInt, Share
 from mstfilter.partition.association import Overlaps
+from mstfilter.partition.candidates import Choices
 from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
 from mstfilter.scene import (
     Clip,
@@ -64,7 +67,7 @@ from mstfilter.scene import (
     log_quality,
     surface_agreement,
 )
-from mstfilter.smc import Population, Systematic, Update, child
+from mstfilter.smc import Candidates, Key, Population, Update, first_seen, key_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +81,7 @@ class Prediction:
     objects: np.ndarray  #: (m,) its object at each reading, 0 is none or a refuted object
     refuted: frozenset[int]  #: labels of the objects that the frame does not show at their places
 
+    @cached_property
     def shares_left(self) -> dict[int, float]:
         """The share q of each object's voxels that the frame does not observe as free, by label."""
         left = Counter(self.hypothesis.labels[self.refined.labels > 0].tolist())
@@ -117,12 +121,14 @@ class PartitionUpdate(Update):
         Added to the log odds of every uncertain voxel, since the network is calibrated for its training scenes. The
         value was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
-        Terms whose sum is the log weight of a candidate. Without terms, all candidates have equal weights, since they
-        are drawn from the distribution that they approximate.
+        Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
+        are built.
     quality_exponent : float
         lambda, the exponent of Q, A and q. With 0, every prediction holds, and every occluded object is kept.
     n_candidates : int
-        Number of candidates after the first pause. 0 means one for each predicted hypothesis, or four with evidence.
+        Largest number of candidates after the first pause. 0 means 20 for each predicted hypothesis.
+    n_scored : int
+        Number of candidates that are built and scored by `evidence`.
     reach : float
         Largest distance in voxels between a reading and the predicted object that explains it.
     n_views : int
@@ -143,6 +149,7 @@ class PartitionUpdate(Update):
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: NonNegativeFloat = 3.0
     n_candidates: NonNegativeInt = 0
+    n_scored: PositiveInt = 20
     reach: NonNegativeFloat = 1.5
     n_views: NonNegativeInt = 4
     threshold: Share = 0.5
@@ -154,30 +161,34 @@ class PartitionUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Candidates. Without a proposal, the result is the predictions after free-space projection."""
+        """Weighted candidates, which are built on access.
+
+        Without a proposal, the result is the predictions after free-space projection.
+        """
         check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
         check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
         clip = self._mended(observation)
         readings = Readings.of(clip.after, clip.grid)
         if predicted is None:
             assert proposed is not None
-            candidates = [_new_objects(segments) for segments in _segments(proposed, readings)]
-            built = self._complete(rng, candidates, readings, clip)
-            return self._weigh(built, observation, proposed.log_weights, proposed.parents, {})
-        projected = self._project(predicted, observation)
-        if proposed is None:
-            return projected
-        predictions = self._predictions(predicted, projected, readings, observation.after)
-        n = self.n_candidates or (4 if self.evidence else 1) * len(predicted)
-        drawn = Systematic().select(child(rng, "predicted"), projected.log_weights, n)[0]
-        partitions = self._draw_partitions(child(rng, "partition"), predictions, proposed, readings, clip, n)
-        candidates = [
-            self._associate(child(rng, "hidden", c), segments, predictions[j], readings)
-            for c, (segments, j) in enumerate(zip(partitions, drawn.tolist(), strict=True))
-        ]
-        built = self._complete(rng, candidates, readings, clip)
-        parents = {"previous": predicted.parents.get("previous", np.full(len(predicted), -1))[drawn]}
-        return self._weigh(built, observation, np.zeros(n), parents, projected.notes)
+            described, segments = _distinct(proposed, _segments(proposed, readings))
+            objects_of = partial(_new_objects, segments)
+        else:
+            projected = self._project(predicted, observation)
+            if proposed is None:
+                return projected
+            predictions = self._predictions(predicted, projected, readings, observation.after)
+            cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
+            choices = self._choices(cells, predictions, projected.log_weights, clip)
+            described = choices.described(projected)
+            objects_of = partial(self._associate, cells, predictions, choices)
+        key = key_of(rng)
+
+        def build(candidate: int) -> Hypothesis:
+            return self._hypothesis(key.child("candidate", candidate), objects_of(candidate), readings, clip)
+
+        candidates = replace(described, particles=Candidates(build, len(described)))
+        return self._scored(candidates, observation) if self.evidence else candidates
 
     def _mended(self, clip: Clip) -> Clip:
         """The last frame, with estimates of missing readings of objects. Free-space projection does not use them."""
@@ -217,79 +228,54 @@ class PartitionUpdate(Update):
         holds = of_scene**self.quality_exponent
         return Prediction(hypothesis, refined, weight, holds, objects, frozenset(refuted.tolist()))
 
-    # 2. Partitions of the image ---------------------------------------------------------------------------------
+    # 2. Partitions of the image, and their weights --------------------------------------------------------------
 
-    def _draw_partitions(
-        self,
-        rng: np.random.Generator,
-        predictions: Sequence[Prediction],
-        proposed: Population,
-        readings: Readings,
-        clip: Clip,
-        n: int,
-    ) -> np.ndarray:
-        """n partitions of the readings: the segment (n, m) of each reading, where 0 means none."""
-        cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
-        weights = np.array([one.weight * one.holds for one in predictions])
-        return cells.to_readings(cells.draw(rng, self.pairs.log_odds(cells, weights, clip), n))
+    def _choices(
+        self, cells: Cells, predictions: Sequence[Prediction], log_weights: np.ndarray, clip: Clip
+    ) -> Choices:
+        """The most probable candidates. `log_weights` (predictions,) are log (w_j Q_j^lambda)."""
+        n = self.n_candidates or 20 * len(predictions)
+        valid = np.diag([one.holds for one in predictions])  # row j: prediction j is the past
+        log_odds = [self.pairs.log_odds(cells, one, clip) for one in valid]
+        choices = Choices.of(cells, log_weights - logsumexp(log_weights), log_odds, n)
+        counts = [cells.counts(one.objects) for one in predictions]
+        overlaps = (
+            Overlaps.of(partition, counts[j], cells.readings.smallest_region)
+            for j, partition in zip(choices.prediction, choices.partitions, strict=True)
+        )
+        stay = [self._stay(predictions[j], one) for j, one in zip(choices.prediction, overlaps, strict=True)]
+        return choices.with_occluded(stay, n)
+
+    def _stay(self, prediction: Prediction, overlaps: Overlaps) -> dict[int, float]:
+        """Probability (A_j q)^lambda of each occluded object of a prediction to stay, by its label."""
+        q = prediction.shares_left
+        occluded = sorted(q.keys() - overlaps.visible - prediction.refuted)
+        return {label: prediction.holds * q[label] ** self.quality_exponent for label in occluded}
 
     # 3. Association, 4. occluded objects ------------------------------------------------------------------------
 
     def _associate(
-        self, rng: np.random.Generator, segments: np.ndarray, prediction: Prediction, readings: Readings
+        self, cells: Cells, predictions: Sequence[Prediction], choices: Choices, candidate: int
     ) -> list[SceneObject]:
-        """The objects of a candidate: the segments (m,) of a partition, and occluded objects of a prediction."""
-        overlaps = Overlaps.of(segments, prediction.objects, readings.smallest_region)
+        """The objects of a candidate: the segments of its partition, and the occluded objects that stay."""
+        prediction, partition = predictions[choices.prediction[candidate]], choices.partitions[candidate]
+        segments = cells.to_readings(partition)
+        overlaps = Overlaps.of(partition, cells.counts(prediction.objects), cells.readings.smallest_region)
         record_of = {record.label: record for record in prediction.hypothesis.objects}
         visible = [
             SceneObject(segments == segment, tuple(record_of[k] for k in tracks))
             for component in overlaps.components()
             for segment, tracks in overlaps.tracks(component).items()
         ]
-        return visible + self._occluded(rng, prediction, overlaps)
-
-    def _occluded(self, rng: np.random.Generator, prediction: Prediction, overlaps: Overlaps) -> list[SceneObject]:
-        """The occluded objects of a prediction that are kept, each with probability (Q q)^lambda."""
-        q = prediction.shares_left()
-        no_readings = np.zeros(len(prediction.objects), bool)
-        return [
-            SceneObject(no_readings, (record,), prediction.remaining(record, self.threshold))
-            for record in prediction.hypothesis.objects
-            if record.label not in overlaps.visible | prediction.refuted
-            and rng.random() < prediction.holds * q[record.label] ** self.quality_exponent
-        ]
+        none = np.zeros(len(segments), bool)
+        stay = [record_of[label] for label in choices.occluded[candidate]]
+        return visible + [SceneObject(none, (one,), prediction.remaining(one, self.threshold)) for one in stay]
 
     # 5. Completion ----------------------------------------------------------------------------------------------
 
-    def _complete(
-        self, rng: np.random.Generator, candidates: Sequence[Sequence[SceneObject]], readings: Readings, clip: Clip
-    ) -> tuple[Hypothesis, ...]:
-        """The hypotheses of the candidates. The objects of all candidates are completed together."""
-        objects = [one for candidate in candidates for one in candidate]
-        completed = iter(self._completions(rng, objects, readings, clip))
-        return tuple(self._hypothesis(one, list(islice(completed, len(one))), clip) for one in candidates)
-
-    def _completions(
-        self, rng: np.random.Generator, objects: Sequence[SceneObject], readings: Readings, clip: Clip
-    ) -> list[Completion]:
-        """Each object, completed from its readings and the views of its tracks.
-
-        An object without readings and views keeps its predicted voxels outside free space.
-        """
-        completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
-        views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
-        seen = [k for k, one in enumerate(objects) if one.readings.any() or views[k]]
-        streams = [child(rng, "completion", k) for k in seen]
-        masks = [readings.mask(objects[k].readings) for k in seen]
-        found = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
-        completed = {k: one.shifted(self.occupied_log_odds) for k, one in zip(seen, found, strict=True)}
-        completed |= {k: one.remains for k, one in enumerate(objects) if k not in completed and one.remains}
-        return [completed[k] for k in range(len(objects))]
-
-    def _hypothesis(
-        self, objects: Sequence[SceneObject], completions: Sequence[Completion], clip: Clip
-    ) -> Hypothesis:
+    def _hypothesis(self, key: Key, objects: Sequence[SceneObject], readings: Readings, clip: Clip) -> Hypothesis:
         """A candidate. An object is dropped if all its voxels belong to other objects."""
+        completions = self._completions(key, objects, readings, clip)
         labels = arbitrate(completions, clip.grid, self.threshold)
         present = set(np.unique(labels).tolist())
         records = [
@@ -298,6 +284,23 @@ class PartitionUpdate(Update):
             if label in present
         ]
         return Hypothesis(labels, clip.grid, tuple(records), occupancy_of(completions, labels, clip.grid))
+
+    def _completions(
+        self, key: Key, objects: Sequence[SceneObject], readings: Readings, clip: Clip
+    ) -> list[Completion]:
+        """Each object, completed from its readings and the views of its tracks.
+
+        An object without readings and views keeps its predicted voxels outside free space.
+        """
+        completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
+        views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
+        seen = [k for k, one in enumerate(objects) if one.readings.any() or views[k]]
+        streams = [key.child(k).generator() for k in seen]
+        masks = [readings.mask(objects[k].readings) for k in seen]
+        found = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
+        completed = {k: one.shifted(self.occupied_log_odds) for k, one in zip(seen, found, strict=True)}
+        completed |= {k: one.remains for k, one in enumerate(objects) if k not in completed and one.remains}
+        return [completed[k] for k in range(len(objects))]
 
     def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
         """The record of an object: the record of the first object that it continues, or a new record."""
@@ -311,23 +314,18 @@ class PartitionUpdate(Update):
         newest = (view for level in zip_longest(*map(reversed, histories)) for view in level if view is not None)
         return tuple(islice(newest, self.n_views))[::-1]
 
-    # Weights ----------------------------------------------------------------------------------------------------
+    # Evidence of built candidates -------------------------------------------------------------------------------
 
-    def _weigh(
-        self,
-        built: tuple[Hypothesis, ...],
-        clip: Clip,
-        log_weights: np.ndarray,
-        parents: Mapping[str, np.ndarray],
-        notes: Mapping[str, object],
-    ) -> Population:
-        """The candidates, weighted by evidence."""
-        total, scores = np.zeros(len(built)), {}
+    def _scored(self, candidates: Population, clip: Clip) -> Population:
+        """The `n_scored` candidates of largest weight, built and weighted by the evidence as well."""
+        kept = np.sort(np.argsort(-candidates.log_weights, kind="stable")[: self.n_scored])
+        built, scores = candidates.take(kept).realised(), {}
+        total = np.zeros(len(built))
         for k, term in enumerate(self.evidence):
-            name, score = type(term).__name__, term.log_score(built, clip)
+            name, score = type(term).__name__, term.log_score(built.particles, clip)
             scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
             total += score
-        return Population(built, log_weights + total, parents, {**notes, "scores": scores})
+        return replace(built, log_weights=built.log_weights + total, notes={**built.notes, "scores": scores})
 
 
 def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
@@ -340,6 +338,15 @@ def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
     return [found[id(h)] for h in proposed.particles]
 
 
-def _new_objects(segments: np.ndarray) -> list[SceneObject]:
-    """The segments (m,) of a partition as new objects."""
-    return [SceneObject(segments == k) for k in np.unique(segments[segments > 0])]
+def _distinct(proposed: Population, segments: Sequence[np.ndarray]) -> tuple[Population, list[np.ndarray]]:
+    """The distinct samples with the total weight of the equal ones, and their segments (m,)."""
+    which = first_seen(one.tobytes() for one in segments)
+    example = np.unique(which, return_index=True)[1]
+    merged = proposed.take(example, np.log(np.bincount(which, proposed.weights)))
+    return merged, [segments[k] for k in example]
+
+
+def _new_objects(segments: Sequence[np.ndarray], candidate: int) -> list[SceneObject]:
+    """The segments (m,) of a candidate as new objects."""
+    own = segments[candidate]
+    return [SceneObject(own == k) for k in np.unique(own[own > 0])]

@@ -1,0 +1,144 @@
+"""Candidates of the update as choices: described and weighted before any object is completed.
+
+>>> choices = Choices.of(cells, log_weights, log_odds, 100)   # for n predictions: log_weights (n,), log_odds (n, e)
+>>> choices.prediction[0], choices.partitions[0]             # prediction j, and the segment (K,) of each cell
+>>> choices = choices.with_occluded(probabilities_to_stay, 100)
+>>> choices.log_weights, choices.occluded[0]                 # log probability, occluded objects of j that stay
+
+A candidate is a prediction j, an alternative a_c for each component c of the cells, and for each occluded object k of
+the prediction whether it stays. Its probability is
+
+    w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}.
+
+The components are independent given the prediction, so the most probable candidates are found without a list of all
+products: the n largest products of some factors contain only the n largest products of fewer factors
+(`largest_products`). All candidates together have probability 1. So the probability of the candidates that are not
+described is known. It is reported as the *discarded mass*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import entr
+
+from mstfilter.partition.cells import Cells
+from mstfilter.smc import Population
+
+_CERTAIN = 1e-3  # an occluded object stays if its probability is above 1 minus this, and leaves if it is below this
+
+
+@dataclass(frozen=True, eq=False)
+class Choices:
+    """Descriptions of m candidates."""
+
+    prediction: np.ndarray  #: (m,) index of the prediction
+    partitions: np.ndarray  #: (m, K) segment of each cell, 1, 2, ...
+    log_weights: np.ndarray  #: (m,) log probability
+    occluded: tuple[tuple[int, ...], ...] = ()  #: labels of the occluded objects that stay, for each candidate
+
+    def __len__(self) -> int:
+        return len(self.prediction)
+
+    @classmethod
+    def of(cls, cells: Cells, log_weights: np.ndarray, log_odds: Sequence[np.ndarray], n: int) -> Choices:
+        """The n most probable pairs of a prediction and a partition.
+
+        Parameters
+        ----------
+        cells : Cells
+        log_weights : (predictions,) float
+            log (w_j Q_j^lambda), with sum 1 of the weights.
+        log_odds : (predictions, e) float
+            Log odds of "one object" of each pair of cells, given each prediction.
+        n : int
+            Largest number of candidates.
+        """
+        components = cells.alternatives()
+        found, entropies = [], np.zeros(len(components))
+        for j, (log_weight, odds) in enumerate(zip(log_weights, log_odds, strict=True)):
+            p = [cells.probabilities(odds, component) for component in components]
+            entropies += np.exp(log_weight) * np.array([entr(one).sum() for one in p])
+            with np.errstate(divide="ignore"):
+                chosen, log_p = largest_products([np.log(one) for one in p], n)
+            found.append((np.full(len(chosen), j), chosen, log_weight + log_p))
+        prediction, chosen, log_p = (np.concatenate(column) for column in zip(*found, strict=True))
+        # Schemes such as systematic resampling take equal steps through the candidates. Neighbours therefore agree in
+        # the most uncertain component first.
+        order = np.lexsort((prediction, *chosen.T[np.argsort(entropies)]))
+        partitions = np.stack([cells.joined(components, row) for row in chosen[order]])
+        return cls(prediction[order], partitions, log_p[order]).most_probable(n)
+
+    def with_occluded(self, probabilities: Sequence[dict[int, float]], n: int) -> Choices:
+        """The n most probable candidates, with each of the most probable sets of occluded objects that stay.
+
+        `probabilities` has, for each candidate, the probability of each occluded object to stay, by its label.
+        """
+        sets = [stays(one, n) for one in probabilities]
+        of = np.repeat(np.arange(len(self)), [len(one) for one in sets])
+        log_p = np.array([p for one in sets for _, p in one])
+        labels = tuple(kept for one in sets for kept, _ in one)
+        return Choices(self.prediction[of], self.partitions[of], self.log_weights[of] + log_p, labels).most_probable(
+            n
+        )
+
+    def most_probable(self, n: int) -> Choices:
+        """The n candidates of largest positive weight, in the present order."""
+        best = np.sort(np.argsort(-self.log_weights, kind="stable")[:n])
+        best = best[self.log_weights[best] > -np.inf]
+        occluded = tuple(self.occluded[k] for k in best.tolist()) if self.occluded else ()
+        return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], occluded)
+
+    def described(self, projected: Population) -> Population:
+        """The candidates as a population whose particles are indices, with the parents of their predictions.
+
+        `projected` are the predictions. The notes have the probability of the candidates that are left out.
+        """
+        previous = projected.parents.get("previous", np.full(len(projected), -1))
+        discarded = max(0.0, 1 - float(np.exp(self.log_weights).sum()))
+        notes = {**projected.notes, "discarded_mass": round(discarded, 4)}
+        parents = {"previous": previous[self.prediction]}
+        return Population(np.arange(len(self)), self.log_weights, parents, notes)
+
+
+def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
+    """The n largest products with one entry of each factor.
+
+    Parameters
+    ----------
+    log_factors : sequence of (k_c,) arrays
+        Logarithms of the entries of each of C factors.
+
+    Returns
+    -------
+    chosen : (m, C) int
+        Index of the entry of each factor, with m <= n.
+    log_products : (m,) float
+        Descending.
+    """
+    chosen, total = np.zeros((1, 0), np.int64), np.zeros(1)
+    for factor in log_factors:
+        sums = np.add.outer(total, factor).ravel()
+        best = np.argsort(-sums, kind="stable")[:n]
+        row, entry = np.divmod(best, len(factor))
+        chosen, total = np.column_stack([chosen[row], entry]), sums[best]
+    return chosen, total
+
+
+def stays(probabilities: dict[int, float], n: int) -> list[tuple[tuple[int, ...], float]]:
+    """The n most probable sets of occluded objects that stay, and their log probabilities.
+
+    `probabilities` has the probability of each object to stay, by its label. Objects are independent.
+    """
+    p = np.array([*probabilities.values()])
+    p = np.where(p < _CERTAIN, 0, np.where(p > 1 - _CERTAIN, 1, p))
+    with np.errstate(divide="ignore"):
+        chosen, total = largest_products([*np.log(np.column_stack([p, 1 - p]))], n)
+    labels = np.array([*probabilities])
+    return [
+        (tuple(labels[row == 0].tolist()), log_p)
+        for row, log_p in zip(chosen, total.tolist(), strict=True)
+        if log_p > -np.inf
+    ]
