@@ -1,4 +1,5 @@
 from mstfilter.partition.association import ConflictComponent as ConflictComponent, Overlaps as Overlaps
+from mstfilter.partition.candidates import Choices as Choices
 from mstfilter.partition.cells import (
     Alternatives as Alternatives,
     Cells as Cells,

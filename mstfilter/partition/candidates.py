@@ -10,10 +10,9 @@ the prediction whether it stays. Its probability is
 
     w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}.
 
-The components are independent given the prediction, so the most probable candidates are found without a list of all
-products: the n largest products of some factors contain only the n largest products of fewer factors
-(`largest_products`). All candidates together have probability 1. So the probability of the candidates that are not
-described is known. It is reported as the *discarded mass*.
+The components are independent given the prediction. So the most probable candidates are found factor by factor, and
+only the n largest products are kept after each factor (`largest_products`). All candidates together have probability
+1. The probability of the candidates that are left out is reported as the *discarded mass*.
 """
 
 from __future__ import annotations
@@ -43,7 +42,14 @@ class Choices:
         return len(self.prediction)
 
     @classmethod
-    def of(cls, cells: Cells, log_weights: np.ndarray, log_odds: Sequence[np.ndarray], n: int) -> Choices:
+    def of(
+        cls,
+        cells: Cells,
+        log_weights: np.ndarray,
+        log_odds: Sequence[np.ndarray],
+        n: int,
+        temperature: float = 1.0,
+    ) -> Choices:
         """The n most probable pairs of a prediction and a partition.
 
         Parameters
@@ -55,11 +61,13 @@ class Choices:
             Log odds of "one object" of each pair of cells, given each prediction.
         n : int
             Largest number of candidates.
+        temperature : float
+            T. The alternatives of a component have probabilities in proportion to P(a_c | image, j)^(1/T).
         """
         components = cells.alternatives()
         found, entropies = [], np.zeros(len(components))
         for j, (log_weight, odds) in enumerate(zip(log_weights, log_odds, strict=True)):
-            p = [cells.probabilities(odds, component) for component in components]
+            p = [tempered(cells.probabilities(odds, component), temperature) for component in components]
             entropies += np.exp(log_weight) * np.array([entr(one).sum() for one in p])
             with np.errstate(divide="ignore"):
                 chosen, log_p = largest_products([np.log(one) for one in p], n)
@@ -125,6 +133,12 @@ def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndar
         row, entry = np.divmod(best, len(factor))
         chosen, total = np.column_stack([chosen[row], entry]), sums[best]
     return chosen, total
+
+
+def tempered(p: np.ndarray, temperature: float) -> np.ndarray:
+    """Probabilities (k,) in proportion to p^(1/T)."""
+    powers = p ** (1 / temperature)
+    return powers / powers.sum()
 
 
 def stays(probabilities: dict[int, float], n: int) -> list[tuple[tuple[int, ...], float]]:

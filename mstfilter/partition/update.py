@@ -49,7 +49,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveInt, Share
+from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from mstfilter.partition.association import Overlaps
 from mstfilter.partition.candidates import Choices
 from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
@@ -117,6 +117,9 @@ class PartitionUpdate(Update):
         Computes the share Q of a prediction that the frame does not observe as free, and the remaining voxels.
     pairs : PairOdds
         The log odds that two cells belong to one object.
+    temperature : float
+        T. Partitions of a component have probabilities in proportion to P^(1/T), where P is their probability by the
+        pairs. The value was fitted in `experiments/partition_fit`.
     occupied_log_odds : float
         Added to the log odds of every uncertain voxel, since the network is calibrated for its training scenes. The
         value was fitted in `experiments/partition_fit`.
@@ -145,6 +148,7 @@ class PartitionUpdate(Update):
     completer: Completer = field(default_factory=Extrude)
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
+    temperature: PositiveFloat = 1.0
     occupied_log_odds: Annotated[float, Bounds()] = 0.6
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: NonNegativeFloat = 3.0
@@ -237,7 +241,7 @@ class PartitionUpdate(Update):
         n = self.n_candidates or 20 * len(predictions)
         valid = np.diag([one.holds for one in predictions])  # row j: prediction j is the past
         log_odds = [self.pairs.log_odds(cells, one, clip) for one in valid]
-        choices = Choices.of(cells, log_weights - logsumexp(log_weights), log_odds, n)
+        choices = Choices.of(cells, log_weights - logsumexp(log_weights), log_odds, n, self.temperature)
         counts = [cells.counts(one.objects) for one in predictions]
         overlaps = (
             Overlaps.of(partition, counts[j], cells.readings.smallest_region)

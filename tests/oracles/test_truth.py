@@ -22,7 +22,7 @@ from mstfilter.oracles import (
     uses_truth,
 )
 from mstfilter.oracles.truth import RecordingTruth
-from mstfilter.partition import Cells, Readings
+from mstfilter.partition import Cells, Choices, Readings
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Hypothesis, component_key
@@ -259,7 +259,7 @@ def test_true_free_space_clears_what_is_free_and_seen(recording):
 
 
 def test_true_pairs_choose_what_agrees_with_the_truth(recording):
-    """Cells of one true object belong together, all others do not; an alternative that agrees is always drawn."""
+    """Cells of one true object belong together, all others do not; an alternative that agrees has probability 1."""
     clip, true = recording.clips()[1], recording.instance(recording.pauses[1])
     pixels = np.flatnonzero(true.ravel() > 0)
     owner = true.ravel()[pixels].astype(np.int64)
@@ -271,8 +271,10 @@ def test_true_pairs_choose_what_agrees_with_the_truth(recording):
     label = np.array([np.bincount(owner[cells.of_reading == c]).argmax() for c in range(cells.samples.shape[1])])
     same = label[cells.pairs[:, 0]] == label[cells.pairs[:, 1]]
     assert same.any() and (odds[same] > 100).all() and (odds[~same] < -100).all()
-    for row in cells.draw(RNG, odds, 5):
-        np.testing.assert_array_equal(row[:, None] == row[None], label[:, None] == label[None])
+    choices = Choices.of(cells, np.zeros(1), [odds], 5)
+    best = choices.partitions[choices.log_weights.argmax()]
+    assert choices.log_weights.max() > np.log(0.99)
+    np.testing.assert_array_equal(best[:, None] == best[None], label[:, None] == label[None])
 
 
 def test_choice_and_selection_prefer_true_quality(recording):

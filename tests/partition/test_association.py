@@ -10,8 +10,13 @@ from hypothesis.extra import numpy as hnp
 from mstfilter.partition import Overlaps
 
 
+def overlaps_of(segments, objects, least):
+    """Every reading is a cell."""
+    return Overlaps.of(np.array(segments), np.eye(1 + np.max(objects), dtype=int)[objects], least)
+
+
 def tracks_of(segments, objects, least):
-    overlaps = Overlaps.of(np.array(segments), np.array(objects), least)
+    overlaps = overlaps_of(segments, objects, least)
     return {a: tracks for component in overlaps.components() for a, tracks in overlaps.tracks(component).items()}
 
 
@@ -35,7 +40,7 @@ def tracks_of(segments, objects, least):
 def test_which_objects_a_segment_continues(segments, objects, continued):
     objects = objects + [0] * (len(segments) - len(objects))
     assert tracks_of(segments, objects, 20) == continued
-    visible = Overlaps.of(np.array(segments), np.array(objects), 20).visible
+    visible = overlaps_of(segments, objects, 20).visible
     assert (1 in visible) == (objects.count(1) > 0 and continued != {1: [2]})
 
 
@@ -45,7 +50,7 @@ labels = hnp.arrays(np.int64, 60, elements=st.integers(0, 4))
 @settings(max_examples=100, deadline=None)
 @given(labels, labels)
 def test_components_and_tracks_by_brute_force(segments, objects):
-    overlaps = Overlaps.of(segments, objects, 4)
+    overlaps = overlaps_of(segments, objects, 4)
     pairs = [(a, b) for a in range(1, 5) for b in range(1, 5)]
     shared = {(a, b): int(((segments == a) & (objects == b)).sum()) for a, b in pairs}
     inside = {b: int(((segments > 0) & (objects == b)).sum()) for b in range(1, 5)}

@@ -1,4 +1,4 @@
-"""Cells, the log odds of their pairs, and the law of the draws: by brute force on small images."""
+"""Cells, the log odds of their pairs, and the probabilities of partitions: by brute force on small images."""
 
 from __future__ import annotations
 
@@ -149,35 +149,11 @@ def test_an_object_on_both_sides_of_another_can_be_one():
     behind = np.where(strips == 3, 1, strips)
     found = Cells.of(READINGS, [strips] * 3, [behind] * 2)
     odds = np.where((found.samples[0, found.pairs] != 2).all(axis=1), 3.0, -3.0)
-    drawn = found.draw(np.random.default_rng(0), odds, 100)
-    left, right, middle = (drawn[:, found.of_reading[k]] for k in (0, 5, 2))
-    assert (left == right).mean() > 0.9 and (left != middle).all()
-
-
-def test_partitions_are_drawn_with_their_probabilities():
-    rng = np.random.default_rng(0)
-    rows = [rng.integers(1, 3, (2, 2)).repeat(3, 0)[:5].repeat(3, 1).ravel() for _ in range(4)]
-    rows.append(np.arange(1, 5).reshape(2, 2).repeat(3, 0)[:5].repeat(3, 1).ravel())
-    found = Cells.of(READINGS, rows[:3], rows[3:])
-    log_odds = rng.normal(size=len(found.pairs))
-    n = 20_000
-    drawn = found.draw(np.random.default_rng(1), log_odds, n)
-    for component in found.alternatives():
-        cells, partitions = component
-        p = found.probabilities(log_odds, component)
-        for partition, expected in zip(partitions, p, strict=True):
-            same = (drawn[:, cells][:, :, None] == drawn[:, cells][:, None]) == (
-                partition[:, None] == partition[None]
-            )
-            share = same.all(axis=(1, 2)).mean()
-            # 1 false alarm in 20,000
-            assert abs(share - expected) < 4.5 * np.sqrt(expected * (1 - expected) / n) + 1 / n
-    # Cells of different components never share an object.
-    component = np.zeros(found.samples.shape[1], int)
-    for k, (cells, _) in enumerate(found.alternatives()):
-        component[cells] = k
-    for label in np.unique(drawn[0]):
-        assert len(np.unique(component[drawn[0] == label])) == 1
+    left, right, middle = (found.of_reading[k] for k in (0, 5, 2))
+    (sides,) = (one for one in found.alternatives() if left in one.cells)
+    assert set(sides.cells) == {left, right} and middle not in sides.cells
+    joined = sides.partitions[:, 0] == sides.partitions[:, 1]
+    assert found.probabilities(odds, sides) @ joined > 0.9
 
 
 def test_slivers_join_a_neighbour(monkeypatch):
@@ -209,4 +185,4 @@ def test_small_objects_far_from_others_are_not_slivers(monkeypatch):
 
 def test_no_objects():
     found = Cells.of(READINGS, [np.zeros(30, int)], [np.ones(30, int)])
-    assert (found.of_reading == -1).all() and found.draw(np.random.default_rng(0), np.zeros(0), 3).shape == (3, 0)
+    assert (found.of_reading == -1).all() and found.alternatives() == []

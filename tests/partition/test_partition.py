@@ -1,4 +1,4 @@
-"""Partition of the readings and completion from all views: what is carried on, what is not, and the law of draws."""
+"""Partition of the readings and completion from all views: what is carried on, what is not, and the weights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.special import expit
 from mstfilter.completion import Completion, Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.partition import PairEvidence, PartitionUpdate, Readings
-from mstfilter.scene import Clip, Hypothesis, Occupancy, surface_agreement
+from mstfilter.scene import Clip, Evidence, Hypothesis, Occupancy, surface_agreement
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
 from tests.completion.test_completion import masks_of
@@ -82,8 +82,7 @@ def test_hidden_objects_stay_until_the_frame_sees_through_them():
 
 
 def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often():
-    n = 100
-    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly(), mend=False)
+    update = PartitionUpdate(completer=SurfaceOnly(), mend=False)
     labels = TWO.astype(np.uint16)
     in_the_air = np.zeros(labels.shape, bool)
     in_the_air[4:18, 4:19, -4:] = True
@@ -97,9 +96,9 @@ def test_hidden_objects_of_a_prediction_that_the_frame_refutes_stay_less_often()
     own = (left.labels == 2).sum() / (labels == 2).sum()
     expected = (of_scene * own) ** update.quality_exponent
     assert of_objects[1] > 0.9 and np.isnan(of_objects[2]) and of_objects[3] < 0.1 and own > 0.9 and expected > 0.02
-    found = step(update, hidden, sample_of(hidden, masks_of(TWO, blind)[:1]), past).particles
-    share = np.mean([past.record(2).id in {record.id for record in one.objects} for one in found])
-    assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
+    found = step(update, hidden, sample_of(hidden, masks_of(TWO, blind)[:1]), past)
+    stays = [past.record(2).id in {record.id for record in one.objects} for one in found.particles]
+    assert found.weights @ stays == pytest.approx(expected, abs=1e-6)
 
 
 def test_objects_without_views_keep_their_voxels_where_the_frame_does_not_see_through():
@@ -166,7 +165,7 @@ def test_a_past_that_the_frame_sees_through_says_nothing_about_pairs():
 
     def objects(past, **changes):
         update = PartitionUpdate(pairs=pairs, completer=SurfaceOnly(), **changes)
-        return step(update, later, proposed, past).particles[0].n_objects
+        return step(update, later, proposed, past).best.n_objects
 
     assert objects(state) == 1
     labels = state.labels.copy()
@@ -198,15 +197,14 @@ def test_partitions_by_pairs_follow_image_and_past():
     masks = masks_of(TOUCHING, clip.after)
     apart, merged = sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])
     state = step(PartitionUpdate(), clip, apart).particles[0]
-    n, pairs = 300, PairEvidence(constant=0.0, image=1.0, prediction=0.3, prediction_constant=0.0)
-    update = PartitionUpdate(pairs=pairs, n_candidates=n, completer=SurfaceOnly())
+    pairs = PairEvidence(constant=0.0, image=1.0, prediction=0.3, prediction_constant=0.0)
+    update = PartitionUpdate(pairs=pairs, completer=SurfaceOnly())
     proposed = Population((apart, merged))
     later = clip_of(TOUCHING, 1)
-    found = update.update(np.random.default_rng(0), Population((state,)), proposed, later).particles
-    share = np.mean([one.n_objects == 2 for one in found])
+    found = update.update(np.random.default_rng(0), Population((state,)), proposed, later)
+    share = found.weights @ [one.n_objects == 2 for one in found.particles]
     odds = 0.3 * np.log(1.02 / 0.02)  # the image says 1 : 1, the prediction that they are two
-    expected = 1 / (1 + np.exp(-odds))
-    assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)  # 1 false alarm in 16,000
+    assert share == pytest.approx(1 / (1 + np.exp(-odds)), abs=2e-3)
     first = update.update(np.random.default_rng(0), None, proposed, clip)  # candidates are the samples
     assert [one.n_objects for one in first.particles] == [2, 1]
 
@@ -225,19 +223,55 @@ def test_labels_of_readings_by_brute_force():
         assert label in nearest if distance.min() <= 2.5 else label == 0
 
 
-def test_predictions_are_drawn_by_their_weights():
+def test_candidates_have_the_weights_of_their_predictions():
     clip = clip_of(ALONE)
     sample = sample_of(clip, masks_of(ALONE, clip.after), Extrude())
-    n, w = 1000, np.array([0.7, 0.2, 0.1])
-    update = PartitionUpdate(n_candidates=n, completer=SurfaceOnly())
+    w = np.array([0.7, 0.2, 0.1])
     proposed = Population((sample,) * 3, np.zeros(3), {"proposed": np.arange(3)})
     predicted = Population((sample,) * 3, np.log(w), {"previous": np.arange(3)})
+    update = PartitionUpdate(completer=SurfaceOnly())
     found = update.update(np.random.default_rng(0), predicted, proposed, clip)
     quality = PartitionUpdate().free_space.refine((sample,), clip)[1][0]
     assert quality == 1.0  # so the predictions keep their weights
-    np.testing.assert_allclose(np.bincount(found.parents["previous"]) / n, w, atol=1 / n + 1e-9)
-    assert np.ptp(found.log_weights) == 0
-    assert len(PartitionUpdate().update(np.random.default_rng(0), predicted, proposed, clip)) == 3
+    np.testing.assert_allclose(np.bincount(found.parents["previous"], found.weights), w)
+    assert found.notes["discarded_mass"] == 0 and found.particles.n_built == 0
+    few = replace(update, n_candidates=1).update(np.random.default_rng(0), predicted, proposed, clip)
+    assert len(few) == 1 and few.notes["discarded_mass"] == pytest.approx(0.3)
+
+
+def test_equal_samples_of_the_first_frame_are_one_candidate():
+    clip = clip_of(TOUCHING)
+    masks = masks_of(TOUCHING, clip.after)
+    apart, merged = sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])
+    proposed = Population((apart, merged, apart), np.log([1.0, 2.0, 3.0]))
+    found = PartitionUpdate(completer=SurfaceOnly()).update(np.random.default_rng(0), None, proposed, clip)
+    assert [one.n_objects for one in found.particles] == [2, 1]
+    np.testing.assert_allclose(found.weights, [4 / 6, 2 / 6])
+
+
+def test_evidence_weights_built_candidates():
+    """Evidence multiplies the weights of the most probable candidates; the others are not built."""
+    clip, later = clip_of(TOUCHING), clip_of(TOUCHING, 1)
+    masks = masks_of(TOUCHING, clip.after)
+    samples = Population((sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])))
+    state = step(PartitionUpdate(), clip, samples.particles[0]).particles[0]
+    update = PartitionUpdate(completer=SurfaceOnly())
+
+    def weights(update):
+        found = update.update(np.random.default_rng(0), Population((state,)), samples, later)
+        return {one.n_objects: w for one, w in zip(found.particles, found.weights, strict=True)}
+
+    before, after = weights(update), weights(replace(update, evidence=(FewObjects(),)))
+    odds = (after[1] / after[2]) / (before[1] / before[2])
+    assert odds == pytest.approx(np.e)
+    assert weights(replace(update, evidence=(FewObjects(),), n_scored=1)).keys() == {max(before, key=before.get)}
+
+
+class FewObjects(Evidence):
+    """Favours hypotheses of few objects."""
+
+    def log_score(self, hypotheses, clip):
+        return -np.array([one.n_objects for one in hypotheses], float)
 
 
 def test_hypotheses_of_another_grid_are_refused():
