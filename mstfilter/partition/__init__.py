@@ -4,8 +4,9 @@
 >>> fused = update.update(rng, predicted, proposed, clip)     # candidates, with weights
 
 =============  =========================================================================================
-`update`       `PartitionUpdate`: partitions of the image are drawn, shapes completed from all views
-`cells`        the common refinement of partitions, odds of pairs of cells, and draws of partitions by them
+`update`       `PartitionUpdate`: weighted candidates, shapes completed from all views
+`candidates`   descriptions of candidates with their probabilities, before anything is completed
+`cells`        the common refinement of partitions, odds of pairs of cells, and probabilities of partitions
 `association`  which segment of the image continues which predicted object
 =============  =========================================================================================
 """

@@ -1,7 +1,7 @@
-"""The measurement update: partitions of the image are drawn, and every object is completed from all its views.
+"""The measurement update: partitions of the image are weighed, and every object is completed from all its views.
 
 >>> update = PartitionUpdate(completer=NetworkCompleter())
->>> fused = update.update(rng, predicted, proposed, clip)       # a candidate for each predicted hypothesis
+>>> fused = update.update(rng, predicted, proposed, clip)       # weighted candidates, built on access
 
 The update replaces section IV-D of the paper. In the paper, a sample of the image and a prediction are two sets of
 voxels, which are crossed. In this update, both are partitions of the depth readings of the last frame. The voxels of
@@ -13,17 +13,17 @@ an object are estimated again from everything that was observed of it.
    present scene. A predicted object is *refuted* and leaves the prediction if less than `least_agreement` of its
    visible surface is at its place.
 2. **Partitions.** A sample groups the readings by its segments. A prediction groups the readings by the objects that
-   lie at the readings. All samples and predictions together give the odds that two readings belong to one object.
-   Partitions of the image are drawn by these odds (`mstfilter.partition.cells`). A drawn partition can agree with
-   different samples and predictions in different parts of the image. The paper crosses each sample with each
-   prediction.
-3. **Association.** Each partition is paired with a prediction j, which is drawn in proportion to w_j Q_j^lambda.
-   Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
+   lie at the readings. The samples and prediction j give the odds that two readings belong to one object. These odds
+   give the partitions of each part of the image a probability (`mstfilter.partition.cells`). A candidate is a
+   prediction j and one partition of each part. Its weight is w_j Q_j^lambda times the probabilities of the partitions
+   (`mstfilter.partition.candidates`). The most probable candidates are described. The resampler of the filter selects
+   among them, and only these are completed. The paper crosses each sample with each prediction.
+3. **Association.** Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
    predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an object that
    is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the partition
    determines the merges.
-4. **Occluded objects.** A predicted object without conflict has no readings or very few. It stays in a candidate with
-   probability (A_j q)^lambda, where q is the share of its own voxels that the frame does not observe as free. A_j
+4. **Occluded objects.** A predicted object without conflict has no readings or very few. It stays with
+   probability (A_j q)^lambda, so there are candidates with it and without it. Here q is the share of its own voxels that the frame does not observe as free. A_j
    says whether the prediction can be trusted at all, and q whether this object is still there.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). A
    visible object is completed from its readings in this frame and from the views of the objects that it continues. An
