@@ -2,7 +2,7 @@
 
 >>> transition = TrueMotions()                                     # the rigid motion of each object
 >>> PartitionUpdate(free_space=TrueFreeSpace())                    # exactly the free space that is visible
->>> PartitionUpdate(evidence=(TrueQuality(),), n_candidates=100)   # the best of the update's own candidates
+>>> PartitionUpdate(evidence=(TrueQuality(),), n_scored=100)   # the best of the update's own candidates
 >>> PartitionUpdate(pairs=TruePairs())                             # the best of the partitions that it considers
 >>> filter = mstfilter.preset("mst", *STAGES["selection"])         # the n best of the candidates
 
@@ -127,7 +127,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "masks": ("proposal=true_masks", "proposal.completer=surface"),
     "completion": ("update.completer=true_completion",),
     "motions": ("transition=true_motions",),
-    "choice": ('update.evidence=["true_quality"]', "update.n_candidates=100"),
+    "choice": ('update.evidence=["true_quality"]', "update.n_scored=100"),
     "partition": ("update.pairs=true_pairs",),
     "free space": ("update.free_space=true_free_space",),
     "selection": ('update.evidence=["true_quality"]', "resampler=largest_weights"),

@@ -18,13 +18,14 @@ an object are estimated again from everything that was observed of it.
    prediction j and one partition of each part. Its weight is w_j Q_j^lambda times the probabilities of the partitions
    (`mstfilter.partition.candidates`). The most probable candidates are described. The resampler of the filter selects
    among them, and only these are completed. The paper crosses each sample with each prediction.
-3. **Association.** Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments continue
-   predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an object that
-   is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the partition
-   determines the merges.
+3. **Association.** Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments
+   continue predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an
+   object that is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the
+   partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has no readings or very few. It stays with
-   probability (A_j q)^lambda, so there are candidates with it and without it. Here q is the share of its own voxels that the frame does not observe as free. A_j
-   says whether the prediction can be trusted at all, and q whether this object is still there.
+   probability (A_j q)^lambda, so there are candidates with it and without it. Here q is the share of its own voxels
+   that the frame does not observe as free. A_j says whether the prediction can be trusted at all, and q whether this
+   object is still there.
 5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). A
    visible object is completed from its readings in this frame and from the views of the objects that it continues. An
    occluded object is completed from its views only. The completer drops views that the frame refutes. An object
@@ -32,7 +33,7 @@ an object are estimated again from everything that was observed of it.
    earlier pause is used again. The exception is an occluded object without views, which occurs if the completer does
    not use views. The object keeps its voxels outside free space.
 
-At the first pause the candidates are the samples, so every segment is a new object. Hypotheses have no objects that
+At the first pause the candidates are the distinct samples, so every segment is a new object. Hypotheses have no objects that
 no frame has shown.
 """
 

@@ -27,7 +27,7 @@ WHERE = {
     "masks": ["proposal"],
     "completion": ["update.completer"],
     "motions": ["transition"],
-    "choice": ["update.evidence", "update.n_candidates"],
+    "choice": ["update.evidence", "update.n_scored"],
     "partition": ["update.pairs"],
     "free space": ["update.free_space"],
     "selection": ["resampler", "update.evidence"],
