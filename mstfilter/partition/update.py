@@ -33,8 +33,8 @@ an object are estimated again from everything that was observed of it.
    earlier pause is used again. The exception is an occluded object without views, which occurs if the completer does
    not use views. The object keeps its voxels outside free space.
 
-At the first pause the candidates are the distinct samples, so every segment is a new object. Hypotheses have no objects that
-no frame has shown.
+At the first pause the candidates are the distinct samples, so every segment is a new object. Hypotheses have no
+objects that no frame has shown.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class PartitionUpdate(Update):
         The log odds that two cells belong to one object.
     temperature : float
         T. Partitions of a component have probabilities in proportion to P^(1/T), where P is their probability by the
-        pairs. The value was fitted in `experiments/partition_fit`.
+        pairs. A higher T makes the probabilities more even.
     occupied_log_odds : float
         Added to the log odds of every uncertain voxel, since the network is calibrated for its training scenes. The
         value was fitted in `experiments/partition_fit`.
