@@ -199,7 +199,8 @@ def resolve_apart(n_worlds: int, out: Path, n: int = 20, n_fit: int = N_FIT) -> 
             exact = exact_filter(world, observations).posterior
             logged = LoggedPairs(pairs)
             partition_filter(world, n, completer, logged).run(observations, seed)
-            asked = enumerate((cells for cells, _ in logged.log), start=1)  # at the first step there is no past
+            of_steps = {id(cells): cells for cells, _ in logged.log}.values()  # asked for each prediction
+            asked = enumerate(of_steps, start=1)  # at the first step there is no past
             errors.append(np.mean([components_apart(world, exact[t], cells, observations[t]) for t, cells in asked]))
         mean, half = interval(np.array(errors))
         rows.append({"world": shape, "n": n, "worlds": n_worlds, "tv": round(mean, 4), "tv_pm": round(half, 4)})

@@ -44,8 +44,8 @@ def test_partition_fit(tmp_path):
     assert all(float(row[past]) < math.log(2) for row in rows.values() for past in ("video", "two frames"))
     assert float(rows["both"]["stranger"]) < math.log(2)  # most objects of a wrong past are refuted before
     pairs = np.load(tmp_path / "pairs/demo-0.npz")
-    for found in (pairs[past] for past in pairs):  # of one pause
-        assert found[:, 7].sum() == pytest.approx(1) and ((found[:, 6] >= 0) & (found[:, 6] <= 1)).all()
+    for found in (pairs[past] for past in pairs):  # of one pause, given each of five predictions
+        assert found[:, 7].sum() == pytest.approx(5) and ((found[:, 6] >= 0) & (found[:, 6] <= 1)).all()
         np.testing.assert_allclose(found[:, 0] + found[:, 2], 1)  # the past is wrong, or right
 
 
