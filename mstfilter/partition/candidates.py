@@ -94,7 +94,7 @@ class Choices:
 
     def most_probable(self, n: int) -> Choices:
         """The n candidates of largest positive weight, in the present order."""
-        best = np.sort(np.argsort(-self.log_weights, kind="stable")[:n])
+        best = largest(self.log_weights, n)
         best = best[self.log_weights[best] > -np.inf]
         occluded = tuple(self.occluded[k] for k in best.tolist()) if self.occluded else ()
         return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], occluded)
@@ -109,6 +109,11 @@ class Choices:
         notes = {**projected.notes, "discarded_mass": round(discarded, 4)}
         parents = {"previous": previous[self.prediction]}
         return Population(np.arange(len(self)), self.log_weights, parents, notes)
+
+
+def largest(log_weights: np.ndarray, n: int) -> np.ndarray:
+    """Indices of the n largest log weights, ascending; of equal ones the first."""
+    return np.sort(np.argsort(-log_weights, kind="stable")[:n])
 
 
 def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -52,7 +52,7 @@ from scipy.special import logsumexp
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from mstfilter.partition.association import Overlaps
-from mstfilter.partition.candidates import Choices
+from mstfilter.partition.candidates import Choices, largest
 from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
 from mstfilter.scene import (
     Clip,
@@ -77,7 +77,6 @@ class Prediction:
 
     hypothesis: Hypothesis
     refined: Hypothesis  #: without the voxels that the frame observes as free
-    weight: float  #: w_j, normalised
     holds: float  #: probability that it holds, A^lambda
     objects: np.ndarray  #: (m,) its object at each reading, 0 is none or a refuted object
     refuted: frozenset[int]  #: labels of the objects that the frame does not show at their places
@@ -212,14 +211,13 @@ class PartitionUpdate(Update):
     ) -> list[Prediction]:
         """The evidence about each prediction in the last frame."""
         quality = np.exp(log_quality(np.array(projected.notes["quality"])))
-        columns = predicted.particles, projected.particles, predicted.weights.tolist(), quality.tolist()
+        columns = predicted.particles, projected.particles, quality.tolist()
         return [self._prediction(*one, readings, frame) for one in zip(*columns, strict=True)]
 
     def _prediction(
         self,
         hypothesis: Hypothesis,
         refined: Hypothesis,
-        weight: float,
         quality: float,
         readings: Readings,
         frame: Frame,
@@ -231,7 +229,7 @@ class PartitionUpdate(Update):
         objects = readings.labels(hypothesis.labels, self.reach)
         objects[np.isin(objects, refuted)] = 0
         holds = of_scene**self.quality_exponent
-        return Prediction(hypothesis, refined, weight, holds, objects, frozenset(refuted.tolist()))
+        return Prediction(hypothesis, refined, holds, objects, frozenset(refuted.tolist()))
 
     # 2. Partitions of the image, and their weights --------------------------------------------------------------
 
@@ -323,7 +321,7 @@ class PartitionUpdate(Update):
 
     def _scored(self, candidates: Population, clip: Clip) -> Population:
         """The `n_scored` candidates of largest weight, built and weighted by the evidence as well."""
-        kept = np.sort(np.argsort(-candidates.log_weights, kind="stable")[: self.n_scored])
+        kept = largest(candidates.log_weights, self.n_scored)
         built, scores = candidates.take(kept).realised(), {}
         total = np.zeros(len(built))
         for k, term in enumerate(self.evidence):
