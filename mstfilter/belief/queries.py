@@ -4,6 +4,7 @@
 >>> belief.occupancy()[tuple(belief.voxel([0.1, 0.0, 0.02]))]     # probability that the voxel is occupied
 >>> belief.same_object_at_pixels(camera, (310, 200), (340, 210))  # probability that two pixels show one object
 >>> belief.object_count()                                         # probability of 0, 1, 2, ... objects
+>>> belief.open_borders(camera)[0].one_object                     # probability of "one object" across a border
 >>> max(cameras, key=belief.view_information)                     # the most informative camera
 >>> belief.estimate()                                             # the hypothesis of least expected loss
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
@@ -27,9 +28,10 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from mstfilter.belief.information import (
     binary_entropy,
@@ -50,6 +52,7 @@ from mstfilter.scene import (
     common_refinement,
     project,
     render_hypothesis,
+    scaled_area,
 )
 from mstfilter.scoring import least_loss
 from mstfilter.smc import Population, first_seen
@@ -57,6 +60,19 @@ from mstfilter.smc import Population, first_seen
 Action = TypeVar("Action")
 
 _DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
+_LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 x 480 pixels
+
+
+class Border(NamedTuple):
+    """A border in an image across which hypotheses disagree: one object, or two?"""
+
+    one_object: float  #: probability that both sides are one object, if both are objects
+    pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The pixel (2,) of the border that is nearest to the mean of its pixels."""
+        return np.asarray(self.pixels[np.linalg.norm(self.pixels - self.pixels.mean(axis=0), axis=1).argmin()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +229,48 @@ class Belief:
         entropy[differ] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
         return entropy
 
+    def disagreement(self, camera: Camera) -> np.ndarray:
+        """Expected difference (H, W) of the objects that two hypotheses, drawn by weight, show at a pixel.
+
+        ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the object that hypothesis i shows at
+        the pixel, and J the Jaccard index. J is 1 if both show no object, and 0 if only one of them does.
+        """
+        refined = common_refinement(self._images(camera))
+        shared = refined.overlaps()
+        union = np.add.outer(shared.diagonal(), shared.diagonal()) - shared
+        jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
+        rows = refined.objects
+        same = sum(
+            w * v * jaccard[a, b]
+            for w, a in zip(self._mass, rows, strict=True)
+            for v, b in zip(self._mass, rows, strict=True)
+        )
+        return np.clip(1 - same, 0, 1)[refined.cells]
+
+    def open_borders(self, camera: Camera, at_least: float = 0.05) -> list[Border]:
+        """Borders in the image across which the hypotheses disagree, the most uncertain one first.
+
+        A border is open if both sides are one object with a probability between `at_least` and 1 - `at_least`, given
+        that both are objects. The parts beside a border look the same in every hypothesis. Parts of less than 200
+        pixels (in an image of 640 x 480) belong to the nearest larger part.
+        """
+        check_number("at_least", at_least, at_least=0, at_most=0.5)
+        refined = common_refinement(self._images(camera))
+        least = scaled_area(_LEAST_PART, camera.width * camera.height)
+        small = (refined.sizes < least)[refined.cells]
+        nearest = distance_transform_edt(small, return_distances=False, return_indices=True)
+        a, b, pixels = _neighbours(refined.cells if small.all() else refined.cells[tuple(nearest)])
+        of_a, of_b = refined.objects[:, a], refined.objects[:, b]
+        both, same = (of_a > 0) & (of_b > 0), (of_a > 0) & (of_a == of_b)
+        p_both, p_same = self._mass @ both, self._mass @ same
+        one = np.divide(p_same, p_both, out=np.ones_like(p_same), where=p_both > at_least)
+        borders: dict[bytes, list[int]] = {}  # pixels that ask the same question, about the same object
+        for k in np.flatnonzero((one >= at_least) & (one <= 1 - at_least)).tolist():
+            borders.setdefault(np.concatenate([both[:, k], same[:, k], of_a[same[:, k], k]]).tobytes(), []).append(k)
+        doubt = {key: p_both[k[0]] * float(binary_entropy(one[k[0]])) for key, k in borders.items()}
+        order = sorted(doubt, key=lambda key: -doubt[key])
+        return [Border(float(one[borders[k][0]]), pixels[borders[k]]) for k in order if len(borders[k]) ** 2 >= least]
+
     def partition_entropy(self, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation.
 
@@ -337,6 +395,19 @@ def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarr
     index = np.asarray(pixels)
     _check_indices("pixel", index, (camera.width, camera.height), "a pixel is (column, row)")
     return index[..., 1], index[..., 0]
+
+
+def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Different cells a < b (m,) of neighbouring pixels of an image (H, W), and the pixel (m, 2) of the first."""
+    found = []
+    for axis in (0, 1):
+        one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))
+        where = np.argwhere(one != next_one)
+        at = tuple(where.T)
+        pixels = where[:, ::-1] if axis == 0 else where  # (column, row)
+        found.append((np.minimum(one[at], next_one[at]), np.maximum(one[at], next_one[at]), pixels))
+    a, b, pixels = (np.concatenate(column) for column in zip(*found, strict=True))
+    return a, b, pixels
 
 
 def _extent(grid: VoxelGrid) -> str:

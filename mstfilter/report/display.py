@@ -83,7 +83,7 @@ def plot_recording(recording: Recording) -> Drawing:
 
 @matplotlib.style.context("mstfilter.report.figures")
 def plot_population(population: Population) -> Drawing:
-    """Hypotheses: the six heaviest with their weights. Numbers: weighted histograms of the first coordinates."""
+    """Hypotheses: the six most probable with their weights. Numbers: weighted histograms of the first coordinates."""
     population = population.realised()
     if isinstance(population.best, Hypothesis):
         return _plot_hypotheses(population)
@@ -119,7 +119,7 @@ def _plot_hypotheses(population: Population) -> Drawing:
 
 
 def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
-    """Pictures of the heaviest distinct hypotheses from one viewpoint, and texts with weight and objects."""
+    """Pictures of the most probable distinct hypotheses from one viewpoint, and texts with weight and objects."""
     particles, groups = population.particles, weigh_distinct(population.particles, population.weights.tolist())
     weights = [weight for _, weight in groups[:_MOST_PICTURES]]
     shown = [particles[members[0]] for members, _ in groups[:_MOST_PICTURES]]

@@ -104,6 +104,12 @@ def overlay_layer(
     return out
 
 
+def shade_layer(shares: np.ndarray, colour: Colour) -> np.ndarray:
+    """A colour with the opacity of shares (H, W) between 0 and 1, as (H, W, 4) uint8, not premultiplied."""
+    opacity = np.rint(255 * shares[..., None])
+    return np.concatenate([np.broadcast_to(colour, (*shares.shape, 3)) * (opacity > 0), opacity], -1).astype(np.uint8)
+
+
 def overlay(
     rgb: np.ndarray, labels: np.ndarray, colours: Mapping[int, Colour], *, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.belief import Belief
 from mstfilter.report.figures import quality_figure, reliability_figure
 from mstfilter.report.page import (
     fill_template,
@@ -25,7 +26,7 @@ from mstfilter.report.page import (
     short_text,
     write_page,
 )
-from mstfilter.report.pictures import close_up, data_uri, jpeg_bytes, viewpoint
+from mstfilter.report.pictures import PALETTE, close_up, data_uri, jpeg_bytes, png_bytes, shade_layer, viewpoint
 from mstfilter.report.run_numbers import SLOT_TITLES, RunNumbers, read_numbers
 from mstfilter.report.scenes import ShownHypothesis, scenes_of_run
 from mstfilter.report.viewer import run_page
@@ -34,6 +35,8 @@ from mstfilter.scene import Camera, project
 from mstfilter.scoring import (
     forecast_table,
 )
+
+_MOST_BORDERS = 6  # with numbers, in the picture of a pause
 
 
 def write_report(
@@ -83,6 +86,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
                 "width": scene.camera.width,
                 "height": scene.camera.height,
                 "close_up": close_up(volumes, scene.camera),
+                "doubt": _doubt(Belief(run.state(t).population), scene.camera),
                 "cards": [card for card in cards if card["weight"] is not None],
                 "hidden": scene.hidden,
                 "further": [card for card in cards if card["weight"] is None],
@@ -105,6 +109,20 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
         "voxels": one.voxels(view),
         "tags": _place_tags(project(one.hypothesis, camera), one.identity),
     }
+
+
+def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
+    """Where the hypotheses of a pause disagree in the image, for the template. None if they agree everywhere."""
+    disagreement = belief.disagreement(camera)
+    if not disagreement.any():
+        return None
+    tags: list[dict[str, Any]] = []
+    for border in belief.open_borders(camera):
+        x, y = border.middle.tolist()
+        apart = all(np.hypot(tag["x"] - x, tag["y"] - y) > 0.07 * camera.width for tag in tags)
+        if apart and len(tags) < _MOST_BORDERS:
+            tags.append({"text": f"{border.one_object:.2f}".lstrip("0"), "x": x, "y": y})
+    return {"overlay": data_uri(png_bytes(shade_layer(disagreement, PALETTE[3]))), "tags": tags}
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """What is shown at the pauses of a run or a recording: for the report and the page that can be rotated.
 
 >>> scenes = scenes_of_run(RunFolder.open("runs/demo"))
->>> view = scenes[-1].views[0]                        # the heaviest hypothesis of the last pause
+>>> view = scenes[-1].views[0]                        # the most probable hypothesis of the last pause
 >>> view.name, view.weight, view.overlay(scenes[-1].camera, 1, 2)
 
 Each hypothesis has its name, its weight and quality, and the colours of its objects (`report.identities`).
@@ -70,7 +70,7 @@ class ShownPause:
 
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
-    """The pauses of a run: at most twelve distinct hypotheses from heavy to light, then the truth."""
+    """The pauses of a run: at most twelve distinct hypotheses the most probable first, then the truth."""
     identities, times = assign_identities(run), run.description["recording"]["times"]
     scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}

@@ -24,7 +24,7 @@ _TABLES = {
     "Quality": (
         ("quality", "quality"),
         (SLOPES["quality"], "slope"),
-        ("quality_top", "heaviest"),
+        ("quality_top", "most probable"),
         ("quality_best", "best of n"),
         ("quality_estimate", "estimate"),
         ("quality_visible", "visible objects"),

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.special import entr
 
-from mstfilter import Belief
+from mstfilter import Belief, InputError
 from mstfilter.belief.information import hamming, outcome_information
 from mstfilter.scene import Camera, Hypothesis, Occupancy, VoxelGrid, look_at, render
 from mstfilter.smc import Population
@@ -96,6 +96,40 @@ def test_pixels(case):
             assert found[a, b] == pytest.approx(want, abs=1e-12)
             seen += 0.01 < want < 0.99
     assert seen > 4
+
+
+def test_disagreement_in_an_image(case):
+    belief, grids, w = case
+    images = [render(g, GRID, CAMERA).labels for g in grids]
+    found = belief.disagreement(CAMERA)
+    for row, column in itertools.product(range(0, CAMERA.height, 3), range(0, CAMERA.width, 3)):
+        shown = [set(np.flatnonzero(i == i[row, column])) if i[row, column] else set() for i in images]
+        agree = [[len(a & b) / len(a | b) if a | b else 1.0 for b in shown] for a in shown]
+        assert found[row, column] == pytest.approx(1 - w @ agree @ w, abs=1e-9)
+
+
+def test_open_borders_of_touching_boxes():
+    # Three boxes in a row. The first two are one object with weight .3; the last one is never joined.
+    camera = Camera.from_intrinsics(600, 600, 99.5, 99.5, 200, 200, look_at((0.001, 0, 0.5), (0, 0, 0)))
+    grid = VoxelGrid(np.array([-0.06, -0.06, 0.0]), 0.01, (12, 12, 4))
+    apart = np.zeros(grid.shape, np.uint16)
+    apart[1:4, 3:9, :2], apart[4:7, 3:9, :2], apart[7:10, 3:9, :2] = 1, 2, 3
+    joined = np.where(apart == 2, 1, apart).astype(np.uint16)
+    belief = belief_of([apart, joined], np.log([0.7, 0.3]), grid)
+    (border,) = belief.open_borders(camera)
+    assert border.one_object == pytest.approx(0.3)
+    image = render(apart, grid, camera).labels
+    for column, row in border.pixels:
+        around = image[row : row + 2, column : column + 2]
+        assert {1, 2} <= set(around.ravel().tolist())
+    assert (
+        len(border.pixels) >= (image == 1).any(axis=0).sum() or len(border.pixels) >= (image == 1).any(axis=1).sum()
+    )
+    assert image[tuple(border.middle[::-1])] in (1, 2)
+    assert belief.open_borders(camera, at_least=0.4) == []
+    assert belief_of([apart], [0.0], grid).open_borders(camera) == []
+    with pytest.raises(InputError, match="at_least is 0.7"):
+        belief.open_borders(camera, at_least=0.7)
 
 
 def test_object_count(case):

@@ -86,6 +86,8 @@ def test_contents_of_the_page(finished):
     # One picture of the camera a pause, used by every card of it; truth and heaviest are drawn at the top too.
     assert text.count("data:image/jpeg") == 3
     assert text.count("Truth</b>") == 3
+    # At one pause, all hypotheses are equal.
+    assert text.count("<b>Disagreement</b>") == 2
 
 
 def test_text_of_the_user_is_escaped(finished):
@@ -169,7 +171,7 @@ def test_only_the_heaviest_of_many_hypotheses_have_cards(tmp_path):
     info["parents"] = {"proposed": list(range(20))}
     (run.pause(0) / "info.json").write_text(json.dumps(info))
     _, page = read(write_report(run))
-    assert "The 12 heaviest are shown; the others have 40 % of the weight." in page.text
+    assert "The 12 most probable are shown; the others have 40 % of the weight." in page.text
 
 
 def test_errors(tmp_path):
