@@ -76,7 +76,8 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     view = viewpoint(volumes, run.camera(0)) if scenes else None
     pauses = []
     for t, (step, scene) in enumerate(zip(numbers.steps, scenes, strict=True)):
-        assert scene.camera is not None and scene.image is not None and view is not None
+        population = run.state(t).population
+        assert scene.camera is not None and scene.image is not None and view is not None and population is not None
         cards = [_card(one, scene.camera, view) for one in scene.views]
         pauses.append(
             {
@@ -86,7 +87,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
                 "width": scene.camera.width,
                 "height": scene.camera.height,
                 "close_up": close_up(volumes, scene.camera),
-                "doubt": _doubt(Belief(run.state(t).population), scene.camera),
+                "doubt": _doubt(Belief(population), scene.camera),
                 "cards": [card for card in cards if card["weight"] is not None],
                 "hidden": scene.hidden,
                 "further": [card for card in cards if card["weight"] is None],
