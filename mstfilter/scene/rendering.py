@@ -7,7 +7,7 @@
 The ray of each pixel is followed from voxel to voxel. The ray jumps in free space. If the nearest occupied voxel has
 the chessboard distance D, the cube of half-width D - 1 around the current voxel is empty. The ray continues at the
 face where it leaves this cube. With D = 1 this is the voxel traversal of Amanatides and Woo (1987). The jumps save
-steps and do not change the result.
+steps and do not change the result. A hypothesis is rendered object by object, and hypotheses share their objects.
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import distance_transform_cdt, find_objects
 
-from mstfilter.scene.arrays import read_only
+from mstfilter.scene.arrays import content_key, read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid, labels_on, occupied_box
+
+_Box = tuple[slice, ...]
 
 
 class Rendering(NamedTuple):
@@ -38,10 +41,32 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
     """Label image and depth of a hypothesis, read-only. Cached by content."""
 
     def compute() -> Rendering:
-        labels, depth = render(hypothesis.labels, hypothesis.grid, camera)
-        return Rendering(read_only(labels), read_only(depth))
+        image = np.zeros((camera.height, camera.width), np.uint16)
+        depth = np.full(image.shape, np.inf, np.float32)
+        for label, box in enumerate(find_objects(hypothesis.labels), 1):
+            if box is not None:
+                window, of_object = _object_depth(hypothesis.labels[box] == label, box, hypothesis.grid, camera)
+                nearer = of_object < depth[window]
+                image[window][nearer] = label
+                depth[window][nearer] = of_object[nearer]
+        depth[image == 0] = np.nan
+        return Rendering(read_only(image), read_only(depth))
 
     return memo("render", (hypothesis.key, camera.key), compute)
+
+
+def _object_depth(mask: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray]:
+    """A window of the image and the depth (h, w) of an object in it, inf without a hit. Hypotheses share objects.
+
+    `mask` (a, b, c) are its voxels in a box of the grid.
+    """
+
+    def compute() -> tuple[_Box, np.ndarray]:
+        window, _, depth = _cast(mask, box, grid, camera)
+        return window, read_only(depth)
+
+    corner = tuple(side.start for side in box)
+    return memo("render_object", (content_key("object", mask, grid.key), corner, camera.key), compute)
 
 
 def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
@@ -49,33 +74,37 @@ def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
     labels = labels_on(grid, labels)
     image = np.zeros((camera.height, camera.width), np.uint16)
     depth = np.full(image.shape, np.nan, np.float32)
-    bounds = occupied_box(labels != 0)
-    if bounds is None:
-        return Rendering(image, depth)
-    box, lower = labels[bounds], np.array([side.start for side in bounds])
-
-    # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
-    matrix = camera.pose.as_matrix()
-    start = (matrix[:3, 3] - grid.origin) / grid.voxel_size - lower
-    rows, columns = _window(start, box.shape, grid, lower, camera)
-    directions = camera.rays()[rows, columns].reshape(-1, 3) @ (matrix[:3, :3].T / grid.voxel_size)
-    # A component of exactly 0 never meets a face of its axis; a tiny one behaves the same without special cases.
-    directions[np.abs(directions) < 1e-12] = 1e-12
-
-    hit, voxel, t = _traverse(box, start, directions)
-    window = np.zeros(directions.shape[0], np.uint16)
-    window_depth = np.full(directions.shape[0], np.nan, np.float32)
-    window[hit] = box.ravel()[voxel]
-    window_depth[hit] = t
-    size = (rows.stop - rows.start, columns.stop - columns.start)
-    image[rows, columns] = window.reshape(size)
-    depth[rows, columns] = window_depth.reshape(size)
+    box = occupied_box(labels != 0)
+    if box is not None:
+        window, voxel, found = _cast(labels[box], box, grid, camera)
+        hit = voxel >= 0
+        image[window][hit] = labels[box].ravel()[voxel[hit]]
+        depth[window][hit] = found[hit]
     return Rendering(image, depth)
 
 
-def _window(
-    start: np.ndarray, shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: Camera
-) -> tuple[slice, slice]:
+def _cast(labels: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray, np.ndarray]:
+    """Cast rays into a box of the grid that has these labels (a, b, c).
+
+    Returns the window of the image that can show the box, the flat voxel (h, w) of each pixel with -1 without a hit,
+    and its depth (h, w) float32 with inf without a hit.
+    """
+    lower = np.array([side.start for side in box])
+    # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
+    matrix = camera.pose.as_matrix()
+    start = (matrix[:3, 3] - grid.origin) / grid.voxel_size - lower
+    window = _window(labels.shape, grid, lower, camera)
+    rays = camera.rays()[window]
+    directions = rays.reshape(-1, 3) @ (matrix[:3, :3].T / grid.voxel_size)
+    # A component of exactly 0 never meets a face of its axis; a tiny one behaves the same without special cases.
+    directions[np.abs(directions) < 1e-12] = 1e-12
+    voxel, depth = np.full(len(directions), -1), np.full(len(directions), np.inf, np.float32)
+    hit, at, t = _traverse(labels, start, directions)
+    voxel[hit], depth[hit] = at, t
+    return window, voxel.reshape(rays.shape[:2]), depth.reshape(rays.shape[:2])
+
+
+def _window(shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: Camera) -> tuple[slice, slice]:
     """Image rows and columns that can show the box, or all of them if a corner is not in front of the camera."""
     corners = np.array(np.meshgrid(*[(0, n) for n in shape], indexing="ij")).reshape(3, -1).T
     uv, z = camera.project(grid.origin + (corners + lower) * grid.voxel_size)
@@ -91,8 +120,6 @@ def _traverse(
     box: np.ndarray, start: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Follow rays (n, 3) from `start`. Returns ray number, flat voxel index and t of rays that hit a voxel."""
-    from scipy.ndimage import distance_transform_cdt
-
     distance = distance_transform_cdt(box == 0, metric="chessboard").astype(np.int32).ravel()
     shape = np.array(box.shape)
     strides = np.array([shape[1] * shape[2], shape[2], 1])

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.fields import Bounded
-from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid
+from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid, content_key, memo
 from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import invert, move_points
@@ -127,7 +127,8 @@ class Warp(Bounded):
             return index, depth, record.moved(RigidTransform.from_matrix(T), crop).changed()
         crop = record.source or hypothesis.crop(record.label)
         total = T if record.source is None else T @ record.motion.as_matrix()
-        index, depth = _pull(crop, total, grid)
+        moved = content_key("pull", crop.occupied, crop.offset, total, grid.key)
+        index, depth = memo("pull", moved, lambda: _pull(crop, total, grid))  # hypotheses share objects
         if not len(index):  # a thin object between two rows of voxel centres
             index, depth = _push(crop, total, grid)
         return index, depth, record.moved(RigidTransform.from_matrix(T), crop)

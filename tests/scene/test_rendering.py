@@ -9,8 +9,8 @@ from hypothesis import given, settings, strategies as st
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.open3d_import import import_open3d
 from mstfilter.scene.camera import Camera, look_at
-from mstfilter.scene.rendering import render
-from mstfilter.scene.voxels import VoxelGrid
+from mstfilter.scene.rendering import render, render_hypothesis
+from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 GRID = VoxelGrid((-0.1, -0.1, 0.0), 0.02, (10, 11, 9))
 CAMERA = Camera.from_intrinsics(40, 42, 15.3, 12.1, 32, 24, look_at((0.03, -0.5, 0.4), (0, 0, 0.05)))
@@ -57,6 +57,21 @@ def test_rendering_agrees_with_open3d(density, position):
     assert same.mean() > 0.999 and (image > 0).mean() > 0.1
     difference = np.abs(got.depth - depth)[same & (image > 0)]
     assert (difference < 1e-5).mean() > 0.999
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), x=st.floats(-0.6, 0.6), y=st.floats(0.1, 0.6), z=st.floats(0.02, 0.7))
+def test_objects_rendered_one_by_one_give_the_scene(seed, x, y, z):
+    """The nearest object at each pixel is that of the ray through all voxels; other pixels are on edges."""
+    rng = np.random.default_rng(seed)
+    blocks = rng.integers(0, 6, (4, 4, 3)).repeat(3, axis=0).repeat(3, axis=1).repeat(3, axis=2)
+    labels = blocks[:10, :11].astype(np.uint16)
+    camera = CAMERA.at(look_at((x, y, z), (0.0123, 0.0071, 0.05)))
+    whole = render(labels, GRID, camera)
+    parts = render_hypothesis(Hypothesis.from_labels(labels, GRID), camera)
+    same = (parts.labels == whole.labels) & (np.isnan(parts.depth) == np.isnan(whole.depth))
+    assert same.mean() > 0.995
+    np.testing.assert_allclose(parts.depth[same], whole.depth[same], rtol=1e-5)
 
 
 def test_depth_of_a_wall_is_the_distance_to_its_plane():
