@@ -275,8 +275,10 @@ class Stream:
         found = self._found(item.time, item.frame.rgb)
         rests = found if item.pause is None else item.pause
         if self._world is None:
-            if not rests:
-                return  # the first clip is the first pause alone
+            if not rests:  # the first clip is the first pause alone
+                if self._step is None:
+                    self._step = self._pool.submit(self._load, item.frame, self._state)
+                return
             self._world, self._grid = find_world(item.frame, self._grid)
         if item.frame.camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
@@ -321,6 +323,12 @@ class Stream:
         self._track()
 
     # --- thread of the filter -----------------------------------------------------------------------------------
+    def _load(self, frame: Frame, state: State) -> None:
+        """Filter a frame before the first pause, and discard the result. So libraries and networks are loaded."""
+        with contextlib.suppress(InputError):  # the frame need not show the scene at rest
+            camera, grid = find_world(frame, self._grid)
+            self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
+
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
         """Filter a clip. The references to `trackers` keep their work until the filter uses it."""
         try:

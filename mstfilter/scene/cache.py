@@ -120,12 +120,12 @@ class Cache:
         return self._n_bytes
 
     def forget(self) -> None:
-        """Drop the values that were last used before the previous call.
+        """Drop the values that were not used since the second last call.
 
         A loop over pauses that calls this method after each step keeps the values of the last two steps.
         """
         with self._lock:
-            for entry in [entry for entry, used in self._used.items() if used < self._n_forgotten]:
+            for entry in [entry for entry, used in self._used.items() if used < self._n_forgotten - 1]:
                 self._drop(entry)
             self._n_forgotten += 1
 
