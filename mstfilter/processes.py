@@ -15,7 +15,7 @@ import functools
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -116,6 +116,23 @@ def together(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]
         raise
     # A call that has not begun is made here. So nested calls cannot wait for each other.
     return found, second() if other.cancel() else other.result()
+
+
+def each(function: Callable[[_A], _B], items: Iterable[_A]) -> list[_B]:
+    """The results of a function for several items, computed two at a time in a block `parallel`.
+
+    The calls are independent and free of side effects.
+    """
+    given = list(items)
+    found: dict[int, _B] = {}
+    waiting = iter(range(len(given)))  # `next` of an iterator over a range is atomic
+
+    def work() -> None:
+        for k in waiting:
+            found[k] = function(given[k])
+
+    together(work, work)
+    return [found[k] for k in range(len(given))]
 
 
 def _cpu() -> str:
