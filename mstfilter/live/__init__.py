@@ -4,7 +4,7 @@
 ...     for rgb, depth in camera:
 ...         stream.push(rgb, depth)
 
-Modules: `stream` has the `Stream`, `folder` a folder that a recorder fills, and `ros` a node of ROS 2.
+Modules: `stream` has the `Stream`, and `folder` a folder that a recorder fills.
 """
 
 from mstfilter.lazy import attach

@@ -15,7 +15,7 @@ from mstfilter.formats import RecordingFormat, Redwood, Settled
 from mstfilter.live.stream import Pause, Stream
 from mstfilter.presets import build_filter
 from mstfilter.runs import RunFolder, check_run_folder, describe_run
-from mstfilter.scene import Frame, content_key
+from mstfilter.scene import content_key
 
 
 def filter_folder(
@@ -90,18 +90,13 @@ def filter_folder(
 
     frames = reader.arriving(source, idle_s)
     with locked(path):
-        time, frame = _first(frames, source)
+        time, frame = next(frames, (0.0, None))
+        if frame is None:
+            raise InputError(f"no image arrived in {source}")
         camera = frame.camera if reader.world.pose is None else frame.camera.at(reader.world.pose)
+        settings: dict[str, Any] = {"grid": reader.world.grid, "seed": seed, "threads": n_threads}
         try:
-            with Stream(
-                camera,
-                filter,
-                pauses=reader.pauses,
-                grid=reader.world.grid,
-                seed=seed,
-                on_pause=write,
-                threads=n_threads,
-            ) as stream:
+            with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
                 stream.push(frame.rgb, frame.depth, time)
                 for time, frame in frames:
                     stream.push(frame.rgb, frame.depth, time)
@@ -112,11 +107,3 @@ def filter_folder(
             raise InputError(f"no pause found in {source}: the image was never still", "-o pauses.hold_s=0.2")
         finish("done")
     return folder
-
-
-def _first(frames: Any, source: Path) -> tuple[float, Frame]:
-    """The first frame."""
-    first: tuple[float, Frame] | None = next(frames, None)
-    if first is None:
-        raise InputError(f"no image arrived in {source}")
-    return first

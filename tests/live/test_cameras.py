@@ -12,7 +12,6 @@ import pytest
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.live.ros import ImagePairs, belief_json, camera_matrix, label_image, main
 from mstfilter.scene import Recording
 from tests.conftest import REPOSITORY
 from tests.formats.bags import COLOUR, DEPTH, scene_messages, topic_info
@@ -21,14 +20,15 @@ from tests.live.test_stream import FAST, RULE, arrays
 from tests.scene.scenes import CAMERA
 
 EXAMPLES = REPOSITORY / "docs" / "examples" / "live"
+NODE = SimpleNamespace(**runpy.run_path(str(EXAMPLES / "ros_node.py"), run_name="ros_node"))
 
 
 def test_the_node_has_the_results_of_the_frames_in_its_messages():
     messages, found, lost = scene_messages(False), [], 1
-    K = next(camera_matrix(message) for topic, _, (_, message) in messages if topic == topic_info(COLOUR))
+    K = next(NODE.camera_matrix(message) for topic, _, (_, message) in messages if topic == topic_info(COLOUR))
     np.testing.assert_allclose(K, CAMERA.K)
     with mstfilter.Stream(K, FAST, seed=4, pauses=RULE, on_pause=found.append) as stream:
-        pairs = ImagePairs(stream)
+        pairs = NODE.ImagePairs(stream)
         for number, (topic, _, (_, message)) in enumerate(messages):
             if topic == COLOUR and number // 3 != lost:  # info, colour and depth of each frame
                 pairs.add_colour(message)
@@ -41,8 +41,8 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     recording = Recording.from_arrays(rgb[kept], metres, K, times=np.array(kept) / FPS, pauses=RULE)
     states = [state for state, _ in FAST.iterate(recording.clips(), 4)]
     assert [arrays(pause.state) for pause in found] == [arrays(state) for state in states]
-    assert label_image(found[1]).shape == (120, 160)
-    belief = json.loads(belief_json(found[1]))
+    assert NODE.label_image(found[1]).shape == (120, 160)
+    belief = json.loads(NODE.belief_json(found[1]))
     assert sum(one["weight"] for one in belief["hypotheses"]) == pytest.approx(1, abs=1e-4)
     best = max(belief["hypotheses"], key=lambda one: one["weight"])
     assert set(best["objects"][0]) == {"label", "id", "voxels", "centre", "T_world_box", "sides"}
@@ -51,7 +51,7 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
 def test_the_node_says_that_ros_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     with pytest.raises(InputError, match="ROS 2 needs rclpy"):
-        main()
+        NODE.main()
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """A node of ROS 2: image topics in; a label image and the belief out.
 
-The node is started by ``python -m mstfilter.live.ros --ros-args -p colour:=/camera/color/image_raw``. Parameters:
+The node is started by ``python ros_node.py --ros-args -p colour:=/camera/color/image_raw``. Parameters:
 
 - ``colour``, ``depth``, ``camera_info``: topics of the camera. Depth is registered to colour.
 - ``depth_scale``: metres per unit of 16-bit depth (0.001). ``tolerance_s``: largest difference of two stamps (0.02).
@@ -22,7 +22,7 @@ import numpy as np
 from mstfilter.errors import missing_library
 from mstfilter.formats import Settled
 from mstfilter.formats.bag import colour_image, depth_image
-from mstfilter.live.stream import Pause, Stream
+from mstfilter.live import Pause, Stream
 from mstfilter.scene import project
 
 _WAITING = 30  # images of each topic that wait for a partner
