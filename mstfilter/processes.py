@@ -15,15 +15,19 @@ import functools
 import os
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mstfilter.errors import InputError
+
+_A = TypeVar("_A")
+_B = TypeVar("_B")
 
 
 @contextmanager
@@ -80,6 +84,55 @@ def threads() -> int:
 def available_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_pools: list[ThreadPoolExecutor] = []  # of the blocks `parallel`, innermost last
+
+
+@contextmanager
+def parallel(n_threads: int) -> Iterator[None]:
+    """In the block, `together` uses up to `n_threads` threads of this process. The results are the same."""
+    if n_threads < 2:
+        yield
+        return
+    with ThreadPoolExecutor(n_threads - 1, "mstfilter") as pool:
+        _pools.append(pool)
+        try:
+            yield
+        finally:
+            _pools.remove(pool)
+
+
+def together(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:
+    """The results of two independent functions, computed at the same time in a block `parallel`."""
+    if not _pools:
+        return first(), second()
+    other = _pools[-1].submit(second)
+    try:
+        found = first()
+    except BaseException:
+        if not other.cancel():
+            other.exception()  # wait, so that nothing continues after the error
+        raise
+    # A call that has not begun is made here. So nested calls cannot wait for each other.
+    return found, second() if other.cancel() else other.result()
+
+
+def each(function: Callable[[_A], _B], items: Iterable[_A]) -> list[_B]:
+    """The results of a function for several items, computed two at a time in a block `parallel`.
+
+    The calls are independent and free of side effects.
+    """
+    given = list(items)
+    found: dict[int, _B] = {}
+    waiting = iter(range(len(given)))  # `next` of an iterator over a range is atomic
+
+    def work() -> None:
+        for k in waiting:
+            found[k] = function(given[k])
+
+    together(work, work)
+    return [found[k] for k in range(len(given))]
 
 
 def _cpu() -> str:

@@ -22,6 +22,7 @@ from mstfilter.cli.root import (
     read_source,
     safe_name,
 )
+from mstfilter.errors import InputError
 from mstfilter.files import atomic_folder, check_output, locked, write_csv
 from mstfilter.report.progress import progress_bar
 
@@ -47,6 +48,14 @@ def run(
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace an earlier run in the run folder after the first step.")
     ] = False,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Threads of a step, with the same result. 0: all available cores.")
+    ] = 0,
+    cache: Annotated[int, typer.Option(min=0, help="Largest size of the cache of shared work, in MiB.")] = 768,
+    live: Annotated[
+        float,
+        typer.Option(min=0, metavar="SECONDS", help="Filter images as they arrive, until none arrives for so long."),
+    ] = 0,
 ) -> None:
     """Filter a recording into a run folder, or resume a run that was stopped."""
     from mstfilter.presets import build_filter, load_config
@@ -64,10 +73,36 @@ def run(
         check_run_folder(out, replace)
     else:
         check_output(Path("runs"), folder=True, empty=False)
-    source = read_source(recording, format, option, pauses)
+    from mstfilter.processes import available_cores
+    from mstfilter.scene import scene_cache
+
+    scene_cache.limit_bytes = cache * 2**20
+    threads = threads or available_cores()
+    source = None if live else read_source(recording, format, option, pauses)
     name = Path(preset).stem
-    folder = out or Path("runs") / f"{safe_name(source.name)}-{safe_name(name)}-{seed}"
-    _execute_all(source, configs, folder, seed, replace)
+    title = recording.resolve().name if source is None else source.name
+    folder = out or Path("runs") / f"{safe_name(title)}-{safe_name(name)}-{seed}"
+    if source is None:
+        from mstfilter.formats import open_format
+        from mstfilter.live import filter_folder
+
+        if compare:
+            raise InputError("--compare needs a complete recording", "run the folder again without --live")
+        reader = open_format(recording, format or "redwood", option or (), pauses or "settled")
+        filter_folder(
+            recording,
+            reader,
+            configs[""],
+            folder,
+            seed,
+            idle_s=live,
+            replace=replace,
+            allow_files=True,
+            n_threads=threads,
+            on_pause=lambda pause: print(f"pause {pause.index}     {pause.latency_s:.2f} s after its last image"),
+        )
+    else:
+        _execute_all(source, configs, folder, seed, replace, threads)
     for name in configs:
         print(f"run         {_compared(folder, name)}")
     from mstfilter.report import read_numbers, write_report
@@ -242,7 +277,12 @@ def _simulate(family: str, out: Path, seed: int, overrides: Sequence[str] = ()) 
 
 
 def _execute_all(
-    recording: Any, configs: dict[str, dict[str, Any]], folder: Path, seed: int, replace: bool = False
+    recording: Any,
+    configs: dict[str, dict[str, Any]],
+    folder: Path,
+    seed: int,
+    replace: bool = False,
+    threads: int = 1,
 ) -> None:
     """Run the filter without a name in `folder`, and the filters for comparison in its folder ``compare``."""
     from mstfilter.runs import filter_recording
@@ -257,6 +297,7 @@ def _execute_all(
                 replace=replace and not name,
                 allow_files=True,
                 progress=advance,
+                n_threads=threads,
             )
 
 

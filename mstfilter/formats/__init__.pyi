@@ -9,9 +9,14 @@ from mstfilter.formats.pauses import (
     At as At,
     Ends as Ends,
     EveryNth as EveryNth,
+    Settled as Settled,
     Still as Still,
 )
-from mstfilter.formats.sources import detect_format as detect_format, open_recording as open_recording
+from mstfilter.formats.sources import (
+    detect_format as detect_format,
+    open_format as open_format,
+    open_recording as open_recording,
+)
 from mstfilter.formats.video import (
     KnownWorld as KnownWorld,
     RecordingFormat as RecordingFormat,

@@ -8,6 +8,8 @@
 from __future__ import annotations
 
 import re
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -89,6 +91,8 @@ _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _STILL = "remove the file if the camera stands still"
+_POLL_S = 0.02
+_WRITTEN_S = 0.3  # age of the last files after which they are complete
 _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
 
 
@@ -123,9 +127,40 @@ class Redwood(VideoFormat):
         folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
         return any((path / name).is_dir() for name in folders)
 
+    def arriving(self, path: Path, idle_s: float = 10.0) -> Iterator[tuple[float, Frame]]:
+        """Time in seconds and frame without a pose of each pair of images of a folder that a recorder fills.
+
+        A pair is read when a later one exists, or when its files do not change any more. A colour image without a
+        depth image of the same number is left out. The iteration ends if no pair arrives for `idle_s` seconds.
+        """
+        last, since, failed = Decimal(-2), time.monotonic(), None
+        while time.monotonic() - since < idle_s:
+            try:
+                colour, depth = _both(*self._files(path))
+                age = time.time() - max(file.stat().st_mtime for file in (colour[-1], depth[-1]))
+                new = [k for k, file in enumerate(colour) if _number(file) > last]
+                new = new if age > _WRITTEN_S else [k for k in new if k < len(colour) - 1]
+                if new:
+                    video = self._video(path, colour, depth)
+                    camera, read = video.frame_reader()
+                for k in new:
+                    yield video.times[k], read(k, camera)
+                    last, since, failed = _number(colour[k]), time.monotonic(), None
+            except InputError as error:  # there is no image yet, or a file is incomplete
+                failed = error
+            time.sleep(_POLL_S)
+        if failed is not None:
+            raise failed
+
     def video(self, path: Path) -> Video:
+        return self._video(path, *self._files(path))
+
+    def _files(self, path: Path) -> tuple[list[Path], list[Path]]:
+        """Colour and depth images."""
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
-        colour, depth = _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
+        return _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
+
+    def _video(self, path: Path, colour: list[Path], depth: list[Path]) -> Video:
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
         file, stored = _read_intrinsics(path)
         K = self.K or _stored_matrix(path, file, stored)
@@ -169,6 +204,14 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
             "name them 000000, 000001, ..., or by time in seconds",
         )
     return sorted(files, key=_number)
+
+
+def _both(colour: list[Path], depth: list[Path]) -> tuple[list[Path], list[Path]]:
+    """The images whose numbers are in both lists."""
+    common = {_number(file) for file in colour} & {_number(file) for file in depth}
+    if not common:
+        raise InputError("no colour image has a depth image of the same number")
+    return [file for file in colour if _number(file) in common], [file for file in depth if _number(file) in common]
 
 
 def _number(file: Path) -> Decimal:

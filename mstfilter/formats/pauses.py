@@ -8,6 +8,7 @@ recording folder of mstfilter stores the pauses. For other layouts, one of the r
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -140,12 +141,13 @@ class Still(PauseRule):
         self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]
     ) -> tuple[tuple[int, int], ...]:
         """First and last frame of each still interval."""
-        images = [self._part(grey_blocks(read_rgb(index))) for index in range(len(times))]
+        images = [self.part(grey_blocks(read_rgb(index))) for index in range(len(times))]
         if len({image.shape for image in images}) > 1:
             raise InputError(f"images differ in size: {sorted({image.shape for image in images})} blocks")
         if len(images) == 1:
             return ((0, 0),)
-        limit, allowed = self._limit(images), _SHARE * images[0].size
+        changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
+        limit, allowed = self.limit(changes), _SHARE * images[0].size
         runs, first = [], 0
         for index in range(1, len(images) + 1):
             if index < len(images) and (_changes(images[first], images[index]) > limit).sum() <= allowed:
@@ -154,16 +156,77 @@ class Still(PauseRule):
             first = index
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
 
-    def _part(self, blocks: np.ndarray) -> np.ndarray:
+    def part(self, blocks: np.ndarray) -> np.ndarray:
+        """The blocks (h, w) of the region."""
         h, w = blocks.shape
         left, top, right, bottom = self.region
         return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
 
-    def _limit(self, images: list[np.ndarray]) -> np.ndarray:
-        """Change (h, w) in grey levels at which a block differs, a multiple of its noise at rest."""
-        changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
+    def limit(self, changes: np.ndarray) -> np.ndarray:
+        """Change (h, w) in grey levels at which a block differs, a multiple of its noise at rest.
+
+        `changes` (n, h, w) are the changes between consecutive images.
+        """
         quarter = np.quantile(changes, 0.25, axis=0) / 0.3186  # the quartile of |x| for a standard normal x is 0.3186
         overall = 1.4826 * np.quantile(np.median(changes, axis=(1, 2)), 0.25)
         limit = np.clip(6 * np.maximum(quarter, overall), self.levels, None)
         bounded: np.ndarray = np.minimum(limit, max(_MAX_LEVELS * self.levels, 6 * overall))
         return bounded
+
+
+@dataclass(frozen=True)
+class Settled(PauseRule):
+    """The frames at which the image has been still for `hold_s` seconds, found while the frames arrive.
+
+    The rule and its parameters are those of `Still`. But each pause is the frame at which its interval reaches
+    `hold_s`, and the noise is measured in the last hundred frames. So a pause depends on earlier frames only, and the
+    pauses of a stream and of its recording are the same.
+    """
+
+    hold_s: NonNegativeFloat = 0.5
+    levels: NonNegativeFloat = 3.0
+    region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        _ = self._still
+
+    @property
+    def _still(self) -> Still:
+        return Still(self.hold_s, self.levels, self.region)
+
+    def watch(self) -> Callable[[float, np.ndarray], bool]:
+        """A function of the time and the colour image of each frame in order: whether the frame is a pause."""
+        still, changes = self._still, deque[np.ndarray](maxlen=_RECENT)
+        first = last = None  # images of the first frame of the interval and of the last frame
+        began, found = 0.0, False
+
+        def add(time: float, rgb: np.ndarray) -> bool:
+            nonlocal first, last, began, found
+            image = still.part(grey_blocks(rgb))
+            if last is not None and image.shape != last.shape:
+                raise InputError(f"images differ in size: {last.shape} and {image.shape} blocks")
+            if last is not None:
+                changes.append(_changes(last, image))
+            last = image
+            if first is None or (_changes(first, image) > still.limit(np.stack(changes))).sum() > _SHARE * image.size:
+                first, began, found = image, time, False
+                return False
+            if found or time - began < self.hold_s - 1e-9:
+                return False
+            found = True
+            return True
+
+        return add
+
+    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        add = self.watch()
+        found = tuple(index for index, time in enumerate(times) if add(time, read_rgb(index)))
+        if not found:
+            raise InputError(
+                f"no pause found: in {len(times)} frames the image is never still for {self.hold_s:g} s",
+                "accept shorter intervals: -o pauses.hold_s=0.2; or give the pauses: --pauses 0,40,85",
+            )
+        return found
+
+
+_RECENT = 100  # changes between frames in which `Settled` measures the noise

@@ -44,6 +44,13 @@ def open_recording(
     allow_files : bool
         Whether ``./file.py:Class`` may be loaded.
     """
+    return open_format(path, format, options, pauses, allow_files=allow_files).open(Path(path))
+
+
+def open_format(
+    path: str | Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
+) -> RecordingFormat:
+    """The reader for an existing path. Parameters: `open_recording`."""
     path = Path(path)
     fields = format_settings(options)
     if pauses:
@@ -55,7 +62,7 @@ def open_recording(
     if not path.exists():
         raise InputError(f"recording does not exist: {path}")
     reader: RecordingFormat = _REGISTRY.make(cls, fields, "", allow_files)
-    return reader.open(path)
+    return reader
 
 
 def pause_rule(text: str) -> PauseRule:

@@ -184,8 +184,8 @@ class Video:
             read_instance=lambda index: self.read_instance(kept[index]),
         )
 
-    def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording. Pose and workspace are computed now, and images are read on access."""
+    def frame_reader(self) -> tuple[Camera, Callable[[int, Camera], Frame]]:
+        """The camera without a pose, and a function that reads a frame by index, undistorted, with a camera."""
         if not self.times:
             raise InputError(f"{self.path} has no pair of a colour and a depth image")
         if len(self.K) != 4:
@@ -199,11 +199,17 @@ class Video:
             )
         camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
         source = undistortion_map(camera, self.distortion)
-        self._frame(0, camera, source)  # raises an error in the first frame before all frames are searched for pauses
+        return camera, lambda index, view: self._frame(index, view, source)
+
+    def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
+        """The recording. Pose and workspace are computed now, and images are read on access."""
+        camera, read = self.frame_reader()
+        source, (height, width) = undistortion_map(camera, self.distortion), (camera.height, camera.width)
+        read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
         found = pauses.find(self.times, self.read_rgb)
         first_pause = found[0]
         camera = camera if world.pose is None else camera.at(world.pose)
-        camera, grid = find_world(self._frame(first_pause, camera, source), world.grid)
+        camera, grid = find_world(read(first_pause, camera), world.grid)
         cameras: dict[int, Camera] = {}
 
         def camera_at(index: int) -> Camera:
@@ -220,7 +226,7 @@ class Video:
             return image if image is None else _undistort(image, source)
 
         return Recording(
-            LazyFrames(lambda index: self._frame(index, camera_at(index), source), len(self.times)),
+            LazyFrames(lambda index: read(index, camera_at(index)), len(self.times)),
             grid,
             found,
             tuple(t - self.times[0] for t in self.times),

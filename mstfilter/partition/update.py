@@ -54,6 +54,7 @@ from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveF
 from mstfilter.partition.association import Overlaps
 from mstfilter.partition.candidates import Choices, largest
 from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
+from mstfilter.processes import each
 from mstfilter.scene import (
     Clip,
     Evidence,
@@ -211,8 +212,8 @@ class PartitionUpdate(Update):
     ) -> list[Prediction]:
         """The evidence about each prediction in the last frame."""
         quality = np.exp(log_quality(np.array(projected.notes["quality"])))
-        columns = predicted.particles, projected.particles, quality.tolist()
-        return [self._prediction(*one, readings, frame) for one in zip(*columns, strict=True)]
+        columns = zip(predicted.particles, projected.particles, quality.tolist(), strict=True)
+        return each(lambda one: self._prediction(*one, readings, frame), columns)
 
     def _prediction(
         self,

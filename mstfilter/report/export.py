@@ -49,6 +49,13 @@ def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, index.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
+def object_mesh(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (v, 3) in world metres and triangles (f, 3) of the surface of an object; see `voxel_faces`."""
+    hypothesis.record(label)
+    corners, triangles = voxel_faces(hypothesis.mask(label))
+    return hypothesis.grid.origin + corners * hypothesis.grid.voxel_size, triangles
+
+
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
     """Write the mesh of a hypothesis that has objects, in world metres; `path` ends in ply or obj.
 
@@ -56,11 +63,11 @@ def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, 
     `colours` is ``{label: (r, g, b)}``. The default is the palette in order of labels. Raises MissingLibraryError if
     open3d cannot be imported.
     """
-    path, o3d, grid = Path(path), import_open3d(), hypothesis.grid
+    path, o3d = Path(path), import_open3d()
     mesh = o3d.geometry.TriangleMesh()
     for k, record in enumerate(hypothesis.objects):
-        corners, triangles = voxel_faces(hypothesis.labels == record.label)
-        vertices = o3d.utility.Vector3dVector(grid.origin + corners * grid.voxel_size)
+        corners, triangles = object_mesh(hypothesis, record.label)
+        vertices = o3d.utility.Vector3dVector(corners)
         part = o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(triangles))
         part.paint_uniform_color(np.array(colour(k) if colours is None else colours[record.label]) / 255)
         mesh += part

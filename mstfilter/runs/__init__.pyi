@@ -3,6 +3,7 @@ from mstfilter.runs.run import (
     code_version as code_version,
     compared_configs as compared_configs,
     component_files as component_files,
+    describe_run as describe_run,
     filter_recording as filter_recording,
     library_versions as library_versions,
 )

@@ -24,7 +24,7 @@ from mstfilter.files import atomic_folder, check_output, locked
 from mstfilter.lazy import progress_of
 from mstfilter.oracles import bind_truth, uses_truth
 from mstfilter.presets import REGISTRY, build_filter, describe_filter
-from mstfilter.processes import machine, threads
+from mstfilter.processes import machine, parallel, threads
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings
@@ -52,6 +52,7 @@ def filter_recording(
     replace: bool = False,
     allow_files: bool = False,
     progress: bool | Callable[[int, int], None] = False,
+    n_threads: int = 1,
 ) -> RunFolder:
     """Filter a recording and return the run folder.
 
@@ -71,6 +72,8 @@ def filter_recording(
     progress : bool or callable
         True shows a progress bar; a function is called before the first step and after every step, with the number
         of pauses done and of all pauses.
+    n_threads : int
+        Threads of one step. The result is the same.
 
     Raises
     ------
@@ -84,14 +87,22 @@ def filter_recording(
     for part in nested_components(filter):
         if isinstance(part, UsesFiles):
             part.check_files(recording)
-    description = _describe(recording, config, filter, int(seed))
+    entry = {
+        "name": recording.name,
+        "key": recording.key.hex(),
+        "truth": recording.truth_key.hex(),
+        "pauses": recording.pauses,
+        "times": [recording.times[p] for p in recording.pauses],
+        "generator": recording.manifest.get("generator"),
+    }
+    description = describe_run(entry, config, filter, int(seed))
     compared = path.parent.name == "compare" and (path.parent.parent / "run.json").is_file()
     with locked(path.parent.parent if compared else path):
         folder = _existing_folder(path, description, replace)
         done = 0 if folder is None else folder.n_pauses
         state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
         doubts: list[Finding] = []
-        with progress_of(progress, "filter") as advance:
+        with progress_of(progress, "filter") as advance, parallel(n_threads):
             try:
                 clips = recording.clips()
                 advance(done, len(clips))
@@ -120,8 +131,10 @@ def filter_recording(
     return folder
 
 
-def _describe(recording: Recording, config: Mapping[str, Any], filter: ParticleFilter, seed: int) -> dict[str, Any]:
-    """The content of run.json except its format and status."""
+def describe_run(
+    recording: Mapping[str, Any], config: Mapping[str, Any], filter: ParticleFilter, seed: int
+) -> dict[str, Any]:
+    """The content of run.json except its format and status; `recording` is the entry of the recording."""
     description: dict[str, Any] = as_json(
         {
             "seed": seed,
@@ -129,14 +142,7 @@ def _describe(recording: Recording, config: Mapping[str, Any], filter: ParticleF
             "config": describe_filter(filter),
             "uses_truth": uses_truth(filter),
             "files": component_files(filter),
-            "recording": {
-                "name": recording.name,
-                "key": recording.key.hex(),
-                "truth": recording.truth_key.hex(),
-                "pauses": recording.pauses,
-                "times": [recording.times[p] for p in recording.pauses],
-                "generator": recording.manifest.get("generator"),
-            },
+            "recording": recording,
             "versions": library_versions(),
             "machine": {**machine(), "threads": threads()},
         }

@@ -241,9 +241,9 @@ class RunFolder:
         found = sorted(path.parent for path in self.path.glob("compare/*/run.json"))
         return {path.name.replace("-", " "): RunFolder(path) for path in found}
 
-    def set_status(self, status: str) -> None:
-        """Set the status of the run: running, interrupted, failed or done."""
-        write_json(self.path / "run.json", {**self.description, "status": status})
+    def set_status(self, status: str, **entries: Any) -> None:
+        """Set the status of the run (running, interrupted, failed or done), and other entries of run.json."""
+        write_json(self.path / "run.json", {**self.description, **entries, "status": status})
 
     def write_pause(
         self,

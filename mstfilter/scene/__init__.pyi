@@ -1,4 +1,9 @@
-from mstfilter.scene.arrays import component_key as component_key, content_key as content_key, read_only as read_only
+from mstfilter.scene.arrays import (
+    component_key as component_key,
+    content_key as content_key,
+    max_of_three as max_of_three,
+    read_only as read_only,
+)
 from mstfilter.scene.cache import (
     Cache as Cache,
     memo as memo,

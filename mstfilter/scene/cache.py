@@ -35,12 +35,14 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    If the total exceeds `limit_bytes`, the least recently used values are dropped. The counter `hits` counts by name
-    how often values were found in memory or on disk.
+    If the total exceeds `limit_bytes`, the least recently used values are dropped. `forget` drops the values that
+    were not used of late. The counter `hits` counts by name how often values were found in memory or on disk.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
         self.limit_bytes = limit_bytes
+        self._used: dict[tuple[str, Hashable], int] = {}  # calls of `forget` before the last use
+        self._n_forgotten = 0
         self.hits: Counter[str] = Counter()
         self._entries: OrderedDict[tuple[str, Hashable], tuple[Any, int]] = OrderedDict()
         self._n_bytes = 0
@@ -77,6 +79,7 @@ class Cache:
             with self._lock:
                 if (name, key) in self._entries:
                     self._entries.move_to_end((name, key))
+                    self._used[name, key] = self._n_forgotten
                     self.hits[name] += 1
                     found[key] = self._entries[name, key][0]
                     continue
@@ -103,14 +106,34 @@ class Cache:
             if entry not in self._entries:
                 self._entries[entry] = (value, size)
                 self._n_bytes += size
+            self._used[entry] = self._n_forgotten
             while self._n_bytes > self.limit_bytes:
-                _, (_, dropped) = self._entries.popitem(last=False)
-                self._n_bytes -= dropped
+                self._drop(next(iter(self._entries)))
+
+    def _drop(self, entry: tuple[str, Hashable]) -> None:
+        self._n_bytes -= self._entries.pop(entry)[1]
+        del self._used[entry]
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of all values."""
+        return self._n_bytes
+
+    def forget(self) -> None:
+        """Drop the values that were not used since the second last call.
+
+        A loop over pauses that calls this method after each step keeps the values of the last two steps.
+        """
+        with self._lock:
+            for entry in [entry for entry, used in self._used.items() if used < self._n_forgotten - 1]:
+                self._drop(entry)
+            self._n_forgotten += 1
 
     def clear(self) -> None:
         """Drop all values in memory and reset the counts of hits."""
         with self._lock:
             self._entries.clear()
+            self._used.clear()
             self.hits.clear()
             self._n_bytes = 0
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import distance_transform_cdt, find_objects
 
-from mstfilter.scene.arrays import content_key, read_only
+from mstfilter.scene.arrays import content_key, max_of_three, read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid, labels_on, occupied_box
@@ -128,8 +128,8 @@ def _traverse(
     # Slabs: a ray is inside the box between the last entry and the first exit of the three axes.
     near = (np.where(forward, 0.0, shape) - start) * inverse
     far = (np.where(forward, shape, 0.0) - start) * inverse
-    enter = np.maximum(near.max(axis=1), 0.0)
-    alive = np.flatnonzero(enter < far.min(axis=1))
+    enter = np.maximum(max_of_three(near), 0.0)
+    alive = np.flatnonzero(enter < -max_of_three(-far))
 
     t = enter[alive]
     inverse, forward, directions = inverse[alive], forward[alive], directions[alive]
@@ -159,7 +159,8 @@ def _traverse(
         point = np.floor(start + t[:, None] * directions).astype(np.int32)
         np.clip(point, voxel - half + 1, voxel + half - 1, out=point)
         point[row, axis] = np.where(forward[row, axis], voxel[row, axis] + free, voxel[row, axis] - free)
-        inside = ((point >= 0) & (point < shape)).all(axis=1)
+        a, b, c = ((point >= 0) & (point < shape)).T
+        inside = a & b & c
         if not inside.all():
             alive, point, t = alive[inside], point[inside], t[inside]
             inverse, forward, directions = inverse[inside], forward[inside], directions[inside]

@@ -22,7 +22,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
 from mstfilter.lazy import late
@@ -431,6 +431,34 @@ class Hypothesis:
     def mask(self, label: int) -> np.ndarray:
         """(X, Y, Z) bool: the voxels of an object."""
         return self.labels == label
+
+    def points(self, label: int) -> np.ndarray:
+        """(n, 3) centres of the voxels of an object in world metres."""
+        self.record(label)
+        return self.grid.centre_of(np.argwhere(self.labels == label))
+
+    mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
+
+    def pose(self, label: int) -> RigidTransform:
+        """Rigid motion of an object in world metres since it was first seen or last changed (`ObjectRecord`)."""
+        return self.record(label).motion
+
+    def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:
+        """Oriented bounding box of the voxels of an object.
+
+        Returns T_world_box and the lengths (3,) of the sides in metres. The origin is the centre, and z is up. The
+        sides are parallel to the rectangle of least area around the voxels seen from above.
+        """
+        import cv2
+
+        points, half = self.points(label), self.grid.voxel_size / 2
+        corners = (points[:, None, :2] + half * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])).reshape(-1, 2)
+        middle = corners.mean(axis=0)  # float32 is exact near 0 only
+        (x, y), (width, depth), angle = cv2.minAreaRect((corners - middle).astype(np.float32))
+        low, high = points[:, 2].min() - half, points[:, 2].max() + half
+        centre = [x + middle[0], y + middle[1], (low + high) / 2]
+        turn = Rotation.from_euler("z", angle, degrees=True)
+        return RigidTransform.from_components(centre, turn), np.array([width, depth, high - low])
 
 
 def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:

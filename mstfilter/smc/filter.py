@@ -22,6 +22,7 @@ function of a `State`. So a run can be stopped, stored and resumed at any step.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ import numpy as np
 from mstfilter.errors import InputError
 from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import progress_of
+from mstfilter.processes import together
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.inputs import AtStep, check_observations, split_input
 from mstfilter.smc.interfaces import (
@@ -147,8 +149,7 @@ class ParticleFilter(AtStep):
         """
         step = _Step(self, state, observation)
         past, resampled_before = step.select_before()
-        predicted = step.predict(past)
-        proposed = step.propose(predicted)
+        predicted, proposed = step.extend(past)
         fused = step.fuse(predicted, proposed)
         chosen, resampled_after = step.select_after(fused, past)
         if resampled_before or resampled_after:
@@ -238,6 +239,17 @@ class _Step:
         if "ancestor" in selected.parents:
             return selected
         return selected.with_ancestors(np.full(len(selected), -1))
+
+    def extend(self, past: Population | None) -> tuple[Population | None, Population | None]:
+        """The predicted and the proposed particles. They are independent given the observation."""
+        if past is None or self.observation is None:
+            predicted = self.predict(past)
+            return predicted, self.propose(predicted)
+        found = together(lambda: self.predict(past), lambda: self.propose(past))
+        for name in ("transition", "proposal"):  # in this order, whichever is complete first
+            if name in self.slot.notes:
+                self.slot.notes[name] = self.slot.notes.pop(name)
+        return found
 
     def predict(self, past: Population | None) -> Population | None:
         """The moved particles; None at the first step of a filter that starts from its proposal."""
@@ -370,28 +382,29 @@ class _Slot:
     """
 
     def __init__(self, t: int) -> None:
-        self.t, self.name, self._began = t, "", 0.0
+        self.t, self._here = t, threading.local()
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Mapping[str, Any]] = {}
 
     def __call__(self, name: str) -> _Slot:
-        self.name = name
+        self._here.name = name
         return self
 
     def __enter__(self) -> None:
-        self._began = time.perf_counter()
+        self._here.began = time.perf_counter()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
-        self.seconds[self.name] = self.seconds.get(self.name, 0.0) + time.perf_counter() - self._began
+        name = self._here.name
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - self._here.began
         if isinstance(error, InputError):
-            raise type(error)(f"step {self.t}, {self.name}: {error.message}", *error.hints) from error
+            raise type(error)(f"step {self.t}, {name}: {error.message}", *error.hints) from error
         if isinstance(error, Exception):
-            error.add_note(f"in step {self.t}, {self.name}")
+            error.add_note(f"in step {self.t}, {name}")
 
     def record(self, notes: Mapping[str, Any]) -> None:
         """Keep the notes of the component, if there are any."""
         if notes:
-            self.notes[self.name] = notes
+            self.notes[self._here.name] = notes
 
 
 def _checked(found: Any, component: Component) -> Population:

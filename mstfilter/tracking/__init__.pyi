@@ -1,5 +1,9 @@
 from mstfilter.tracking.features import Matches as Matches, SiftMatching as SiftMatching
-from mstfilter.tracking.flow import ClipTracks as ClipTracks, DenseFlow as DenseFlow
+from mstfilter.tracking.flow import (
+    ClipTracks as ClipTracks,
+    DenseFlow as DenseFlow,
+    FlowTracker as FlowTracker,
+)
 from mstfilter.tracking.registration import (
     Registration as Registration,
     RegistrationResult as RegistrationResult,

@@ -15,19 +15,21 @@ not on the robot. Flow that is computed only from the first and the last frame f
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Literal
+from weakref import WeakValueDictionary
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.fields import Bounded
-from mstfilter.scene import Clip, Frame, fill_from_nearest, memo
+from mstfilter.processes import together
+from mstfilter.scene import Clip, Frame, fill_from_nearest, max_of_three, memo
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
 _PRESETS = ("ultrafast", "fast", "medium")
@@ -75,66 +77,102 @@ class DenseFlow(Bounded):
     preset: Literal["ultrafast", "fast", "medium"] = "medium"
 
     def track(self, clip: Clip) -> ClipTracks:
-        """Follow points and pixels through the clip. Cached by content."""
+        """Follow points and pixels through the clip. Cached by content; a tracker of this clip (`begin`) is used."""
         frames = list(clip.frames)
-        key = (tuple(f.key for f in frames), astuple(self))
-        return memo("clip tracks", key, lambda: _track(_thinned(frames), self.preset), ClipTracks)
+        keys = [f.key for f in frames]
+
+        def compute() -> ClipTracks:
+            tracker = _begun.pop((keys[0], self.preset), None)
+            if tracker is None or tracker.keys != keys[: len(tracker.keys)]:
+                tracker = FlowTracker(frames[0], self.preset)
+            for frame in frames[len(tracker.keys) :]:
+                tracker.add(frame)
+            return tracker.finish()
+
+        return memo("clip tracks", (tuple(keys), astuple(self)), compute, ClipTracks)
+
+    def begin(self, first: Frame) -> FlowTracker:
+        """A tracker for a clip whose frames arrive one by one. `track` continues it while it is referenced."""
+        tracker = _begun[first.key, self.preset] = FlowTracker(first, self.preset)
+        return tracker
 
 
-def _track(frames: list[Frame], preset: str) -> ClipTracks:
-    first, last = frames[0], frames[-1]
-    height, width = first.depth.shape
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    start = np.stack([columns[_GRID].ravel(), rows[_GRID].ravel()], axis=1)
-    end = start.copy()
-    alive = ~_robot(first)[_GRID].ravel()
-    grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    pull = grid.copy()  # position in the first frame of every pixel of the current frame
-    known = ~_robot(first).ravel()
-    for previous, current in pairwise(frames):
-        forward, backward = _flow(previous, current, preset)
-        end, ok = _advance(end, forward, backward, previous, current)
-        alive &= ok
+class FlowTracker:
+    """The tracks of a clip, advanced when a frame is added.
+
+    Frames with little motion since the last used frame are skipped, except the last frame.
+    """
+
+    def __init__(self, first: Frame, preset: str) -> None:
+        height, width = first.depth.shape
+        columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        self.keys, self.used = [first.key], [0]  #: content keys of the added frames; indices of the used ones
+        self._preset = preset
+        self._first = self._used = self._last = first
+        self._small, self._moved = _small(first), 0.0
+        self._start = self._end = np.stack([columns[_GRID].ravel(), rows[_GRID].ravel()], axis=1)
+        self._alive = ~_robot(first)[_GRID].ravel()
+        self._grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        self._pull = self._grid.copy()  # position in the first frame of every pixel of the last used frame
+        self._known = ~_robot(first).ravel()
+
+    def add(self, frame: Frame) -> None:
+        """Add the next frame. The frame before is used if the motion since the last used frame is large."""
+        small, dis = _small(frame), cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
+        with _one_thread():
+            flow = dis.calc(self._small, small, None)
+        # The robot is excluded: it moves fast and is not tracked.
+        speed = _speed(flow, self._last) / _SMALL_WIDTH
+        if len(self.keys) > 1 and self._moved + speed > _FRAME_MOTION:
+            self._use(self._last)
+            self.used.append(len(self.keys) - 1)
+            self._moved = 0.0
+        self._moved += speed
+        self._last, self._small = frame, small
+        self.keys.append(frame.key)
+
+    def finish(self) -> ClipTracks:
+        """The tracks from the first to the last added frame. No frame can be added afterwards."""
+        if len(self.keys) > 1:
+            self._use(self._last)
+        height, width = self._first.depth.shape
+        u, v = _pixel(self._pull, width, height)
+        source = np.where(self._known, v * width + u, -1).astype(np.int32).reshape(height, width)
+        unchanged = _unchanged_pixels(self._first, self._last)
+        return ClipTracks(self._start.astype(np.int32), self._end, self._alive, source, unchanged)
+
+    def _use(self, current: Frame) -> None:
+        """Follow points and pixels from the last used frame to another one."""
+        previous, grid = self._used, self._grid
+        height, width = current.depth.shape
+        forward, backward = _flow(previous, current, self._preset)
+        self._end, ok = _advance(self._end, forward, backward, previous, current)
+        self._alive = self._alive & ok
         # One step back to the previous frame, then the accumulated map.
         back, ok = _advance(grid, backward, forward, current, previous)
         u, v = _pixel(back, width, height)
         at = v * width + u
-        pull = pull[at] + (back - grid[at])  # keeps the subpixel part
-        ok &= known[at]
-        same = _unchanged_pixels(first, current).ravel()
+        pull = self._pull[at] + (back - grid[at])  # keeps the subpixel part
+        ok &= self._known[at]
+        same = _unchanged_pixels(self._first, current).ravel()
         pull[same] = grid[same]
         ok |= same
         robot = _robot(current).ravel()
         uncertain = np.flatnonzero(~ok & ~robot)
-        known = ~robot
+        self._known = ~robot
         pull[uncertain] = _vote(current, pull, ok, uncertain)
-    unchanged = _unchanged_pixels(first, last)
-    u, v = _pixel(pull, width, height)
-    source = np.where(known, v * width + u, -1).astype(np.int32).reshape(height, width)
-    return ClipTracks(start.astype(np.int32), end, alive, source, unchanged)
+        self._pull, self._used = pull, current
 
 
-def _thinned(frames: list[Frame]) -> list[Frame]:
-    """Remove frames with little motion since the previous kept frame."""
-    if len(frames) < 3:
-        return frames
-    factor = 160.0 / frames[0].depth.shape[1]
-    dis = cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
-    small = [
-        cv2.resize(cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-        for f in frames
-    ]
-    kept, moved = [frames[0]], 0.0
-    for i in range(1, len(frames) - 1):
-        with _one_thread():
-            flow = dis.calc(small[i - 1], small[i], None)
-            following = dis.calc(small[i], small[i + 1], None)
-        # The robot is excluded: it moves fast and is not tracked.
-        moved += _speed(flow, frames[i - 1]) / 160.0
-        if moved + _speed(following, frames[i]) / 160.0 > _FRAME_MOTION:
-            kept.append(frames[i])
-            moved = 0.0
-    return [*kept, frames[-1]]
+_begun: WeakValueDictionary[tuple[bytes, str], FlowTracker] = WeakValueDictionary()  # by first frame and preset
+_SMALL_WIDTH = 160  # pixels per row of the images that decide which frames are used
+
+
+def _small(frame: Frame) -> np.ndarray:
+    """Grey image of `_SMALL_WIDTH` pixels per row."""
+    factor = _SMALL_WIDTH / frame.depth.shape[1]
+    grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    return cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
 
 def _speed(flow: np.ndarray, frame: Frame) -> float:
@@ -145,15 +183,25 @@ def _speed(flow: np.ndarray, frame: Frame) -> float:
     return float(np.quantile(seen, 0.995)) if len(seen) else 0.0
 
 
+_calls = {"open": 0, "threads": 0}  # blocks of `_one_thread` in all threads, and the setting outside of them
+_calls_lock = threading.Lock()
+
+
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Limit OpenCV to one thread, since the result of the flow depends on the number of threads."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    with _calls_lock:  # the setting is global: the first block changes it, and the last one restores it
+        if not _calls["open"]:
+            _calls["threads"] = cv2.getNumThreads()
+            cv2.setNumThreads(1)
+        _calls["open"] += 1
     try:
         yield
     finally:
-        cv2.setNumThreads(threads)
+        with _calls_lock:
+            _calls["open"] -= 1
+            if not _calls["open"]:
+                cv2.setNumThreads(_calls["threads"])
 
 
 def _robot(frame: Frame) -> np.ndarray:
@@ -163,9 +211,13 @@ def _robot(frame: Frame) -> np.ndarray:
 def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
     """The flow a -> b and the flow b -> a, (H, W, 2) pixels."""
     grey = [cv2.cvtColor(f.rgb, cv2.COLOR_RGB2GRAY) for f in (a, b)]
-    dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
+
+    def between(first: int, second: int) -> np.ndarray:
+        dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
+        return np.asarray(dis.calc(grey[first], grey[second], None))
+
     with _one_thread():
-        return dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)
+        return together(lambda: between(0, 1), lambda: between(1, 0))
 
 
 def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -184,13 +236,16 @@ def _advance(
     height, width = a.depth.shape
     moved = at + _sample(there, at)
     returned = moved + _sample(back, moved)
-    inside = (moved >= 0).all(axis=1) & (moved[:, 0] <= width - 1) & (moved[:, 1] <= height - 1)
-    ok = inside & (((returned - at) ** 2).sum(axis=1) < _ROUND_TRIP**2)
+    # Operations over columns are several times faster than reductions over axes of two or three elements.
+    x, y = moved.T
+    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    dx, dy = (returned - at).T
+    ok = inside & (dx**2 + dy**2 < _ROUND_TRIP**2)
     ua, va = _pixel(at, width, height)
     ub, vb = _pixel(moved, width, height)
     jump = np.abs(b.depth[vb, ub] - a.depth[va, ua])
     ok &= ~(jump > _DEPTH_JUMP)  # a missing reading (NaN) is not a jump
-    ok &= np.abs(smooth_colour(b)[vb, ub] - smooth_colour(a)[va, ua]).max(axis=1) <= _COLOUR_JUMP
+    ok &= max_of_three(np.abs(smooth_colour(b)[vb, ub] - smooth_colour(a)[va, ua])) <= _COLOUR_JUMP
     ok &= ~_robot(b)[vb, ub] & ~_robot(a)[va, ua]
     return moved, ok
 
@@ -208,7 +263,7 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     12 grey levels in every channel after exposure matching. Pixels that show the robot or have no depth count as
     changed.
     """
-    change = np.abs(smooth_colour(first) - matched_colour(last, first)).max(axis=2)
+    change = max_of_three(np.abs(smooth_colour(first) - matched_colour(last, first)))
     return same_depth(first, last) & (change <= 12.0)
 
 
@@ -246,6 +301,7 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     # that voter in the first frame, not the motion: at an uncovered pixel of the resting table the first frame shows
     # the object.
     offset = pull[voters] - np.stack([columns[voters], rows[voters]], axis=-1)
-    distance = np.abs(offset[:, :, None] - offset[:, None, :]).sum(axis=-1)
+    apart = np.abs(offset[:, :, None] - offset[:, None, :])
+    distance = apart[..., 0] + apart[..., 1]
     choice = np.minimum(distance, 4.0).sum(axis=-1).argmin(axis=1)
     return pull[voters[np.arange(len(uncertain)), choice]]

@@ -20,6 +20,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.fields import Bounded
+from mstfilter.processes import each
 from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid, content_key, memo
 from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import DenseFlow
@@ -301,7 +302,7 @@ class TrackingTransition(Transition):
         if observation is None or len(observation.frames) < 2:
             return _successor(population, particles, {"motions": {}, "segments": 0})
         clip = observation
-        segments_by_hypothesis = [segments_of(h, clip.before) if h.n_objects else {} for h in particles]
+        segments_by_hypothesis = each(lambda h: segments_of(h, clip.before) if h.n_objects else {}, particles)
         cache = self._track_all(rng, clip, segments_by_hypothesis)
         occurrences: Counter[bytes] = Counter()
         counts: Counter[str] = Counter()
@@ -359,11 +360,12 @@ class TrackingTransition(Transition):
         if self.tracker is not None and moving:
             masks = self.tracker.track(clip, [track.mask for track in moving])
             moving = [replace(track, followed=mask) for track, mask in zip(moving, masks, strict=True)]
-        for track in moving:
-            key = track.segment.key
-            candidates = self.rule.candidates(child(rng, "segment", _number(key)), track)
-            found[key] = ("tracked" if track.target_mask.any() else "lost"), candidates
-        return found
+
+        def follow(track: Track) -> tuple[str, tuple[Candidate, ...]]:
+            candidates = self.rule.candidates(child(rng, "segment", _number(track.segment.key)), track)
+            return ("tracked" if track.target_mask.any() else "lost"), candidates
+
+        return found | {track.segment.key: one for track, one in zip(moving, each(follow, moving), strict=True)}
 
 
 def _number(key: bytes) -> int:

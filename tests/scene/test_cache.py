@@ -255,3 +255,18 @@ def test_fields_without_a_text_of_their_own_are_known_by_their_content():
     copy.load_state_dict(a.state_dict())
     keys = [component_key(Holder(net)) for net in (a, b, copy)]
     assert keys[0] != keys[1] and keys[0] == keys[2]
+
+
+def test_forget_keeps_what_the_last_two_steps_used():
+    cache = Cache()
+    for step in range(4):
+        cache.get("first", 0, lambda: np.zeros(10))
+        for used in (step, step - 1):  # the frames of this pause and of the one before
+            cache.get("frame", used, lambda: np.zeros(1000))
+        cache.forget()
+    assert cache.n_bytes == 3 * (8000 + 128) + 80 + 128  # frames 1, 2 and 3 of the last two steps
+    cache.forget()
+    cache.forget()
+    assert cache.n_bytes == 0
+    cache.get("frame", 1, lambda: np.zeros(10))
+    assert cache.hits["frame"] == 3

@@ -182,3 +182,28 @@ def test_encoding_is_lossless_and_reproducible():
                     np.testing.assert_array_equal(getattr(v, name), getattr(w, name))
     again = encode_hypotheses(loaded)
     assert {name: a.tobytes() for name, a in again.items()} == {name: a.tobytes() for name, a in arrays.items()}
+
+
+def test_points_mesh_pose_and_box_of_an_object():
+    grid = VoxelGrid((-0.2, -0.2, 0.0), 0.01, (60, 60, 20))
+    x, y, z = (grid.centre_of(np.argwhere(np.ones(grid.shape, bool)))).reshape(*grid.shape, 3).transpose(3, 0, 1, 2)
+    c, s = np.cos(0.4), np.sin(0.4)
+    along, across = c * (x - 0.1) + s * (y - 0.05), -s * (x - 0.1) + c * (y - 0.05)
+    mask = (np.abs(along) < 0.15) & (np.abs(across) < 0.05) & (z < 0.1)
+    hypothesis = Hypothesis.from_labels(3 * mask.astype(np.uint16), grid)
+    np.testing.assert_allclose(hypothesis.points(3), np.stack([x, y, z], axis=-1)[mask])
+    corners, triangles = hypothesis.mesh(3)
+    a, b, d = (corners[triangles[:, k]] for k in range(3))
+    assert np.einsum("ij,ij->i", a, np.cross(b, d)).sum() / 6 == pytest.approx(mask.sum() * 1e-6)  # its volume
+    T, sides = hypothesis.box(3)
+    assert sides == pytest.approx([0.3, 0.1, 0.1], abs=0.02) or sides == pytest.approx([0.1, 0.3, 0.1], abs=0.02)
+    np.testing.assert_allclose(T.translation, [0.1, 0.05, 0.05], atol=0.006)
+    inside = np.abs(T.inv().apply(corners)) <= sides / 2 + 1e-6
+    assert inside.all()
+    assert np.allclose(hypothesis.pose(3).as_matrix(), np.eye(4))
+    moved = RigidTransform.from_translation([0.02, 0, 0])
+    record = hypothesis.record(3).moved(moved, hypothesis.crop(3))
+    assert np.allclose(replace(hypothesis, objects=(record,)).pose(3).as_matrix(), moved.as_matrix())
+    for method in (hypothesis.points, hypothesis.mesh, hypothesis.pose, hypothesis.box):
+        with pytest.raises(InputError, match="no object with label 4"):
+            method(4)

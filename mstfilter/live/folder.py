@@ -1,0 +1,109 @@
+"""A folder that a recorder fills, filtered while the images arrive.
+
+>>> filter_folder(Path("session"), Redwood(pauses=Settled()), load_config("mst"), Path("runs/session"))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mstfilter.errors import InputError
+from mstfilter.files import atomic_folder, locked
+from mstfilter.formats import RecordingFormat, Redwood, Settled
+from mstfilter.live.stream import Pause, Stream
+from mstfilter.presets import build_filter
+from mstfilter.runs import RunFolder, check_run_folder, describe_run
+from mstfilter.scene import content_key
+
+
+def filter_folder(
+    source: Path,
+    reader: RecordingFormat,
+    config: Mapping[str, Any],
+    path: Path,
+    seed: int = 0,
+    *,
+    idle_s: float = 10.0,
+    replace: bool = False,
+    allow_files: bool = False,
+    n_threads: int = 1,
+    on_pause: Callable[[Pause], Any] = lambda pause: None,
+) -> RunFolder:
+    """Filter the images of a folder while they arrive, and return the run folder.
+
+    The files of the pauses are those of a run on the complete folder with the same rule. An interrupted live run
+    cannot be resumed.
+
+    Parameters
+    ----------
+    source : Path
+        Folder with color/ and depth/, to which a recorder adds images.
+    reader : RecordingFormat
+        The reader of the folder: a `Redwood` whose field `pauses` is a `Settled`.
+    config : mapping
+        A configuration from `mstfilter.presets.load_config`.
+    path : Path
+        The run folder, which is made at the first pause.
+    seed : int
+        Seed of all random streams.
+    idle_s : float
+        The run ends if no image arrives for this time.
+    replace, allow_files, n_threads
+        As for `mstfilter.runs.filter_recording`.
+    on_pause : callable
+        Called with a `Pause` when its files are written.
+    """
+    if not isinstance(reader, Redwood):
+        name = type(reader).__name__
+        raise InputError(f"a live run cannot read {name}", "it reads folders color/ and depth/ (format redwood)")
+    if not isinstance(reader.pauses, Settled):
+        name = type(reader.pauses).__name__
+        raise InputError(f"a live run cannot find pauses by {name}, which needs later frames", "--pauses settled")
+    check_run_folder(path, replace)
+    if not replace and (path / "run.json").is_file():
+        raise InputError(f"run folder {path} exists", "choose another folder, or remove this one: --replace")
+    filter = build_filter(config, allow_files=allow_files)
+    entry: dict[str, Any] = {"name": source.resolve().name, "key": "", "truth": "", "pauses": [], "times": []}
+    folder: RunFolder | None = None
+
+    def write(pause: Pause) -> None:
+        nonlocal folder
+        entry["pauses"].append(pause.frames[-1])
+        entry["times"].append(pause.clip.times[-1])
+        entry["key"] = content_key(entry["key"], pause.clip.key).hex()
+        step = pause.clip, pause.state, pause.info, None
+        if folder is None:
+            with atomic_folder(path, "replace" if replace else "refuse") as work:
+                RunFolder.create(work, describe_run(entry, config, filter, seed)).write_pause(*step)
+            folder = RunFolder(path)
+        else:
+            folder.write_pause(*step)
+            folder.set_status("running", recording=entry)
+        on_pause(pause)
+
+    def finish(status: str) -> None:
+        if folder is not None:
+            folder.write_metrics()
+            folder.set_status(status)
+
+    frames = reader.arriving(source, idle_s)
+    with locked(path):
+        time, frame = next(frames, (0.0, None))
+        if frame is None:
+            raise InputError(f"no image arrived in {source}")
+        camera = frame.camera if reader.world.pose is None else frame.camera.at(reader.world.pose)
+        settings: dict[str, Any] = {"grid": reader.world.grid, "seed": seed, "threads": n_threads}
+        try:
+            with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
+                stream.push(frame.rgb, frame.depth, time)
+                for time, frame in frames:
+                    stream.push(frame.rgb, frame.depth, time)
+        except BaseException as error:
+            finish("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+            raise
+        if folder is None:
+            raise InputError(f"no pause found in {source}: the image was never still", "-o pauses.hold_s=0.2")
+        finish("done")
+    return folder

@@ -1,0 +1,344 @@
+"""A filter of frames that arrive one by one.
+
+>>> with mstfilter.Stream(K) as stream:
+...     for rgb, depth in camera:
+...         stream.push(rgb, depth)                 # returns within milliseconds
+...     stream.wait()
+...     stream.hypotheses, stream.belief
+
+One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last
+complete clip. The results are those of a run on the recorded frames with the same pauses.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+import time as clock
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from mstfilter.belief import Belief
+from mstfilter.errors import InputError, check_integer
+from mstfilter.formats import Settled
+from mstfilter.presets import preset
+from mstfilter.processes import parallel
+from mstfilter.registry import nested_components
+from mstfilter.scene import (
+    Camera,
+    Clip,
+    Frame,
+    Hypothesis,
+    VoxelGrid,
+    check_depth,
+    examine,
+    find_world,
+    report_findings,
+    rigid_from_matrix,
+    scene_cache,
+)
+from mstfilter.smc import Info, ParticleFilter, State
+from mstfilter.tracking import DenseFlow
+
+
+@dataclass(frozen=True, eq=False)
+class Pause:
+    """The result at one pause of a stream."""
+
+    index: int  #: number of the pause, from 0
+    clip: Clip  #: the frames since the previous pause
+    frames: tuple[int, ...]  #: numbers of these frames among all pushed frames
+    state: State  #: the state of the filter
+    info: Info  #: the record of the step
+    latency_s: float  #: seconds from the push of the last frame to the result
+    #: Frames so far: pushed; dropped because they were late, had no depth, or found the queue full (overflow);
+    #: thinned, which were removed from a long clip.
+    counts: dict[str, int]
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The particles."""
+        assert self.state.population is not None
+        return tuple(self.state.population.particles)
+
+
+@dataclass(frozen=True, eq=False)
+class _Item:
+    number: int
+    frame: Frame
+    time: float
+    pause: bool | None
+    arrived: float
+
+
+class Stream:
+    """Filters frames while they arrive.
+
+    Parameters
+    ----------
+    camera : Camera or (3, 3) array
+        The camera, or its intrinsics in pixels.
+    filter : ParticleFilter or str
+        The filter, or the name of a preset.
+    pauses : Settled or None
+        The rule that finds the pauses. None: only frames that are pushed with ``pause=True`` are pauses.
+    grid : VoxelGrid, optional
+        Workspace. The default is found at the first pause, as for a recording. A camera without a pose gets the pose
+        of the support plane of the first pause.
+    seed : int
+        Seed of all random streams.
+    on_pause : callable, optional
+        Called with a `Pause` after each step, in the thread of the filter.
+    max_frames : int
+        Largest number of frames that wait, and largest number of frames of a clip. See Notes.
+    threads : int
+        Threads of one step. The results are the same.
+
+    Notes
+    -----
+    If `max_frames` frames wait because the filter is slower than the camera, new frames are dropped. If a clip
+    reaches `max_frames`, the frames with little motion are removed from it. Both are counted in `counts`. So at most
+    three times `max_frames` frames are in memory.
+
+    An error of a thread is raised by the next call of `push`, `wait` or `close`.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | np.ndarray,
+        filter: ParticleFilter | str = "mst",
+        *,
+        pauses: Settled | None = Settled(),  # noqa: B008
+        grid: VoxelGrid | None = None,
+        seed: int = 0,
+        on_pause: Callable[[Pause], Any] | None = None,
+        max_frames: int = 150,
+        threads: int = 2,
+    ) -> None:
+        check_integer("max_frames", max_frames, at_least=4)
+        check_integer("threads", threads, at_least=1)
+        self._camera, self._grid = camera, grid
+        self._filter = preset(filter) if isinstance(filter, str) else filter
+        self._flows = [part for part in nested_components(self._filter) if isinstance(part, DenseFlow)]
+        self._found = pauses.watch() if pauses is not None else lambda time, rgb: False
+        self._state, self._on_pause = self._filter.start(seed), on_pause
+        self._max, self._threads = max_frames, threads
+        self._world: Camera | None = None  # the camera of the first pause
+        self._clip: list[_Item] = []
+        self._trackers: list[Any] = []
+        self._n_pauses = 0
+        self._last_time = -np.inf
+        self._step: Future[None] | None = None
+        self._error: BaseException | None = None
+        self.last: Pause | None = None  #: the result at the last pause
+        self.counts: Counter[str] = Counter()  #: see `Pause.counts`
+        self._queue: queue.Queue[_Item | None] = queue.Queue(max_frames)
+        self._pool = ThreadPoolExecutor(1, "mstfilter-step")
+        self._watcher = threading.Thread(target=self._watch, name="mstfilter-stream", daemon=True)
+        self._watcher.start()
+
+    def push(
+        self,
+        rgb: np.ndarray,
+        depth: np.ndarray | None,
+        time: float | None = None,
+        pose: np.ndarray | RigidTransform | None = None,
+        robot_mask: np.ndarray | None = None,
+        pause: bool | None = None,
+    ) -> bool:
+        """Add a frame. The images are copied.
+
+        Parameters
+        ----------
+        rgb : (H, W, 3) uint8
+            Colour image.
+        depth : (H, W) float or None
+            Depth in metres, registered to the colour image.
+        time : float, optional
+            Time stamp in seconds. The default is the time of the call.
+        pose : (4, 4) array or RigidTransform, optional
+            T_world_camera of this frame, if the camera moves.
+        robot_mask : (H, W) bool, optional
+            Pixels that show the robot.
+        pause : bool, optional
+            Whether nothing moves at this frame, so that a clip ends. The default is decided by the rule `pauses`.
+
+        Returns
+        -------
+        bool
+            Whether the frame was accepted. A frame without depth, with a time stamp that is not later than that of
+            the frame before, or with no place in the queue is dropped and counted.
+
+        Raises
+        ------
+        InputError
+            If the images cannot be used, or a thread of the stream has failed.
+        """
+        arrived = clock.perf_counter()
+        self._check()
+        number, time = self.counts["pushed"], arrived if time is None else float(time)
+        self.counts["pushed"] += 1
+        if not np.isfinite(time):
+            raise InputError(f"time of frame {number} is {time}, expected seconds")
+        if depth is None or not np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
+            return self._dropped("no depth")
+        if time <= self._last_time:
+            return self._dropped("late")
+        if self._queue.full():
+            return self._dropped("overflow")
+        camera = self._camera
+        if not isinstance(camera, Camera):
+            camera = self._camera = Camera(camera, np.shape(rgb)[1], np.shape(rgb)[0])
+        if pose is not None:
+            rigid = pose if isinstance(pose, RigidTransform) else rigid_from_matrix(pose, f"pose of frame {number}")
+            camera = camera.at(rigid)
+        elif camera.T_world_camera is None:
+            camera = self._world or camera
+        frame = Frame(np.array(rgb), depth, camera, None if robot_mask is None else np.array(robot_mask))
+        check_depth(frame.depth, f"depth image of frame {number}")
+        self._last_time = time
+        self._queue.put(_Item(number, frame, time, pause, arrived))
+        return True
+
+    def _dropped(self, why: str) -> bool:
+        self.counts[why] += 1
+        return False
+
+    @property
+    def state(self) -> State:
+        """The state of the filter after the last step."""
+        return self._state
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The hypotheses at the last pause; empty before the first one."""
+        return () if self.last is None else self.last.hypotheses
+
+    @property
+    def belief(self) -> Belief:
+        """The belief at the last pause."""
+        if self.last is None or self.last.state.population is None:
+            raise InputError("the stream has had no pause yet", "push frames until nothing moves, and call wait()")
+        return Belief(self.last.state.population)
+
+    def wait(self) -> None:
+        """Wait until all pushed frames are processed."""
+        self._queue.join()
+        if self._step is not None:
+            with contextlib.suppress(Exception):  # raised by `_check`
+                self._step.result()
+        self._check()
+
+    def close(self) -> None:
+        """Process the frames that wait, and end the threads."""
+        if self._watcher.is_alive():
+            self._queue.put(None)
+            self._watcher.join()
+        self._pool.shutdown()
+        self._check()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
+        if kind is None:
+            self.close()
+        else:
+            with contextlib.suppress(Exception):  # the first error is raised
+                self.close()
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    # --- thread of the frames -----------------------------------------------------------------------------------
+    def _watch(self) -> None:
+        while (item := self._queue.get()) is not None:
+            try:
+                if self._error is None:
+                    self._take(item)
+            except BaseException as error:
+                self._error = self._error or error
+            finally:
+                self._queue.task_done()
+        self._queue.task_done()
+
+    def _take(self, item: _Item) -> None:
+        """Add a frame to the clip, and filter the clip if the frame is a pause."""
+        found = self._found(item.time, item.frame.rgb)
+        rests = found if item.pause is None else item.pause
+        if self._world is None:
+            if not rests:  # the first clip is the first pause alone
+                if self._step is None:
+                    self._step = self._pool.submit(self._load, item.frame, self._state)
+                return
+            self._world, self._grid = find_world(item.frame, self._grid)
+        if item.frame.camera.T_world_camera is None:
+            item = replace(item, frame=replace(item.frame, camera=self._world))
+        if not self._clip:
+            report_findings(examine([item.frame], [0], self._grid), "stream")  # type: ignore[arg-type]
+        self._clip.append(item)
+        for tracker in self._trackers:
+            tracker.add(item.frame)
+        if rests:
+            self._end_clip()
+        elif len(self._clip) >= self._max:
+            self._thin()
+
+    def _thin(self) -> None:
+        """Remove the frames with little motion from the clip, and more if that does not suffice."""
+        used = self._trackers[0].used if self._trackers else range(0, len(self._clip), 2)
+        kept = [self._clip[k] for k in used]
+        while len(kept) > self._max // 2:
+            kept = kept[::2]
+        kept = kept if kept[-1] is self._clip[-1] else [*kept, self._clip[-1]]
+        self.counts["thinned"] += len(self._clip) - len(kept)
+        self._clip = kept
+        self._track()
+
+    def _track(self) -> None:
+        """Track the frames of the clip from its first frame."""
+        self._trackers = [flow.begin(self._clip[0].frame) for flow in self._flows]
+        for tracker in self._trackers:
+            for item in self._clip[1:]:
+                tracker.add(item.frame)
+
+    def _end_clip(self) -> None:
+        if self._step is not None:
+            self._step.result()  # at most one complete clip waits
+        items, trackers = tuple(self._clip), tuple(self._trackers)
+        frames, times = tuple(item.frame for item in items), tuple(item.time for item in items)
+        assert self._grid is not None
+        clip = Clip(frames, self._grid, self._n_pauses, times)
+        self._n_pauses += 1
+        self._step = self._pool.submit(self._filter_clip, clip, items, trackers)
+        self._clip = [items[-1]]
+        self._track()
+
+    # --- thread of the filter -----------------------------------------------------------------------------------
+    def _load(self, frame: Frame, state: State) -> None:
+        """Filter a frame before the first pause, and discard the result. So libraries and networks are loaded."""
+        with contextlib.suppress(InputError):  # the frame need not show the scene at rest
+            camera, grid = find_world(frame, self._grid)
+            self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
+
+    def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
+        """Filter a clip. The references to `trackers` keep their work until the filter uses it."""
+        try:
+            with parallel(self._threads):
+                self._state, info = self._filter.step(self._state, clip)
+            scene_cache.forget()
+            latency = clock.perf_counter() - items[-1].arrived
+            numbers = tuple(item.number for item in items)
+            self.last = Pause(clip.index, clip, numbers, self._state, info, latency, dict(self.counts))
+            if self._on_pause is not None:
+                self._on_pause(self.last)
+        except BaseException as error:
+            self._error = self._error or error

@@ -1,0 +1,169 @@
+"""Streams: the same results as on a recording, dropped frames, bounded memory, errors."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import mstfilter
+from mstfilter.errors import InputError
+from mstfilter.formats import Redwood, Settled, Still
+from mstfilter.live import filter_folder
+from mstfilter.presets import load_config
+from mstfilter.runs import filter_recording
+from mstfilter.scene import Recording, encode_hypotheses, scene_cache
+from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
+from tests.scene.scenes import CAMERA, GRID
+
+RULE = Settled(hold_s=0.3)
+FAST = mstfilter.preset("mst", "n=2", "n_proposed=4")
+RGB, DEPTH, _ = video()
+TIMES = np.arange(len(SHIFTS)) / FPS
+PAUSES = (3, 13)  # 0.3 s after the first frames 0 and 10 of the still intervals
+
+
+def arrays(state):
+    """Bytes of the particles and the weights of a state."""
+    found = {
+        name: np.asarray(value).tobytes() for name, value in encode_hypotheses(state.population.particles).items()
+    }
+    return found | {"log_weights": state.population.log_weights.tobytes()}
+
+
+def pushed(**more):
+    """The results at the pauses of a stream."""
+    found = []
+    with mstfilter.Stream(CAMERA.K, FAST, seed=4, on_pause=found.append, pauses=RULE, **more) as stream:
+        for k in range(len(SHIFTS)):
+            assert stream.push(RGB[k], DEPTH[k], TIMES[k])
+    return found
+
+
+def filtered(**more):
+    """The states of the filter on a recording of the same frames."""
+    scene_cache.clear()
+    recording = Recording.from_arrays(RGB, DEPTH, CAMERA.K, times=TIMES, **more)
+    return [state for state, _ in FAST.iterate(recording.clips(), 4)]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_stream_has_the_results_of_the_recording(threads):
+    states = filtered(pauses=RULE)
+    scene_cache.clear()
+    found = pushed(threads=threads)
+    assert [pause.frames[-1] for pause in found] == list(PAUSES)
+    assert [len(pause.clip) for pause in found] == [1, 11]
+    assert [arrays(pause.state) for pause in found] == [arrays(state) for state in states]
+    assert found[1].counts == {"pushed": len(SHIFTS)}
+
+
+def test_frames_can_be_announced_as_pauses():
+    states = filtered(pauses=(2, 15))
+    found = []
+    with mstfilter.Stream(CAMERA.K, FAST, seed=4, pauses=None, on_pause=found.append) as stream:
+        with pytest.raises(InputError, match="no pause yet"):
+            _ = stream.belief
+        for k in range(len(SHIFTS)):
+            stream.push(RGB[k], DEPTH[k], TIMES[k], pause=k in (2, 15))
+        stream.wait()
+        assert stream.hypotheses == tuple(stream.state.population.particles)
+        assert stream.belief.object_count().sum() == pytest.approx(1)
+        assert arrays(stream.state) == arrays(states[1])
+    assert len(found) == 2
+
+
+def test_late_frames_and_frames_without_depth_are_dropped_and_counted():
+    found = []
+    with mstfilter.Stream(CAMERA.K, FAST, seed=4, pauses=RULE, on_pause=found.append) as stream:
+        for k in range(len(SHIFTS)):
+            assert stream.push(RGB[k], DEPTH[k], TIMES[k])
+            assert not stream.push(RGB[k], DEPTH[k], TIMES[k] - 0.05)
+            assert not stream.push(RGB[k], None, TIMES[k] + 0.01)
+            assert not stream.push(RGB[k], np.full_like(DEPTH[k], np.nan), TIMES[k] + 0.01)
+    assert stream.counts == {"pushed": 4 * len(SHIFTS), "late": len(SHIFTS), "no depth": 2 * len(SHIFTS)}
+    assert [pause.frames[-1] for pause in found] == [4 * k for k in PAUSES]
+    assert arrays(found[-1].state) == arrays(filtered(pauses=RULE)[-1])
+
+
+def test_a_long_clip_is_thinned_and_has_the_result_of_the_frames_that_remain():
+    found = []
+    with mstfilter.Stream(CAMERA.K, FAST, seed=4, pauses=None, max_frames=6, on_pause=found.append) as stream:
+        for k, shift in enumerate([0] * 40 + [1, 2, 3, 4] + [5] * 40):
+            j = SHIFTS.index(shift)
+            stream.push(RGB[j], DEPTH[j] + 1e-5 * (k % 3), k / FPS, pause=k in (0, 83))
+            stream._queue.join()  # the frames wait for the thread, so that none is dropped
+    last = found[-1]
+    assert len(last.clip) <= 6 and last.counts["thinned"] == 84 - len(last.clip)
+    scene_cache.clear()
+    kept = Recording(last.clip.frames, last.clip.grid, (0, len(last.clip) - 1), last.clip.times)
+    assert arrays(last.state) == arrays([state for state, _ in FAST.iterate(kept.clips(), 4)][-1])
+
+
+def test_a_full_queue_drops_frames_and_says_so():
+    gate = threading.Event()
+    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4, on_pause=lambda pause: gate.wait()) as stream:
+        n = sum(stream.push(RGB[k % 17], DEPTH[k % 17], k, pause=True) for k in range(30))
+        gate.set()
+    assert n < 30 and stream.counts["overflow"] == 30 - n
+    assert stream.last.index == n - 1  # every accepted frame was a pause
+
+
+def test_errors_of_frames_and_threads_reach_the_caller():
+    def fail(pause):
+        raise RuntimeError("in the callback")
+
+    stream = mstfilter.Stream(CAMERA.K, FAST, grid=GRID, pauses=None, on_pause=fail)
+    for rgb, depth, when, message in (
+        (RGB[0][:50], DEPTH[0], 0, "expected"),
+        (RGB[0], (1000 * DEPTH[0]), 0, "between 0.05 and 30 m"),
+        (RGB[0], DEPTH[0], np.nan, "time of frame"),
+    ):
+        with pytest.raises(InputError, match=message):
+            mstfilter.Stream(CAMERA, FAST, pauses=None).push(rgb, depth, when)
+    stream.push(RGB[0], DEPTH[0], pause=True)
+    with pytest.raises(RuntimeError, match="callback"):
+        stream.wait()
+    with pytest.raises(RuntimeError, match="callback"):
+        stream.push(RGB[0], DEPTH[0])
+    with pytest.raises(RuntimeError, match="callback"):
+        stream.close()
+
+
+def test_a_folder_is_filtered_while_it_is_filled(tmp_path):
+    whole, growing = write_redwood(tmp_path / "whole"), tmp_path / "growing"
+    for part in ("color", "depth"):
+        (growing / part).mkdir(parents=True)
+    shutil.copy(whole / "intrinsic.json", growing)
+
+    def record():
+        for k in range(len(SHIFTS)):
+            shutil.copy(whole / "color" / f"{k:05d}.png", growing / "color")
+            time.sleep(0.02)
+            data = (whole / "depth" / f"{k:05d}.png").read_bytes()
+            with (growing / "depth" / f"{k:05d}.png").open("wb") as file:
+                file.write(data[:100])
+                file.flush()
+                time.sleep(0.01)
+                file.write(data[100:])
+
+    reader, config = Redwood(fps=FPS, pauses=RULE), load_config("mst", ["n=2", "n_proposed=4"])
+    recorder = threading.Thread(target=record)
+    recorder.start()
+    live = filter_folder(growing, reader, config, tmp_path / "live", 3, idle_s=2)
+    recorder.join()
+    run = filter_recording(reader.open(whole), config, tmp_path / "run", 3, n_threads=2)
+    assert live.check().n_pauses == run.n_pauses == 2
+    for t in range(2):
+        assert (live.pause(t) / "SHA256SUMS").read_bytes() == (run.pause(t) / "SHA256SUMS").read_bytes()
+    assert live.description["recording"]["pauses"] == list(PAUSES)
+    assert live.description["status"] == "done"
+    with pytest.raises(InputError, match="exists"):
+        filter_folder(growing, reader, config, tmp_path / "live")
+    with pytest.raises(InputError, match="later frames"):
+        filter_folder(growing, Redwood(pauses=Still()), config, tmp_path / "other")
+    with pytest.raises(InputError, match="missing|no image"):
+        filter_folder(tmp_path, reader, config, tmp_path / "other", idle_s=0.1)
