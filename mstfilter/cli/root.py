@@ -37,7 +37,9 @@ Options = Annotated[
 ]
 Pauses = Annotated[
     str,
-    typer.Option(metavar="RULE", help="Pauses of a video: still, ends, every, frames 0,40,85, seconds 0s,4.2s."),
+    typer.Option(
+        metavar="RULE", help="Pauses of a video: still, settled, ends, every, frames 0,40,85, seconds 0s,4.2s."
+    ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random streams.")]
 

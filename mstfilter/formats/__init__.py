@@ -24,6 +24,7 @@ __components__ = {
     },
     "pauses": {
         "still": "Still",
+        "settled": "Settled",
         "at": "At",
         "ends": "Ends",
         "every": "EveryNth",

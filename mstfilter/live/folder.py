@@ -65,7 +65,8 @@ def filter_folder(
     if not replace and (path / "run.json").is_file():
         raise InputError(f"run folder {path} exists", "choose another folder, or remove this one: --replace")
     filter = build_filter(config, allow_files=allow_files)
-    entry: dict[str, Any] = {"name": source.resolve().name, "key": "", "truth": "", "pauses": [], "times": []}
+    entry: dict[str, Any] = {"name": source.resolve().name, "key": "", "truth": "", "generator": None}
+    entry |= {"pauses": [], "times": []}
     folder: RunFolder | None = None
 
     def write(pause: Pause) -> None:

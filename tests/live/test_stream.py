@@ -11,9 +11,10 @@ import pytest
 
 import mstfilter
 from mstfilter.errors import InputError
-from mstfilter.formats import Redwood, Settled, Still
+from mstfilter.formats import Redwood, Settled, Still, open_format
 from mstfilter.live import filter_folder
 from mstfilter.presets import load_config
+from mstfilter.report import write_report
 from mstfilter.runs import filter_recording
 from mstfilter.scene import Recording, encode_hypotheses, scene_cache
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
@@ -161,6 +162,8 @@ def test_a_folder_is_filtered_while_it_is_filled(tmp_path):
         assert (live.pause(t) / "SHA256SUMS").read_bytes() == (run.pause(t) / "SHA256SUMS").read_bytes()
     assert live.description["recording"]["pauses"] == list(PAUSES)
     assert live.description["status"] == "done"
+    assert "pause 1" in write_report(live).read_text()
+    assert open_format(whole, options=["pauses.hold_s=0.3"], pauses="settled").pauses == RULE
     with pytest.raises(InputError, match="exists"):
         filter_folder(growing, reader, config, tmp_path / "live")
     with pytest.raises(InputError, match="later frames"):
