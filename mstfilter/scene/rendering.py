@@ -86,8 +86,8 @@ def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
 def _cast(labels: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray, np.ndarray]:
     """Cast rays into a box of the grid that has these labels (a, b, c).
 
-    Returns the window of the image that can show the box, and two arrays (h, w) of its pixels: the flat voxel, and the
-    depth as float32. Without a hit they are -1 and inf.
+    Returns the window of the image that can show the box, and two arrays (h, w) of its pixels: the flat voxel, and
+    the depth as float32. Without a hit they are -1 and inf.
     """
     lower = np.array([side.start for side in box])
     # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
