@@ -149,8 +149,8 @@ def test_segmentation_fit(tmp_path):
     assert len(rows) == 9 and float(rows["true masks"]["image"]) == 1.0
 
 
-def test_tracking_rules(tmp_path):
-    run_script("tracking_rules/run.py", "--smoke", "--out", tmp_path)
+def test_tracking(tmp_path):
+    run_script("tracking/run.py", "--smoke", "--out", tmp_path)
     rows = {r["arm"]: r for r in read_csv(tmp_path / "results.csv")}
     assert len(rows) == 13 and len({(r["n_moved"], r["n_rest"]) for r in rows.values()}) == 1
     assert int(rows["mst"]["n_moved"]) >= 1
