@@ -23,16 +23,17 @@ from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Literal
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_rigid, check_type, describe_value, returns, warn_once
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, SmallGicp, centroid_shift
-from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, refine_motion
-from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
+from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, normals, refine_motion
+from mstfilter.tracking.rigid import MotionCluster, jlinkage, move_points, rigid_transform
 from mstfilter.tracking.segments import Track
 
 # Limits of `MstRule`.
@@ -42,6 +43,7 @@ _MAX_SIFT = 3  # SIFT motions of a segment
 _REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
 _MAX_SHIFT, _MAX_ANGLE = 0.6, 2.6  # metres at the segment's centre, radians
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
+_N_TOPPLED = 400  # points of the segment that find the start of a toppling
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,8 +244,8 @@ class MstRule(MotionRule):
     n_refine : int
         Number of best candidates that are refined against the whole last frame. These motions are candidates too.
     search_above : float
-        If every score is larger than this value, the object is searched for around its last position. Disabled if
-        negative.
+        If every score is larger than this value, the object is searched for around its last position, and topplings
+        are tried. Disabled if negative.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
@@ -279,6 +281,7 @@ class MstRule(MotionRule):
             if _admissible(T, centre):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
+            moving.extend(self._toppled(track, centre))
             moving.extend(self._search(track, centre))
         return (rest, *(c for c in moving if c.score < self.max_score))
 
@@ -332,6 +335,30 @@ class MstRule(MotionRule):
                 if np.isfinite(scores[k]) and _admissible(T, centre):
                     candidates.append(self._scored(track, "search", T))
         return candidates
+
+    def _toppled(self, track: Track, centre: np.ndarray) -> Iterator[Candidate]:
+        """Turns by 90 degrees about the horizontal edges, registered to the target and refined."""
+        source, target = track.surface, track.target_surface
+        if source is None or target is None:
+            return
+        pixels = track.sampled(_N_TOPPLED)
+        points = track.clip.before.points.reshape(-1, 3)[pixels]
+        normal = np.nan_to_num(normals(track.clip.before).reshape(-1, 3)[pixels])
+        _, _, yaw = cv2.minAreaRect((points[:, :2] - centre[:2]).astype(np.float32))
+        for quarter in np.deg2rad(yaw) + np.pi / 2 * np.arange(4):
+            T = np.eye(4)
+            T[:3, :3] = Rotation.from_rotvec(np.pi / 2 * np.array([np.cos(quarter), np.sin(quarter), 0])).as_matrix()
+            turned = move_points(T, points)
+            # The sides that can be seen after the turn; the others have no counterpart.
+            seen = ((normal @ T[:3, :3].T) * (target.points.mean(axis=0) - track.clip.after.camera.position)).sum(1) < 0
+            if seen.sum() < _MIN_PAIRS:
+                continue
+            T = centroid_shift(turned[seen], target.points) @ T
+            result = self.registration.register(source, target, T, 0.030)
+            for start in [T] if result is None else [T, result.T]:
+                refined = refine_motion(track, start)
+                if _admissible(refined, centre):
+                    yield self._scored(track, "search", refined)
 
     def _scored(self, track: Track, kind: str, T: np.ndarray, support: int = 0) -> Candidate:
         return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T))
