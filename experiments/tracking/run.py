@@ -11,6 +11,7 @@ import json
 import tempfile
 import time
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,13 +60,13 @@ def surface_points(shape: Shape) -> np.ndarray:
     return cells[inside & ~deep]
 
 
-def error_mm(shape: Shape, points: np.ndarray, pose: np.ndarray, T: np.ndarray, after: np.ndarray) -> float:
+def error_mm(shape: Shape, points: np.ndarray, pose: np.ndarray, after: np.ndarray, T: np.ndarray) -> float:
     """Mean distance of the surface under a motion and under the true one; to the nearest point if it is turned."""
     off = np.linalg.inv(after) @ T @ pose
     moved = points @ off[:3, :3].T + off[:3, 3]
     if shape.family in TURNED and not np.allclose(off, np.eye(4), atol=1e-4):
-        return 1000 * float(cKDTree(points).query(moved)[0].mean())
-    return 1000 * float(np.linalg.norm(moved - points, axis=1).mean())
+        return round(1000 * float(cKDTree(points).query(moved)[0].mean()), 2)
+    return round(1000 * float(np.linalg.norm(moved - points, axis=1).mean()), 2)
 
 
 def measure(path: Path, transition: TrackingTransition) -> list[dict]:
@@ -92,9 +93,7 @@ def measure(path: Path, transition: TrackingTransition) -> list[dict]:
             T_true = after[k] @ np.linalg.inv(before[k])
             candidates = rule.found.get(segments[k].key, ()) if k in segments else ()
 
-            def of(T: np.ndarray, k: int = k) -> float:
-                return round(error_mm(shapes[k - 1], surfaces[k - 1], before[k], T, after[k]), 2)
-
+            measured = partial(error_mm, shapes[k - 1], surfaces[k - 1], before[k], after[k])
             cosine = np.clip((np.trace(T_true[:3, :3]) - 1) / 2, -1, 1)
             rows.append(
                 {
@@ -103,10 +102,10 @@ def measure(path: Path, transition: TrackingTransition) -> list[dict]:
                     "object": k,
                     "shape": shapes[k - 1].name,
                     "turned": round(float(np.degrees(np.arccos(cosine))), 1),
-                    "moved": of(np.eye(4)),
+                    "moved": measured(np.eye(4)),
                     "pixels": int(min(seen[0][k], seen[1][k])),
-                    "error": of(chosen[k]),
-                    "candidates": [(c.kind, round(c.score, 3), of(c.T.as_matrix())) for c in candidates],
+                    "error": measured(chosen[k]),
+                    "candidates": [(c.kind, round(c.score, 3), measured(c.T.as_matrix())) for c in candidates],
                     "seconds": round(seconds, 2),
                 }
             )

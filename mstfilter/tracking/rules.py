@@ -350,7 +350,9 @@ class MstRule(MotionRule):
             T[:3, :3] = Rotation.from_rotvec(np.pi / 2 * np.array([np.cos(quarter), np.sin(quarter), 0])).as_matrix()
             turned = move_points(T, points)
             # The sides that can be seen after the turn; the others have no counterpart.
-            seen = ((normal @ T[:3, :3].T) * (target.points.mean(axis=0) - track.clip.after.camera.position)).sum(1) < 0
+            seen = ((normal @ T[:3, :3].T) * (target.points.mean(axis=0) - track.clip.after.camera.position)).sum(
+                1
+            ) < 0
             if seen.sum() < _MIN_PAIRS:
                 continue
             T = centroid_shift(turned[seen], target.points) @ T
