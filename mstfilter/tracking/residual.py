@@ -53,10 +53,13 @@ class MotionResidual:
 
     `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
     `target_weight` is added to S if the motion explains no point that the flow traces back to this object.
+    S is infinite if a smaller fraction of the points than `min_visible` would be visible, except at rest: an object
+    that rests can become hidden, but nothing in the image supports one of many hidden places.
     """
 
     track_weight: float = 1.0
     target_weight: float = 2.0
+    min_visible: float = 0.05
 
     def score(self, track: Track, T: np.ndarray) -> float:
         """S of a motion (4, 4); infinite if too few points can be compared."""
@@ -91,7 +94,9 @@ class MotionResidual:
         mean = total / np.maximum(n, 1) + self.track_weight * share_foreign
         if self.target_weight:
             mean = mean + self.target_weight * _unexplained(track, motions, n_points // 8)
-        return np.where(n >= max(_MIN_COUNTED * len(points), 1), mean, np.inf)
+        supported = (counted & ~hidden).sum(axis=-1) + n_outside >= self.min_visible * len(points)
+        supported |= (motions == np.eye(4)).all(axis=(1, 2))
+        return np.where(supported & (n >= max(_MIN_COUNTED * len(points), 1)), mean, np.inf)
 
 
 def _facing_away(track: Track, motions: np.ndarray, moved: np.ndarray, n: int) -> np.ndarray:

@@ -25,6 +25,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
@@ -32,8 +33,8 @@ from mstfilter.results import Checked, check_rigid, check_type, describe_value, 
 from mstfilter.tracking import rigid
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, SmallGicp, centroid_shift
-from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, normals, refine_motion
-from mstfilter.tracking.rigid import MotionCluster, jlinkage, move_points, rigid_transform
+from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, refine_motion
+from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
 
 # Limits of `MstRule`.
@@ -43,7 +44,6 @@ _MAX_SIFT = 3  # SIFT motions of a segment
 _REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
 _MAX_SHIFT, _MAX_ANGLE = 0.6, 2.6  # metres at the segment's centre, radians
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
-_N_TOPPLED = 400  # points of the segment that find the start of a toppling
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +281,6 @@ class MstRule(MotionRule):
             if _admissible(T, centre):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
-            moving.extend(self._toppled(track, centre))
             moving.extend(self._search(track, centre))
         return (rest, *(c for c in moving if c.score < self.max_score))
 
@@ -318,16 +317,13 @@ class MstRule(MotionRule):
                     yield kind, result.T, support
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
-        """Search a grid of shifts on the table and three rotations, and refine the two best shifts of each."""
+        """Search a grid of shifts on the table for several rotations, and refine the two best shifts of each."""
         n = round(_SEARCH_RADIUS / _SEARCH_STEP)
         shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
         shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]
         candidates = []
-        for yaw in (-0.35, 0.0, 0.35):
-            motions = np.tile(np.eye(4), (len(shifts), 1, 1))
-            c, s = np.cos(yaw), np.sin(yaw)
-            motions[:, :2, :2] = [[c, -s], [s, c]]
-            motions[:, :3, 3] = centre - motions[0, :3, :3] @ centre
+        for start in (*(_turn([0, 0, yaw], centre) for yaw in (-0.35, 0.0, 0.35)), *_topplings(track.points)):
+            motions = np.tile(start, (len(shifts), 1, 1))
             motions[:, :2, 3] += shifts
             scores = self.residual.scores(track, motions, 150)
             for k in np.argsort(scores, kind="stable")[:2]:
@@ -336,34 +332,26 @@ class MstRule(MotionRule):
                     candidates.append(self._scored(track, "search", T))
         return candidates
 
-    def _toppled(self, track: Track, centre: np.ndarray) -> Iterator[Candidate]:
-        """Turns by 90 degrees about the horizontal edges, registered to the target and refined."""
-        source, target = track.surface, track.target_surface
-        if source is None or target is None:
-            return
-        pixels = track.sampled(_N_TOPPLED)
-        points = track.clip.before.points.reshape(-1, 3)[pixels]
-        normal = np.nan_to_num(normals(track.clip.before).reshape(-1, 3)[pixels])
-        _, _, yaw = cv2.minAreaRect((points[:, :2] - centre[:2]).astype(np.float32))
-        for quarter in np.deg2rad(yaw) + np.pi / 2 * np.arange(4):
-            T = np.eye(4)
-            T[:3, :3] = Rotation.from_rotvec(np.pi / 2 * np.array([np.cos(quarter), np.sin(quarter), 0])).as_matrix()
-            turned = move_points(T, points)
-            # The sides that can be seen after the turn; the others have no counterpart.
-            seen = ((normal @ T[:3, :3].T) * (target.points.mean(axis=0) - track.clip.after.camera.position)).sum(
-                1
-            ) < 0
-            if seen.sum() < _MIN_PAIRS:
-                continue
-            T = centroid_shift(turned[seen], target.points) @ T
-            result = self.registration.register(source, target, T, 0.030)
-            for start in [T] if result is None else [T, result.T]:
-                refined = refine_motion(track, start)
-                if _admissible(refined, centre):
-                    yield self._scored(track, "search", refined)
-
     def _scored(self, track: Track, kind: str, T: np.ndarray, support: int = 0) -> Candidate:
         return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T))
+
+
+def _turn(rotation: ArrayLike, point: np.ndarray) -> np.ndarray:
+    """The motion (4, 4) by a rotation vector (3,), radians, about a point (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
+    T[:3, 3] = point - T[:3, :3] @ point
+    return T
+
+
+def _topplings(points: np.ndarray) -> Iterator[np.ndarray]:
+    """Turns (4, 4) by 90 degrees about each lower edge of the box around points (N, 3), outwards."""
+    middle = points.mean(axis=0)
+    corners = cv2.boxPoints(cv2.minAreaRect((points[:, :2] - middle[:2]).astype(np.float32))) + middle[:2]
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = np.append(b - a, 0.0) / max(float(np.linalg.norm(b - a)), 1e-9)
+        side = np.sign(np.cross(along, [0.0, 0.0, 1.0])[:2] @ (a + b - corners[0] - corners[2]))
+        yield _turn(np.pi / 2 * side * along, np.append(a, points[:, 2].min()))
 
 
 def _admissible(T: np.ndarray, centre: np.ndarray) -> bool:

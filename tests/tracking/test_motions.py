@@ -68,9 +68,10 @@ def test_the_residual_distinguishes_equal_objects_by_the_flow():
 
 def test_occluded_points_and_points_outside_have_constant_costs(textured):
     scene, clip = textured
-    track, residual = tracks_of(scene, clip)[1], MotionResidual(track_weight=0.0, target_weight=0.0)
+    track, residual = tracks_of(scene, clip)[1], MotionResidual(track_weight=0.0, target_weight=0.0, min_visible=0.0)
     assert residual.score(track, at(0, 0, -0.5)) == pytest.approx(5.6)
     assert residual.score(track, at(30, 0, 0)) == pytest.approx(16.0)
+    assert MotionResidual().score(track, at(0, 0, -0.5)) == np.inf, "a hidden place has no evidence"
 
 
 def test_scores_of_several_motions_equal_single_scores(textured):
