@@ -53,7 +53,7 @@ class MotionResidual:
 
     `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
     `target_weight` is added to S if the motion explains no point that the flow traces back to this object.
-    S is infinite if a smaller fraction of the points than `min_visible` would be visible, except at rest: an object
+    S is infinite if a smaller fraction of the points than `min_visible` would be visible, except at rest. An object
     that rests can become hidden, but nothing in the image supports one of many hidden places.
     """
 
