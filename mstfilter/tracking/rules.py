@@ -238,7 +238,8 @@ class MstRule(MotionRule):
         2) for each particle ("sample").
     n_eff : float
         Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring
-        pixels are correlated, so this number is much smaller than the number of pixels.
+        pixels are correlated, so this number is much smaller than the number of pixels. The default has the largest
+        likelihood on 124 objects of simulated tuning scenes.
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
@@ -253,7 +254,7 @@ class MstRule(MotionRule):
     """
 
     select: Literal["map", "sample"] = "map"
-    n_eff: float = 20.0
+    n_eff: float = 2.0
     use_flow: bool = True
     use_icp: bool = True
     use_sift: bool = True
