@@ -6,10 +6,13 @@ depth m, the cost of a point is
 - ``min(|z - m| / s, cap)^2 + min(|colour difference| / c, cap)^2``, where s is the sensor noise at this range;
 - a constant if z is behind m by more than a margin (occluded);
 - a larger constant outside the image;
-- not counted without a reading or on the robot.
+- not counted without a reading, on the robot, or if it is occluded and the moved surface faces away from the camera.
 
-The score S is the mean cost of the counted points, plus a term for the fraction of visible points on pixels that the
-flow traces back to another object. The term distinguishes two objects that look the same. A lower score is better.
+The score S is the mean cost of the counted points, plus two terms. The first term is for the fraction of visible
+points on pixels that the flow traces back to another object. It distinguishes two objects that look the same. The
+second term is for the fraction of the surface that the flow traces back to this object and that the moved object does
+not explain. Without this term, a place behind another object fits as well as a place that is seen. A lower score is
+better.
 
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
 `refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
@@ -28,7 +31,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mstfilter.scene import Camera, Frame, depth_sigma, memo
-from mstfilter.tracking.rigid import move_points
+from mstfilter.tracking.rigid import invert, move_points
 from mstfilter.tracking.segments import Track
 
 _DEPTH_SCALE = 1.5  # unit of depth differences, in standard deviations of the difference of two readings
@@ -36,6 +39,8 @@ _COLOUR_SCALE = 25.0  # unit of colour differences (Euclidean RGB), grey levels
 _CAP = 4.0  # largest normalised difference
 _OCCLUDED_COST, OUTSIDE_COST = 5.6, 16.0  # of an occluded point and of a point outside the image
 _OCCLUDED_MARGIN = 0.015  # metres; points farther behind the measured surface are occluded
+_FACING_AWAY = -0.1  # cosine of normal and ray; the visible side of a surface is below
+_EXPLAINED = 0.01  # metres from the moved surface to a measured point that it explains
 _MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
 _N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
@@ -47,9 +52,14 @@ class MotionResidual:
     """Robust residual of a motion.
 
     `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
+    `target_weight` is added to S if the motion explains no point that the flow traces back to this object.
+    S is infinite if a smaller fraction of the points than `min_visible` would be visible, except at rest. An object
+    that rests can become hidden, but nothing in the image supports one of many hidden places.
     """
 
     track_weight: float = 1.0
+    target_weight: float = 2.0
+    min_visible: float = 0.05
 
     def score(self, track: Track, T: np.ndarray) -> float:
         """S of a motion (4, 4); infinite if too few points can be compared."""
@@ -60,8 +70,8 @@ class MotionResidual:
         points, colours = track.sample(n_points)
         if not len(points):
             return np.full(len(motions), np.inf)
-        after = track.clip.after
-        u, v, z, inside = after.camera.pixels_of(move_points(motions, points))
+        after, moved = track.clip.after, move_points(motions, points)
+        u, v, z, inside = after.camera.pixels_of(moved)
         measured = after.depth[v, u].astype(np.float64)
         counted = inside & after.valid[v, u]
         behind = z - measured
@@ -72,6 +82,7 @@ class MotionResidual:
             cost = np.minimum(np.abs(behind) / scale, _CAP) ** 2
             cost = cost + np.minimum(colour / _COLOUR_SCALE, _CAP) ** 2
         cost = np.where(hidden, _OCCLUDED_COST, cost)
+        counted &= ~(hidden & _facing_away(track, motions, moved, n_points))
         n_outside = (~inside).sum(axis=-1)
         n = n_outside + counted.sum(axis=-1)
         total = np.where(counted, cost, 0.0).sum(axis=-1) + OUTSIDE_COST * n_outside
@@ -80,8 +91,31 @@ class MotionResidual:
         with_source = counted & ~hidden & (source >= 0)
         foreign = (with_source & ~track.mask.ravel()[source]).sum(axis=-1)
         share_foreign = foreign / np.maximum(with_source.sum(axis=-1), 1)
-        mean = total / np.maximum(n, 1)
-        return np.where(n >= max(_MIN_COUNTED * len(points), 1), mean + self.track_weight * share_foreign, np.inf)
+        mean = total / np.maximum(n, 1) + self.track_weight * share_foreign
+        if self.target_weight:
+            mean = mean + self.target_weight * _unexplained(track, motions, n_points // 8)
+        supported = (counted & ~hidden).sum(axis=-1) + n_outside >= self.min_visible * len(points)
+        supported |= (motions == np.eye(4)).all(axis=(1, 2))
+        return np.where(supported & (n >= max(_MIN_COUNTED * len(points), 1)), mean, np.inf)
+
+
+def _facing_away(track: Track, motions: np.ndarray, moved: np.ndarray, n: int) -> np.ndarray:
+    """Whether the surface at the moved points (K, N, 3) of `Track.sample` faces away from the camera, (K, N) bool."""
+    normal = normals(track.clip.before).reshape(-1, 3)[track.sampled(n)] @ np.swapaxes(motions[:, :3, :3], -1, -2)
+    ray = moved - track.clip.after.camera.position
+    with np.errstate(invalid="ignore"):
+        return np.einsum("kni,kni->kn", normal, ray) > _FACING_AWAY * np.linalg.norm(ray, axis=-1)
+
+
+def _unexplained(track: Track, motions: np.ndarray, n: int) -> np.ndarray:
+    """Fraction (K,) of about n points of the target surface that are far from the moved surface; 0 without one."""
+    source, target = track.surface, track.target_surface
+    if source is None or target is None:
+        return np.zeros(len(motions))
+    points = target.points[:: max(1, len(target.points) // max(n, 1))]
+    at_source = move_points(invert(motions), points)
+    distance, _ = track.near.query(at_source, distance_upper_bound=_EXPLAINED)
+    return (~np.isfinite(distance)).mean(axis=-1)
 
 
 def normals(frame: Frame) -> np.ndarray:

@@ -23,8 +23,10 @@ from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Literal
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_rigid, check_type, describe_value, returns, warn_once
@@ -236,14 +238,15 @@ class MstRule(MotionRule):
         2) for each particle ("sample").
     n_eff : float
         Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring
-        pixels are correlated, so this number is much smaller than the number of pixels.
+        pixels are correlated, so this number is much smaller than the number of pixels. The default has the largest
+        likelihood on 124 objects of simulated tuning scenes.
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
         Number of best candidates that are refined against the whole last frame. These motions are candidates too.
     search_above : float
-        If every score is larger than this value, the object is searched for around its last position. Disabled if
-        negative.
+        If every score is larger than this value, the object is searched for around its last position, and topplings
+        are tried. Disabled if negative.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
@@ -251,7 +254,7 @@ class MstRule(MotionRule):
     """
 
     select: Literal["map", "sample"] = "map"
-    n_eff: float = 20.0
+    n_eff: float = 2.0
     use_flow: bool = True
     use_icp: bool = True
     use_sift: bool = True
@@ -315,16 +318,13 @@ class MstRule(MotionRule):
                     yield kind, result.T, support
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
-        """Search a grid of shifts on the table and three rotations, and refine the two best shifts of each."""
+        """Search a grid of shifts on the table for several rotations, and refine the two best shifts of each."""
         n = round(_SEARCH_RADIUS / _SEARCH_STEP)
         shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
         shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]
         candidates = []
-        for yaw in (-0.35, 0.0, 0.35):
-            motions = np.tile(np.eye(4), (len(shifts), 1, 1))
-            c, s = np.cos(yaw), np.sin(yaw)
-            motions[:, :2, :2] = [[c, -s], [s, c]]
-            motions[:, :3, 3] = centre - motions[0, :3, :3] @ centre
+        for start in (*(_turn([0, 0, yaw], centre) for yaw in (-0.35, 0.0, 0.35)), *_topplings(track.points)):
+            motions = np.tile(start, (len(shifts), 1, 1))
             motions[:, :2, 3] += shifts
             scores = self.residual.scores(track, motions, 150)
             for k in np.argsort(scores, kind="stable")[:2]:
@@ -335,6 +335,24 @@ class MstRule(MotionRule):
 
     def _scored(self, track: Track, kind: str, T: np.ndarray, support: int = 0) -> Candidate:
         return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T))
+
+
+def _turn(rotation: ArrayLike, point: np.ndarray) -> np.ndarray:
+    """The motion (4, 4) by a rotation vector (3,), radians, about a point (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
+    T[:3, 3] = point - T[:3, :3] @ point
+    return T
+
+
+def _topplings(points: np.ndarray) -> Iterator[np.ndarray]:
+    """Turns (4, 4) by 90 degrees about each lower edge of the box around points (N, 3), outwards."""
+    middle = points.mean(axis=0)
+    corners = cv2.boxPoints(cv2.minAreaRect((points[:, :2] - middle[:2]).astype(np.float32))) + middle[:2]
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = np.append(b - a, 0.0) / max(float(np.linalg.norm(b - a)), 1e-9)
+        side = np.sign(np.cross(along, [0.0, 0.0, 1.0])[:2] @ (a + b - corners[0] - corners[2]))
+        yield _turn(np.pi / 2 * side * along, np.append(a, points[:, 2].min()))
 
 
 def _admissible(T: np.ndarray, centre: np.ndarray) -> bool:

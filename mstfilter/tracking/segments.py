@@ -20,6 +20,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from scipy.ndimage import value_indices
+from scipy.spatial import cKDTree
 
 from mstfilter.results import Checked, check_array, check_list, returns
 from mstfilter.scene import Clip, Frame, Hypothesis, content_key, read_only, render_hypothesis
@@ -112,6 +113,11 @@ class Track:
         return prepare(self.points)
 
     @cached_property
+    def near(self) -> cKDTree:
+        """Search tree of the visible surface in the first frame, for short distances."""
+        return cKDTree(np.empty((0, 3)) if self.surface is None else self.surface.points)
+
+    @cached_property
     def target_surface(self) -> Surface | None:
         """The surface of the target mask in the last frame, above the table; None if it has too few points."""
         after = self.clip.after
@@ -141,10 +147,14 @@ class Track:
 
     def sample(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """At most n points of the support, evenly spaced, and their slightly blurred colours, both (n, 3)."""
+        pixels = self.sampled(n)
+        colours = smooth_colour(self.clip.before, 5).reshape(-1, 3)[pixels]
+        return self.clip.before.points.reshape(-1, 3)[pixels], colours.astype(np.float64)
+
+    def sampled(self, n: int) -> np.ndarray:
+        """The flat pixels of the first frame of `sample`."""
         chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
-        chosen = chosen[chosen >= 0]
-        colours = smooth_colour(self.clip.before, 5).reshape(-1, 3)[self.segment.support[chosen]]
-        return self.points[chosen], colours.astype(np.float64)
+        return self.segment.support[chosen[chosen >= 0]]
 
     @property
     def colour_after(self) -> np.ndarray:

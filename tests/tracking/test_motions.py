@@ -62,15 +62,16 @@ def test_the_residual_distinguishes_equal_objects_by_the_flow():
     onto_twin = scene.poses[0][3] @ np.linalg.inv(scene.poses[0][4])  # object 5 to where its twin, 4, rests
     truth = scene.motions()[5]
     assert MotionResidual().score(track, truth) < MotionResidual().score(track, onto_twin)
-    by_look = MotionResidual(track_weight=0.0)
+    by_look = MotionResidual(track_weight=0.0, target_weight=0.0)
     assert by_look.score(track, onto_twin) < by_look.score(track, truth) + 0.5
 
 
 def test_occluded_points_and_points_outside_have_constant_costs(textured):
     scene, clip = textured
-    track, residual = tracks_of(scene, clip)[1], MotionResidual(track_weight=0.0)
+    track, residual = tracks_of(scene, clip)[1], MotionResidual(track_weight=0.0, target_weight=0.0, min_visible=0.0)
     assert residual.score(track, at(0, 0, -0.5)) == pytest.approx(5.6)
     assert residual.score(track, at(30, 0, 0)) == pytest.approx(16.0)
+    assert MotionResidual().score(track, at(0, 0, -0.5)) == np.inf, "a hidden place has no evidence"
 
 
 def test_scores_of_several_motions_equal_single_scores(textured):

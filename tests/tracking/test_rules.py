@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mstfilter.tracking import rigid, rules
 from mstfilter.tracking.flow import DenseFlow
@@ -140,3 +141,31 @@ def test_an_object_that_was_taken_away_does_not_move_into_others():
     assert rest.kind == "identity" and rest.score > 10, "resting is bad, too"
     never = MstRule(max_score=np.inf)
     assert never.choose(rng, never.candidates(rng, track)).kind == "search"
+
+
+def test_a_box_that_toppled_between_two_frames_is_found():
+    """A quarter turn about a horizontal edge. No estimator can follow the box, its colours and its faces can."""
+    fallen = at(0.0, 0.03, 0.035, 10)
+    fallen[:3, :3] = fallen[:3, :3] @ Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    scene = Scene([Box((0.1, 0.07, 0.15), texture=0.9)], [[at(0.0, 0.0, 0.075, 10)], [fallen]], (480, 360))
+    track, rng = track_of(scene, scene.clip(0)), np.random.default_rng(0)
+    rule = MstRule(use_flow=False, use_icp=False, use_sift=False)
+    chosen = rule.choose(rng, rule.candidates(rng, track))
+    mm, deg = errors(chosen.T, scene.motions()[1], track.points.mean(axis=0))
+    assert mm < 5 and deg < 3
+
+
+def test_a_place_that_is_seen_wins_against_a_place_behind_another_object():
+    """The box moves behind a low wall, half of it hidden. Behind the high wall nothing of it would be seen."""
+    boxes = [
+        Box((0.08, 0.05, 0.09), texture=0.6),
+        Box((0.2, 0.02, 0.05), (60, 150, 60)),
+        Box((0.2, 0.02, 0.2), seed=3),
+    ]
+    walls = [at(-0.15, -0.05, 0.025), at(0.12, -0.02, 0.1)]
+    poses = [[T, *walls] for T in slide(at(0.0, -0.12, 0.045), at(-0.15, 0.02, 0.045, 15), 12)]
+    scene = Scene(boxes, poses, (480, 360))
+    track, truth = track_of(scene, scene.clip(0)), scene.motions()[1]
+    behind = at(0.12, 0.1, 0.0) @ at(0.0, 0.12, 0.0)
+    residual = rules.MotionResidual()
+    assert residual.score(track, truth) < residual.score(track, behind) - 1.0
