@@ -50,6 +50,7 @@ from mstfilter.scene import (
     VoxelGrid,
     check_grids,
     common_refinement,
+    memo,
     project,
     render_hypothesis,
     scaled_area,
@@ -235,7 +236,7 @@ class Belief:
         ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the object that hypothesis i shows at
         the pixel, and J the Jaccard index. J is 1 if both show no object, and 0 if only one of them does.
         """
-        refined = common_refinement(self._images(camera))
+        refined = self._refined_image(camera)
         shared = refined.overlaps()
         union = np.add.outer(shared.diagonal(), shared.diagonal()) - shared
         jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
@@ -255,7 +256,7 @@ class Belief:
         pixels (in an image of 640 x 480) belong to the nearest larger part.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
-        refined = common_refinement(self._images(camera))
+        refined = self._refined_image(camera)
         least = scaled_area(_LEAST_PART, camera.width * camera.height)
         small = (refined.sizes < least)[refined.cells]
         nearest = distance_transform_edt(small, return_distances=False, return_indices=True)
@@ -355,6 +356,11 @@ class Belief:
         """
         hypotheses, mass = self._merged
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
+
+    def _refined_image(self, camera: Camera) -> CommonRefinement:
+        """The common refinement of the label images."""
+        images, keys = self._images(camera), [h.key for h in self._merged[0]]
+        return memo("refined image", (camera.key, *keys), lambda: common_refinement(images))
 
     def _images(self, camera: Camera) -> list[np.ndarray]:
         check_component("camera", camera, Camera)

@@ -142,7 +142,7 @@ class Redwood(VideoFormat):
                 new = new if age > _WRITTEN_S else [k for k in new if k < len(colour) - 1]
                 if new:
                     video = self._video(path, colour, depth)
-                    camera, read = video.frame_reader()
+                    camera, _, read = video.frame_reader()
                 for k in new:
                     yield video.times[k], read(k, camera)
                     last, since, failed = _number(colour[k]), time.monotonic(), None

@@ -141,13 +141,13 @@ class Still(PauseRule):
         self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]
     ) -> tuple[tuple[int, int], ...]:
         """First and last frame of each still interval."""
-        images = [self.part(grey_blocks(read_rgb(index))) for index in range(len(times))]
+        images = [self._part(grey_blocks(read_rgb(index))) for index in range(len(times))]
         if len({image.shape for image in images}) > 1:
             raise InputError(f"images differ in size: {sorted({image.shape for image in images})} blocks")
         if len(images) == 1:
             return ((0, 0),)
         changes = np.stack([_changes(a, b) for a, b in pairwise(images)])
-        limit, allowed = self.limit(changes), _SHARE * images[0].size
+        limit, allowed = self._limit(changes), _SHARE * images[0].size
         runs, first = [], 0
         for index in range(1, len(images) + 1):
             if index < len(images) and (_changes(images[first], images[index]) > limit).sum() <= allowed:
@@ -156,13 +156,13 @@ class Still(PauseRule):
             first = index
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
 
-    def part(self, blocks: np.ndarray) -> np.ndarray:
+    def _part(self, blocks: np.ndarray) -> np.ndarray:
         """The blocks (h, w) of the region."""
         h, w = blocks.shape
         left, top, right, bottom = self.region
         return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
 
-    def limit(self, changes: np.ndarray) -> np.ndarray:
+    def _limit(self, changes: np.ndarray) -> np.ndarray:
         """Change (h, w) in grey levels at which a block differs, a multiple of its noise at rest.
 
         `changes` (n, h, w) are the changes between consecutive images.
@@ -175,7 +175,7 @@ class Still(PauseRule):
 
 
 @dataclass(frozen=True)
-class Settled(PauseRule):
+class Settled(Still):
     """The frames at which the image has been still for `hold_s` seconds, found while the frames arrive.
 
     The rule and its parameters are those of `Still`. But each pause is the frame at which its interval reaches
@@ -183,32 +183,21 @@ class Settled(PauseRule):
     pauses of a stream and of its recording are the same.
     """
 
-    hold_s: NonNegativeFloat = 0.5
-    levels: NonNegativeFloat = 3.0
-    region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        _ = self._still
-
-    @property
-    def _still(self) -> Still:
-        return Still(self.hold_s, self.levels, self.region)
-
     def watch(self) -> Callable[[float, np.ndarray], bool]:
         """A function of the time and the colour image of each frame in order: whether the frame is a pause."""
-        still, changes = self._still, deque[np.ndarray](maxlen=_RECENT)
+        changes = deque[np.ndarray](maxlen=_RECENT)
         first = last = None  # images of the first frame of the interval and of the last frame
         began, found = 0.0, False
 
         def add(time: float, rgb: np.ndarray) -> bool:
             nonlocal first, last, began, found
-            image = still.part(grey_blocks(rgb))
+            image = self._part(grey_blocks(rgb))
             if last is not None and image.shape != last.shape:
                 raise InputError(f"images differ in size: {last.shape} and {image.shape} blocks")
             if last is not None:
                 changes.append(_changes(last, image))
             last = image
-            if first is None or (_changes(first, image) > still.limit(np.stack(changes))).sum() > _SHARE * image.size:
+            if first is None or (_changes(first, image) > self._limit(np.stack(changes))).sum() > _SHARE * image.size:
                 first, began, found = image, time, False
                 return False
             if found or time - began < self.hold_s - 1e-9:

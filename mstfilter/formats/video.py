@@ -184,8 +184,8 @@ class Video:
             read_instance=lambda index: self.read_instance(kept[index]),
         )
 
-    def frame_reader(self) -> tuple[Camera, Callable[[int, Camera], Frame]]:
-        """The camera without a pose, and a function that reads a frame by index, undistorted, with a camera."""
+    def frame_reader(self) -> tuple[Camera, Any, Callable[[int, Camera], Frame]]:
+        """The camera without a pose, the undistortion map, and a function of index and camera that reads a frame."""
         if not self.times:
             raise InputError(f"{self.path} has no pair of a colour and a depth image")
         if len(self.K) != 4:
@@ -199,12 +199,12 @@ class Video:
             )
         camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
         source = undistortion_map(camera, self.distortion)
-        return camera, lambda index, view: self._frame(index, view, source)
+        return camera, source, lambda index, view: self._frame(index, view, source)
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
         """The recording. Pose and workspace are computed now, and images are read on access."""
-        camera, read = self.frame_reader()
-        source, (height, width) = undistortion_map(camera, self.distortion), (camera.height, camera.width)
+        camera, source, read = self.frame_reader()
+        height, width = camera.height, camera.width
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
         found = pauses.find(self.times, self.read_rgb)
         first_pause = found[0]

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, locked
+from mstfilter.files import locked
 from mstfilter.formats import RecordingFormat, Redwood, Settled
 from mstfilter.live.stream import Pause, Stream
 from mstfilter.presets import build_filter
-from mstfilter.runs import RunFolder, check_run_folder, describe_run
+from mstfilter.runs import RunFolder, check_run_folder, describe_run, first_pause
 from mstfilter.scene import content_key
 
 
@@ -76,9 +76,7 @@ def filter_folder(
         entry["key"] = content_key(entry["key"], pause.clip.key).hex()
         step = pause.clip, pause.state, pause.info, None
         if folder is None:
-            with atomic_folder(path, "replace" if replace else "refuse") as work:
-                RunFolder.create(work, describe_run(entry, config, filter, seed)).write_pause(*step)
-            folder = RunFolder(path)
+            folder = first_pause(path, describe_run(entry, config, filter, seed), replace, *step)
         else:
             folder.write_pause(*step)
             folder.set_status("running", recording=entry)

@@ -70,7 +70,7 @@ class ShownPause:
 
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
-    """The pauses of a run: at most twelve distinct hypotheses the most probable first, then the truth."""
+    """The pauses of a run: at most twelve distinct hypotheses, the most probable first, then the truth."""
     identities, times = assign_identities(run), run.description["recording"]["times"]
     scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}

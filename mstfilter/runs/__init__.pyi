@@ -5,6 +5,7 @@ from mstfilter.runs.run import (
     component_files as component_files,
     describe_run as describe_run,
     filter_recording as filter_recording,
+    first_pause as first_pause,
     library_versions as library_versions,
 )
 from mstfilter.runs.run_folder import (

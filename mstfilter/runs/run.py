@@ -112,9 +112,7 @@ def filter_recording(
                     questions = None if truth is None else ask(recording, clip.index)
                     step = clip, state, info, truth, questions, recording.instance(recording.pauses[clip.index])
                     if folder is None:  # a run that fails in its first step leaves no folder, or an earlier run
-                        with atomic_folder(path, "replace" if replace else "refuse") as work:
-                            RunFolder.create(work, description).write_pause(*step)
-                        folder = RunFolder(path)
+                        folder = first_pause(path, description, replace, *step)
                     else:
                         folder.write_pause(*step)
                     if not doubts and state.population is not None:  # said once
@@ -129,6 +127,13 @@ def filter_recording(
         folder.write_metrics()
         folder.set_status("done")
     return folder
+
+
+def first_pause(path: Path, description: dict[str, Any], replace: bool, *step: Any) -> RunFolder:
+    """Make a run folder with its first pause, or nothing. `step` are the arguments of `RunFolder.write_pause`."""
+    with atomic_folder(path, "replace" if replace else "refuse") as work:
+        RunFolder.create(work, description).write_pause(*step)
+    return RunFolder(path)
 
 
 def describe_run(
