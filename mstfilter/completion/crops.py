@@ -22,7 +22,7 @@ LATTICE = 0.01  # metres, edge of a voxel of the network's lattice
 EDGE = 32  # voxels, edge of a crop
 LARGER = (48, 64)  # crops for larger objects: the network is convolutional
 #: Boxes of a batch. Results do not depend on the other boxes of a batch only if all batches have one size.
-BATCH = 8
+BATCH = 4
 
 #: Channels of the input. The first five and the last are 0 or 1; "distance" is the signed distance behind the
 #: measured surface, in units of 4 voxels, 0 where it is unknown; "height" is above the table, in units of 0.25 m;

@@ -87,8 +87,11 @@ class Readings:
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
         """The distinct voxels (k, 3) with readings, and the voxel of each reading (m,)."""
-        voxels, of_reading = np.unique(self.voxels, axis=0, return_inverse=True)
-        return voxels, of_reading.ravel()
+        if not len(self.voxels):
+            return self.voxels, np.zeros(0, np.int64)
+        shape = tuple(self.voxels.max(axis=0) + 1)
+        flat, of_reading = np.unique(np.ravel_multi_index(tuple(self.voxels.T), shape), return_inverse=True)
+        return np.stack(np.unravel_index(flat, shape), axis=1), of_reading
 
 
 class Alternatives(NamedTuple):

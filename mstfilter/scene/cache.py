@@ -45,6 +45,7 @@ class Cache:
         self._n_forgotten = 0
         self.hits: Counter[str] = Counter()
         self._entries: OrderedDict[tuple[str, Hashable], tuple[Any, int]] = OrderedDict()
+        self._pending: dict[tuple[str, Hashable], threading.Event] = {}  # values that a thread computes now
         self._n_bytes = 0
         self._lock = threading.RLock()
         self._disk: DiskCache | None = None
@@ -69,34 +70,60 @@ class Cache:
         compute: Callable[[Sequence[int]], Sequence[_Value]],
         stored_as: Any = None,
     ) -> list[_Value]:
-        """The values of several keys. ``compute(indices)`` computes all missing values together."""
+        """The values of several keys. ``compute(indices)`` computes all missing values together.
+
+        A value that another thread computes at present is not computed again, but waited for.
+        """
         found: dict[Hashable, _Value] = {}
-        missing: dict[Hashable, int] = {}
-        disk = self._disk if stored_as is not None else None
+        left: dict[Hashable, int] = {}
         for k, key in enumerate(keys):
-            if key in found or key in missing:
-                continue
+            left.setdefault(key, k)
+        while left:
+            missing, others = {}, []
             with self._lock:
-                if (name, key) in self._entries:
-                    self._entries.move_to_end((name, key))
-                    self._used[name, key] = self._n_forgotten
-                    self.hits[name] += 1
-                    found[key] = self._entries[name, key][0]
-                    continue
-            value = None if disk is None else disk.find(name, key, stored_as)
-            if value is None:
-                missing[key] = k
-                continue
-            self.hits[name] += 1
-            self._keep((name, key), value)
-            found[key] = value
-        if missing:
-            for key, value in zip(missing, compute(tuple(missing.values())), strict=True):
+                for key, k in left.items():
+                    entry = (name, key)
+                    if entry in self._entries:
+                        self._entries.move_to_end(entry)
+                        self._used[entry] = self._n_forgotten
+                        self.hits[name] += 1
+                        found[key] = self._entries[entry][0]
+                    elif entry in self._pending:
+                        others.append(self._pending[entry])
+                    else:
+                        self._pending[entry] = threading.Event()
+                        missing[key] = k
+            try:
+                found |= self._missing(name, missing, compute, stored_as)
+            finally:
+                for key in missing:
+                    self._pending.pop((name, key)).set()
+            for done in others:
+                done.wait()
+            left = {key: k for key, k in left.items() if key not in found}
+        return [found[key] for key in keys]
+
+    def _missing(
+        self,
+        name: str,
+        missing: dict[Hashable, int],
+        compute: Callable[[Sequence[int]], Sequence[_Value]],
+        stored_as: Any,
+    ) -> dict[Hashable, _Value]:
+        """The values of keys that are not in memory, from the disk or computed."""
+        disk = self._disk if stored_as is not None else None
+        found = {} if disk is None else {key: disk.find(name, key, stored_as) for key in missing}
+        found = {key: value for key, value in found.items() if value is not None}
+        if found:
+            self.hits[name] += len(found)
+        if new := {key: k for key, k in missing.items() if key not in found}:
+            for key, value in zip(new, compute(tuple(new.values())), strict=True):
                 if disk is not None:
                     disk.store(name, key, value)
-                self._keep((name, key), value)
                 found[key] = value
-        return [found[key] for key in keys]
+        for key, value in found.items():
+            self._keep((name, key), value)
+        return found
 
     def _keep(self, entry: tuple[str, Hashable], value: Any) -> None:
         size = _size_of(value)

@@ -66,7 +66,7 @@ class CommonRefinement:
 
 
 def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
-    """The common refinement of n label arrays of one shape, in which 0 is free."""
+    """The common refinement of n arrays of labels >= 0 of one shape, in which 0 is free."""
     occupied = np.logical_or.reduce([labels != 0 for labels in segmentations])
     count = int(occupied.sum())
     cell = np.zeros(count, np.int64)
@@ -90,5 +90,10 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
 
 def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
     """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays 0."""
-    present, index = np.unique(np.append(codes, 0), return_inverse=True)
-    return len(present) - 1, index[:-1]
+    if codes.max(initial=0) > 8 * len(codes) + 1000:  # too large for a table
+        codes = np.unique(np.append(codes, 0), return_inverse=True)[1][:-1]
+    number = np.zeros(codes.max(initial=0) + 1, np.int64)
+    number[codes] = 1
+    number[0] = 0
+    number = np.cumsum(number)
+    return int(number[-1]), number[codes]

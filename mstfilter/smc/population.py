@@ -27,6 +27,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.lazy import late
+from mstfilter.processes import each
 
 _T = TypeVar("_T")
 
@@ -59,8 +60,8 @@ class Candidates(Sequence[_T], Generic[_T]):
     """Particles ``build(index)`` that are built on first access, and then stored.
 
     In MST the weight of a candidate depends only on its pair of parents, so candidates can be resampled before they
-    are built. `build` must return the same particle at every call with the same index. `indices` (n,) are the
-    candidates in order. An index may occur more than once. An integer n means 0 .. n-1.
+    are built. `build` must return the same particle at every call with the same index, from any thread. `indices`
+    (n,) are the candidates in order. An index may occur more than once. An integer n means 0 .. n-1.
     """
 
     def __init__(
@@ -80,6 +81,12 @@ class Candidates(Sequence[_T], Generic[_T]):
         if index not in self._built:
             self._built[index] = self._build(index)
         return self._built[index]
+
+    def built(self) -> tuple[_T, ...]:
+        """All candidates in order; different ones are built two at a time in a block `parallel`."""
+        _, first = np.unique(self._indices, return_index=True)
+        each(self.__getitem__, np.sort(first))
+        return tuple(self)
 
     @property
     def n_built(self) -> int:
@@ -339,7 +346,7 @@ class Population:
     def realised(self) -> Population:
         """The same population with every candidate built."""
         if isinstance(self.particles, Candidates):
-            return replace(self, particles=tuple(self.particles))
+            return replace(self, particles=self.particles.built())
         return self
 
     def reweighted(self, log_factors: np.ndarray) -> Population:

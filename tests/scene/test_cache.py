@@ -6,6 +6,7 @@ import io
 import multiprocessing
 import os
 import pickle
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass
 from typing import Any
@@ -51,6 +52,45 @@ def test_a_value_is_computed_once_per_name_and_key():
     assert cache.hits == {"x": 2}
     cache.clear()
     assert found("x", 1) == 4
+
+
+def test_threads_share_the_values_that_one_of_them_computes():
+    cache, calls, begun, go_on = Cache(), [], threading.Event(), threading.Event()
+
+    def compute(indices):
+        calls.append(tuple(indices))
+        begun.set()
+        if not go_on.wait(60):
+            raise AssertionError("the other thread does not wait for this value")
+        return [str(k) for k in indices]
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(cache.get_many, "x", ["a", "b"], compute)
+        assert begun.wait(60)
+        second = pool.submit(
+            cache.get_many, "x", ["b", "c"], lambda k: calls.append(tuple(k)) or go_on.set() or ["c"]
+        )
+        assert first.result(60) == ["0", "1"]
+        assert second.result(60) == ["1", "c"]
+    assert calls == [(0, 1), (1,)]
+
+
+def test_a_value_whose_computation_fails_is_computed_by_the_thread_that_waits():
+    cache, begun, failed = Cache(), threading.Event(), threading.Event()
+
+    def fails():
+        begun.set()
+        assert failed.wait(60)
+        raise ValueError("no value")
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(cache.get, "x", 1, fails)
+        assert begun.wait(60)
+        second = pool.submit(cache.get, "x", 1, lambda: 9)
+        failed.set()
+        with pytest.raises(ValueError, match="no value"):
+            first.result(60)
+        assert second.result(60) == 9
 
 
 def test_memory_is_bounded_and_drops_the_least_recently_used():
