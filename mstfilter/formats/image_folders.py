@@ -7,9 +7,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -133,19 +134,21 @@ class Redwood(VideoFormat):
         A pair is read when a later one exists, or when its files do not change any more. A colour image without a
         depth image of the same number is left out. The iteration ends if no pair arrives for `idle_s` seconds.
         """
-        last, since, failed = Decimal(-2), time.monotonic(), None
+        known: set[str] = set()  # names of the images that were read
+        pairs: list[tuple[Path, Path]] = []  # the first and the latest one
+        n, since, failed = 0, time.monotonic(), None
         while time.monotonic() - since < idle_s:
             try:
-                colour, depth = _both(*self._files(path))
-                age = time.time() - max(file.stat().st_mtime for file in (colour[-1], depth[-1]))
-                new = [k for k, file in enumerate(colour) if _number(file) > last]
-                new = new if age > _WRITTEN_S else [k for k in new if k < len(colour) - 1]
-                if new:
+                for pair in _complete(*self._files(path, known), after=pairs[-1:]):
+                    colour, depth = map(list, zip(*pairs[:1], pair, strict=True))
                     video = self._video(path, colour, depth)
                     camera, _, read = video.frame_reader()
-                for k in new:
-                    yield video.times[k], read(k, camera)
-                    last, since, failed = _number(colour[k]), time.monotonic(), None
+                    stamped = _seconds(_number(pair[0])) is not None
+                    seconds = video.times[-1] if stamped else n / self._rate(*_read_intrinsics(path))
+                    yield seconds, read(len(video.times) - 1, camera)
+                    pairs, n = [*pairs[:1], pair], n + 1
+                    known.update(file.name for file in pair)
+                    since, failed = time.monotonic(), None
             except InputError as error:  # there is no image yet, or a file is incomplete
                 failed = error
             time.sleep(_POLL_S)
@@ -155,17 +158,21 @@ class Redwood(VideoFormat):
     def video(self, path: Path) -> Video:
         return self._video(path, *self._files(path))
 
-    def _files(self, path: Path) -> tuple[list[Path], list[Path]]:
-        """Colour and depth images."""
+    def _files(self, path: Path, known: Collection[str] = ()) -> tuple[list[Path], list[Path]]:
+        """Colour and depth images, except those with known names."""
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
-        return _images(folder, _SUFFIXES), _images(path / "depth", _DEPTH_SUFFIXES)
+        return _images(folder, _SUFFIXES, known), _images(path / "depth", _DEPTH_SUFFIXES, known)
+
+    def _rate(self, file: Path | None, stored: dict[str, Any]) -> float:
+        """Frames per second."""
+        return self.fps or _stored(file, stored, "fps", 30)
 
     def _video(self, path: Path, colour: list[Path], depth: list[Path]) -> Video:
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
         file, stored = _read_intrinsics(path)
         K = self.K or _stored_matrix(path, file, stored)
         scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
-        fps = self.fps or _stored(file, stored, "fps", 30)
+        fps = self._rate(file, stored)
         video = Video.of_files(
             path.resolve().name,
             stamps or tuple(k / fps for k in range(len(pairs))),
@@ -191,12 +198,13 @@ def _is_recording(path: Path) -> bool:
     return ours or (path / "manifest.json").is_file()
 
 
-def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Images of a folder, ordered by the numbers in their names."""
+def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()) -> list[Path]:
+    """Images of a folder without those with known names, ordered by the numbers in their names."""
     if not folder.is_dir():
         raise InputError(f"not a folder of colour and depth images: {folder} is missing", "it holds rgb/ and depth/")
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
-    if not files:
+    new = [folder / name for name in set(os.listdir(folder)).difference(known)]
+    files = [p for p in new if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    if not files and not known:
         raise InputError(f"{folder} has no image", f"expected {', '.join(suffixes)}")
     if len({_number(file) for file in files}) < len(files):
         raise InputError(
@@ -206,12 +214,16 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(files, key=_number)
 
 
-def _both(colour: list[Path], depth: list[Path]) -> tuple[list[Path], list[Path]]:
-    """The images whose numbers are in both lists."""
-    common = {_number(file) for file in colour} & {_number(file) for file in depth}
-    if not common:
+def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Path]]) -> list[tuple[Path, Path]]:
+    """The pairs of images of one number that are completely written, and later than the pair `after`."""
+    last = _number(after[0][0]) if after else Decimal(-2)
+    of_number = {_number(file): file for file in depth}
+    pairs = [(file, of_number[n]) for file in colour if (n := _number(file)) in of_number and n > last]
+    if not pairs and not after:
         raise InputError("no colour image has a depth image of the same number")
-    return [file for file in colour if _number(file) in common], [file for file in depth if _number(file) in common]
+    if not pairs or time.time() - max(file.stat().st_mtime for file in pairs[-1]) > _WRITTEN_S:
+        return pairs
+    return pairs[:-1]
 
 
 def _number(file: Path) -> Decimal:
