@@ -69,7 +69,7 @@ __components__ = {
         "sorted": "Sorted",
         "keep_weights": "KeepWeights",
     },
-    "trigger": {"always": "Always", "ess": "EssBelow", "never": "Never"},
+    "trigger": {"always": "Always", "ess": "EssBelow", "every": "Every", "never": "Never"},
     "size": {"kld": "Kld"},
     "similarity": {"gaussian": "Gaussian"},
     "equivalence": {"bins": "Bins", "exact": "ExactEquality"},

@@ -4,6 +4,7 @@ from mstfilter.smc.components import (
     Bins as Bins,
     Branching as Branching,
     EssBelow as EssBelow,
+    Every as Every,
     ExactEquality as ExactEquality,
     Kld as Kld,
     Never as Never,

@@ -129,6 +129,17 @@ class Always(Trigger):
 
 
 @dataclass(frozen=True)
+class Every(Trigger):
+    """Resample at every `k`-th step, from step 0."""
+
+    k: PositiveInt = 2
+    batched: ClassVar[bool] = True
+
+    def wants(self, population: Population, t: int) -> bool:
+        return t % self.k == 0
+
+
+@dataclass(frozen=True)
 class Never(Trigger):
     """Resample only if there are more particles than the filter keeps."""
 

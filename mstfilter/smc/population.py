@@ -30,6 +30,7 @@ from mstfilter.lazy import late
 from mstfilter.processes import each
 
 _T = TypeVar("_T")
+_U = TypeVar("_U")
 
 Particles = Any  # ndarray (n, ...) | mapping name -> ndarray (n, ...) | sequence of objects
 
@@ -92,6 +93,10 @@ class Candidates(Sequence[_T], Generic[_T]):
     def n_built(self) -> int:
         """Number of distinct candidates built so far. Selections by `take` share built candidates."""
         return len(self._built)
+
+    def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
+        """Candidates ``function(candidate)``, computed on access."""
+        return Candidates(lambda position: function(self[position]), len(self))
 
     def take(self, positions: np.ndarray) -> Candidates[_T]:
         """Select candidates without building them."""

@@ -16,6 +16,7 @@ from mstfilter.smc import (
     Always,
     Branching,
     EssBelow,
+    Every,
     FearnheadClifford,
     Multinomial,
     Never,
@@ -171,6 +172,7 @@ SEEDS = [3, 1, 4, 1_000_003, 2**40 + 1]
 FILTERS = {
     "always": bootstrap(raw(1), 20, Stratified(), Always()),
     "after": replace(bootstrap(raw(1), 20, Ssp(), EssBelow(0.9)), resample="after"),
+    "every": bootstrap(raw(1), 20, Systematic(), Every(3)),
     "independent": bootstrap(raw(1), 20, Multinomial()),
     "many draws": bootstrap(raw(1), 2100, Multinomial(), Always()),
     "many strata": bootstrap(raw(1), 1100, Stratified(), Always()),
@@ -183,7 +185,7 @@ FILTERS = {
     "fewer particles": bootstrap(AR1, 20, FearnheadClifford()),
     "moves": resample_move(AR1, RandomWalkMove(AR1, 0.5), 20),
 }
-TOGETHER = ("always", "after", "independent", "many draws", "many strata", "never", "rows", "vectors")
+TOGETHER = ("always", "every", "after", "independent", "many draws", "many strata", "never", "rows", "vectors")
 
 
 @pytest.mark.parametrize("name", sorted(smc.__components__["resampler"]))

@@ -108,6 +108,14 @@ def test_candidates_are_built_once_and_only_when_looked_at():
     assert candidates.n_built == 2
 
 
+def test_a_function_of_candidates_is_computed_on_access():
+    candidates = Candidates(lambda i: 10 * i, np.array([4, 2]))
+    mapped = candidates.map(str)
+    assert candidates.n_built == 0
+    assert tuple(mapped.take(np.array([1]))) == ("20",)
+    assert (candidates.n_built, tuple(mapped)) == (1, ("40", "20"))
+
+
 def test_moved_particles_keep_weights_and_parents():
     population = Population(np.zeros(3), np.log([1.0, 2.0, 3.0]), {"previous": np.arange(3)}, {"note": 1})
     moved = population.moved(np.ones((3, 2)))

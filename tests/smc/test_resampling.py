@@ -19,6 +19,7 @@ from mstfilter.smc import (
     ClusterStratified,
     Coalesced,
     EssBelow,
+    Every,
     FearnheadClifford,
     Gaussian,
     KeepWeights,
@@ -228,6 +229,7 @@ def test_triggers():
     assert EssBelow(0.5).wants(peaked, 0)
     assert Always().wants(even, 0)
     assert not Never().wants(peaked, 0)
+    assert [Every(3).wants(even, t) for t in range(4)] == [True, False, False, True]
 
 
 # --- schemes that compare particles ---
