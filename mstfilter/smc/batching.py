@@ -85,8 +85,7 @@ def run_together(
 ) -> list[Collected]:
     """The runs of some seeds with the observations `ys`.
 
-    With ``check=False``, no runs are compared with single runs. `rounding` states whether differences by rounding are
-    accepted.
+    `check` compares some runs with single runs. `rounding` accepts differences by rounding.
 
     Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component states ``batched=True``
     but mixes runs.
