@@ -10,10 +10,9 @@
 (2, 20, 50)
 
 Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. If the
-components of an arm treat each particle independently, the runs of the arm are processed together, as arrays of the
-particles of all runs (see `mstfilter.smc.batching`). In other cases the runs are made one by one. Run k of every arm
-has the same seed and the same random streams. Differences between arms therefore have less noise than in independent
-runs.
+components of an arm treat each particle independently, its runs are processed together, as arrays of the particles of
+all runs (see `mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every arm has the same seed
+and random streams, so differences between arms have less noise.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ def run_many(
     filters : ParticleFilter or mapping
         A filter, or a mapping from names of arms to filters. All arms get the same observations and seeds.
     observations : iterable
-        T observations, the same for all runs. A missing observation is None; an observation with an input is a
-        `WithInput`.
+        T observations, the same for all runs. A missing observation is None. Use `WithInput` for an input.
     seeds : iterable of int
         Different non-negative integers.
     workers : int
@@ -72,8 +70,7 @@ def run_many(
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
         an observation (`LostRunError`). From that step on, the log evidence of a lost run is -inf and the other
-        results are NaN. `History.lost` states why runs are lost. `History.single` states why runs were made one by
-        one.
+        results are NaN. `History.lost` explains lost runs. `History.single` explains runs made one by one.
 
     Warns
     -----

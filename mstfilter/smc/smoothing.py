@@ -124,8 +124,7 @@ def backward_paths(
         The transition of the model, ``Dynamics(model)``. A transition with a proposal has another density and cannot
         be used.
     method : "exact" or "mcmc"
-        "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N densities
-        per step.
+        "exact" (Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
         leave the distribution of "exact" invariant: (1 + `steps`) n densities per step. The record must have parents.
