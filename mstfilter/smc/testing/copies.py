@@ -169,7 +169,7 @@ def fault_message(sample: Sample, column: int) -> str:
 
 
 class ConstantGenerator(np.random.Generator):
-    """A generator whose `random` always returns one value. A scheme that then does not end is skipped."""
+    """A generator whose `random` always returns one value. The test is skipped if a scheme does not end."""
 
     def __init__(self, value: float) -> None:
         super().__init__(np.random.PCG64(0))
