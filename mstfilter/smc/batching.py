@@ -3,10 +3,10 @@
 `mstfilter.smc.run_many` uses this module where possible.
 
 The components are called once per step with the particles of all runs, as one population of R n particles. Runs are
-batched if `batched` of each component is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
-programs). A component sees no axis of runs. The component treats each row independently, and its draws have the shape
-of its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from the
-stream of that run.
+batched if the `batched` of each component is True or None. Programs and models of `StateSpaceModel.of` have None:
+batching is tried. Components get arrays without an axis of runs. A component treats each row independently, and its
+draws have the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of a
+run from its stream.
 
 The batch compares some runs with single runs at steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number
 of runs changes. If results differ by more than rounding and the component states ``batched=True``, InputError is
@@ -48,7 +48,7 @@ class NotTogether(Exception):
 
 @dataclass(frozen=True)
 class RunFilters:
-    """The filters of some runs. Their components may have different parameters."""
+    """The filters of some runs. The components of two runs may have different parameters."""
 
     one: Callable[[int], ParticleFilter]  #: the filter of a run
     rows: Callable[[np.ndarray], ParticleFilter]  #: one filter of the rows of some runs, in their order
@@ -85,7 +85,7 @@ def run_together(
 ) -> list[Collected]:
     """The runs of some seeds with the observations `ys`.
 
-    `check` compares some runs with single runs. `rounding` accepts differences by rounding.
+    If `check` is True, some runs are compared with single runs. `rounding` allows differences by rounding.
 
     Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component states ``batched=True``
     but mixes runs.
@@ -214,7 +214,7 @@ class _Sweep:
         return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(self.filter.n)), particles)
 
     def alone(self, t: int, slot: str, row: int) -> Population:
-        """The result of a component for one run. Raises LostRunError; other errors become `NotTogether`."""
+        """The result of a component for one run. Raises LostRunError, or `NotTogether` for any other error."""
         y, u = self.given[t]
         component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = self.key(t, slot, row).generator() if component.draws else None
@@ -291,7 +291,7 @@ class _Sweep:
 
     # --- resampling -----------------------------------------------------------------------------------------------
     def select(self, t: int) -> None:
-        """Resample the runs for which the trigger requires it."""
+        """Resample the runs that the trigger chooses."""
         self.resampled = np.array(np.broadcast_to(self.wanted(t), len(self.runs)))
         rows = np.flatnonzero(self.resampled)
         if not len(rows):

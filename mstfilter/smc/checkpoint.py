@@ -1,4 +1,4 @@
-"""Storage of the state of a run, so that a new process continues the run with identical results.
+"""Stores the state of a run, so that a new process can continue the run with identical results.
 
 >>> for state, info in filter.iterate(observations, seed):
 ...     save_state(path, state)
@@ -7,8 +7,8 @@
 
 The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
 then renamed. If the process is killed, the file holds the state of a complete step. All draws depend on the seed and
-the step only, so a continued run equals an uninterrupted run. The file stores neither filter nor observations: the
-caller must pass the same ones again.
+the step only, so a continued run equals an uninterrupted run. The file stores no filter and no observations: pass the
+same filter and observations again.
 
 `ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another type need a `Codec`. Loading
 a file never imports code.
@@ -64,7 +64,7 @@ def save_state(path: Path, state: State, codec: Codec | None = None, *, compress
 def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> State:
     """The state stored in a file.
 
-    Raises InputError if the file is missing, damaged, not a checkpoint, or its arrays need more than `limit` bytes.
+    Raises InputError if the file is missing, damaged or no checkpoint, or if arrays need more than `limit` bytes.
     """
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")

@@ -146,7 +146,7 @@ def first_seen(keys: Iterable[Hashable]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ExactEquality(Equivalence):
-    """Particles are equal if their array rows are bitwise equal, or objects by ``==`` and hash."""
+    """Array particles are equal if their bytes are equal, and objects if ``==`` and hash agree."""
 
     def classes(self, particles: Any) -> np.ndarray:
         if isinstance(particles, np.ndarray) and particles.dtype != object:
@@ -190,7 +190,7 @@ class Kld(Size):
     delta : float
         Probability that the distance exceeds `epsilon`, in (0, 1).
     n_min, n_max : int
-        Bounds of the number of particles. If one bin is occupied, the number is `n_min`.
+        Bounds of the number of particles. If one bin is occupied, `n_min` are selected.
     """
 
     equivalence: Equivalence = Bins()

@@ -4,8 +4,8 @@
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 
 `conditional_path` is a Markov kernel that leaves the smoothing distribution invariant for any number of particles
-(Andrieu, Doucet, Holenstein 2010). Models and probabilistic programs are supported. `path_log_prob` is the joint log
-density of a path and the observations. `particle_gibbs` uses both functions.
+(Andrieu, Doucet, Holenstein 2010). Programs are supported too. `path_log_prob` is the joint log density of a path and
+the observations. `particle_gibbs` uses both functions.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def conditional_path(
     filter : ParticleFilter
         Bootstrap or guided filter of a model or a program, with at least two particles.
     path : T particles, optional
-        The present path. Row t is the particle at time t. If None, an ordinary filter draws the path.
+        The present path. Row t is the particle at time t. If `path` is None, an ordinary filter draws the path.
 
     Returns
     -------

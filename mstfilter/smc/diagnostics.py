@@ -36,9 +36,9 @@ def energy_distance(
     population. For scalar particles the result is the square of `scipy.stats.energy_distance`. The energy distance is
     0 if both populations represent the same distribution, and positive otherwise.
 
-    ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
-    of negative type (Sejdinovic et al. 2013). For other distances, the result can be 0 for different distributions.
-    The default is the Euclidean distance of arrays and mappings of arrays.
+    ``distance(particles)`` returns an (n, n) array, for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance
+    must be of negative type (Sejdinovic et al. 2013). For other distances, the result can be 0 for different
+    distributions. The default is the Euclidean distance of arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -67,7 +67,7 @@ def _energy(particles: Any, masses: np.ndarray, distance: Callable[[Any], np.nda
 
 @dataclass(frozen=True, eq=False)
 class RunVariance:
-    """Estimates of a run, and their Monte Carlo variances, which are estimated from the same run."""
+    """Estimates of a run and their Monte Carlo variances, estimated from the same run."""
 
     log_evidence: np.ndarray  #: (T,)
     #: (T,) variance of the log evidence over seeds. May be negative where it is small compared with its own error.
@@ -105,12 +105,12 @@ def run_variance(
 
     With a lag L (Olsson and Douc 2019), the estimate for the mean uses ancestors L steps earlier instead of ancestors
     at time 0. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the
-    parts are added. The lag reduces the noise of the estimates, and the estimates stay valid when all particles share
-    one ancestor. The bias is small if x_t hardly depends on x_{t-L}.
+    parts are added. The lag reduces the noise of the estimates and keeps them valid when all particles share one
+    ancestor. The bias is small if x_t hardly depends on x_{t-L}.
 
     The variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
     % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
-    means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles for variances above 0.3.
+    means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the variance exceeds 0.3.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def run_variance(
     observations : iterable
     seed : int
     lag : int, optional
-        Number of steps L, at least 1. The default is all steps. Time and memory grow with n times the lag.
+        Number of steps L, at least 1. By default, L covers all steps. Time and memory grow with n times the lag.
     function : callable, optional
         ``(particles) -> (n, ...)``: the values that are averaged. By default, the values are the particles if they
         are an array. For particles of another type, means have the shape (T, 0).

@@ -17,8 +17,8 @@ from the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
 and `Student` are checked only when the distribution is sampled. The log density of a row that is out of range is NaN.
-MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with such values have the log
-density NaN, and the move rejects the proposal.
+MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values have the log
+density NaN, and the move rejects them.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ POSITIVE = Range("a positive number", 0.0)
 
 
 class _Checked(Distribution):
-    """A distribution that checks its parameters. The parameters are its fields.
+    """A distribution that checks its parameters, which are its fields.
 
     Scalar parameters are checked when the distribution is made. Arrays are checked at the same time unless `lazy` is
-    True. Lazy arrays are checked when the distribution is sampled; their log density is NaN at a value out of range.
+    True. Lazy arrays are checked when the distribution is sampled; the log density of a row out of range is NaN.
     """
 
     draws_numbers = True
@@ -99,7 +99,7 @@ class _Checked(Distribution):
             self._check(name, parameters)
 
     def _check(self, name: str, allowed: Range) -> None:
-        """Raise InputError at the first entry of a parameter out of range. `hypothetical` sets such rows to NaN."""
+        """Raise InputError at the first entry of a parameter out of range. In `hypothetical`, the rows become NaN."""
         value = getattr(self, name)
         if allowed.surely_contains(value):  # a third of the time of the rest
             return
@@ -427,7 +427,7 @@ class Categorical(Distribution):
 
 
 def as_distribution(value: Any) -> Distribution:
-    """A distribution of this package, or a frozen one of scipy.stats; InputError otherwise."""
+    """Return a `Distribution`, or convert a frozen distribution of scipy.stats. InputError for other types."""
     if isinstance(value, Distribution):
         return value
     if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):

@@ -9,8 +9,8 @@
 >>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
 
 `ClusterStratified` divides the n particles among groups of similar particles by weight, and gives each group at least
-one if possible. `ClusterStratified` then selects inside each group. A group of small weight keeps a particle, while
-schemes that use only weights usually lose such a group. The schemes of this module are unbiased.
+one particle if possible. `ClusterStratified` then selects inside each group. A group of small weight keeps a
+particle, while schemes that use only weights usually lose such a group. The schemes of this module are unbiased.
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -90,7 +90,7 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
 
 @dataclass(frozen=True)
 class Chopthin(WeightResampler):
-    """Bounds the ratio of the output weights: light particles are thinned, and heavy ones are split into copies.
+    """Bounds the ratio of the output weights: light particles are thinned, heavy particles are split into copies.
 
     With a threshold a, a particle of weight w gets on average h(w) copies:
 
@@ -185,10 +185,10 @@ class ClusterStratified(Resampler):
     """Divides n particles among clusters by weight, at least one each if possible, and draws inside each cluster.
 
     If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
-    of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n.
-    Systematic resampling rounds these numbers. The particles of a cluster share its weight, so any allocation is
-    unbiased. A cluster below `least_mass` gets W_g / c particles on average and may lose all particles. If W_g / c <
-    1 and the cluster keeps a particle, the particle has weight c. ``notes["clusters"]`` is the number of clusters.
+    of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n. The
+    numbers are rounded systematically. The particles of a cluster share its weight, so any allocation is unbiased. A
+    cluster below `least_mass` gets W_g / c particles on average and may lose all particles. If W_g / c < 1 and the
+    cluster keeps a particle, the particle has weight c. ``notes["clusters"]`` is the number of clusters.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ class ClusterStratified(Resampler):
     scheme : Resampler
         The scheme that selects inside a cluster.
     least_mass : float
-        A cluster with at least this share of the total weight always keeps a particle, in [0, 1).
+        Least share of the total weight for which a cluster always keeps a particle, in [0, 1).
     """
 
     similarity: Similarity = Gaussian()
@@ -255,7 +255,7 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
     """(m,) cluster of each particle; -1 if the particle has no weight.
 
     The heaviest unassigned particle becomes the leader of a new cluster. All unassigned particles that are similar
-    enough to the leader join this cluster. These steps are repeated until all particles are assigned.
+    enough to the leader join this cluster. The procedure ends when all particles are assigned.
     """
     cluster = np.full(len(weights), -1, np.int64)
     number = 0

@@ -1,4 +1,4 @@
-"""Linear-Gaussian and finite models, and their exact answers.
+"""Linear-Gaussian and finite models, and their exact posteriors.
 
 >>> filter = bootstrap(linear_gaussian(F, Q, H, R, m0, P0), n=1000)
 >>> exact = kalman_filter(F, Q, H, R, m0, P0, observations)
@@ -31,7 +31,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = N
 
     The matrices may have a first axis of length T. Entry t of `H` and `R` belongs to y_t. With `B` (d, j), each step
     after the first needs an input (j,), see `WithInput`. `Q` and `P0` may be singular (see `nonlinear_gaussian`).
-    `kalman_filter` computes the exact answers.
+    `kalman_filter` computes the exact posteriors.
 
     Raises InputError if shapes do not fit, or if a step has no entry of a matrix or no required input.
     """
@@ -85,7 +85,7 @@ def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
 
 
 class Kalman(NamedTuple):
-    """Exact answers of a linear-Gaussian model."""
+    """Exact posteriors and evidence of a linear-Gaussian model."""
 
     means: np.ndarray  #: (T, d) E[x_t | y_0 .. y_t]
     covariances: np.ndarray  #: (T, d, d) Cov[x_t | y_0 .. y_t]
@@ -161,7 +161,7 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
 
     `initial` (K,) holds the probabilities of x_0. Row i of `transition` (K, K) holds the probabilities of x_t given
     x_{t-1} = i. ``log_likelihood(y)`` (K,) returns log p(y_t | x_t) for each state, -inf if impossible. The function
-    may also have the parameters ``t`` and ``u``. `forward_backward` computes the exact answers.
+    may also have the parameters ``t`` and ``u``. `forward_backward` computes the exact posteriors.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -201,7 +201,7 @@ def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Marginals(NamedTuple):
-    """Exact answers of a model with K states."""
+    """Exact posteriors and evidence of a model with K states."""
 
     filtered: np.ndarray  #: (T, K) p(x_t | y_0 .. y_t)
     smoothed: np.ndarray  #: (T, K) p(x_t | y_0 .. y_{T-1})

@@ -68,11 +68,11 @@ class ParticleFilter(AtStep):
     Parameters
     ----------
     initial : Proposal
-        Draws the particles of the first step. The first observation updates these particles. The first prediction is
-        made in the second step. If `initial` is None or equal to `proposal`, the first step has only proposed
+        Draws the particles of the first step. The first observation updates the initial particles. The second step
+        makes the first prediction. If `initial` is None or equal to `proposal`, the first step has only proposed
         particles.
     transition : Transition
-        Moves the particles from the previous time to the present time. If None, the particles do not move.
+        Moves the particles from the previous time to the present time. None leaves the particles unchanged.
     proposal : Proposal, optional
         Draws new particles from the observation at every step.
     update : Update
@@ -93,7 +93,7 @@ class ParticleFilter(AtStep):
         Number of particles that `proposal` draws at each step. 0 means `n`.
     resample : {"after", "before"}
         With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
-        before the next prediction, as in textbooks. A step then returns the weights of its update.
+        before the next prediction, as in textbooks, and a step returns the weights of its update.
     """
 
     initial: Proposal | None = None
@@ -182,7 +182,7 @@ class ParticleFilter(AtStep):
     ) -> tuple[State, Infos]:
         """Run all steps, and return the last state and the infos. The parameters are those of `iterate`.
 
-        ``progress=True`` shows a progress bar. A function is called as ``progress(done, total)``.
+        ``progress=True`` shows a progress bar. A function `progress` is called as ``progress(done, total)``.
 
         To keep weights or particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
         """
@@ -408,7 +408,7 @@ class _Slot:
 
 
 def _checked(found: Any, component: Component) -> Population:
-    """The population that a component returned. Raises InputError for any other result."""
+    """The population that a component returned. Raises InputError if the result is not a `Population`."""
     if isinstance(found, Population):
         return found
     name = type(component).__name__
@@ -435,8 +435,8 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 def keep_freed_memory() -> None:
     """Free one large block, once per process.
 
-    After the call, glibc keeps freed arrays of up to 32 MB (the largest value) and does not return them to the system
-    after every step. Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of
-    the time of resampling a million weights. Other C libraries are not affected.
+    After the call, glibc keeps freed arrays of up to 32 MB and does not return them to the system after every step.
+    Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of the time of
+    resampling a million weights. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

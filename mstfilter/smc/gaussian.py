@@ -17,7 +17,7 @@ A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_
 of arrays. The transition draws u_t and predicts z_t. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) and
 corrects z_t. Reference: Doucet, de Freitas, Murphy, Russell (2000).
 
-`mstfilter.smc.exact` has linear models and their exact answers.
+`mstfilter.smc.exact` has linear models and their exact posteriors.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def nonlinear_gaussian(
     without noise. The functions may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of
     length T, one entry per step.
 
-    `Q` and `P0` may be singular, for example if noise acts only on the velocity. With a singular `Q`, x_t has no
-    density given x_{t-1}. The model then has no `log_transition` (with a singular `P0`, no `log_initial`), and
-    functions that need this density raise InputError. `conditional_path` then omits ancestor sampling.
+    `Q` and `P0` may be singular, for example if noise acts only on the velocity. With a singular `Q`, the model has
+    no `log_transition`. With a singular `P0`, the model has no `log_initial`. Functions that need the missing density
+    raise InputError. Without `log_transition`, `conditional_path` omits ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
@@ -98,7 +98,7 @@ class _Noise:
 
 
 class _Noises:
-    """Noise with one covariance (k, k) for all steps, or one for each step, (T, k, k)."""
+    """Noise with one covariance (k, k) for all steps, or a covariance for each step, (T, k, k)."""
 
     def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
         cov = np.asarray(given, np.float64)
@@ -110,7 +110,7 @@ class _Noises:
 
 
 class _OfStep:
-    """A function of particles, and of the step `t` and its input `u` if it has these parameters."""
+    """A function of particles that may also have the parameters `t` (step) and `u` (input)."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.parameters = function, step_parameters(function, 1)

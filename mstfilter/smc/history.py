@@ -1,4 +1,4 @@
-"""Recording of quantities of a run.
+"""Records quantities of a run.
 
 A collector is a function ``(state, info) -> number or array``. The run calls each collector after every step. `ess`,
 `unique_ancestors`, `log_evidence`, `mean` and `resampled` are collectors.

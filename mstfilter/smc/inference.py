@@ -1,4 +1,4 @@
-"""Parameters of a model, inferred by particle Markov chain Monte Carlo.
+"""Inference of model parameters by particle Markov chain Monte Carlo.
 
 A model with parameters is a function that returns a filter:
 
@@ -11,10 +11,10 @@ A model with parameters is a function that returns a filter:
 - `pmmh` is a Metropolis chain that uses the filter's unbiased estimate of the likelihood. The estimate for the
   current parameters is kept until a proposal is accepted. The chain then converges to the exact posterior for any
   number of particles (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` uses the same estimates with the walkers of emcee. The walkers need no step scale.
+- `ensemble` uses the estimates of the likelihood with the walkers of emcee. The walkers need no scale of steps.
 - `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Without
+  the transition has a density, this particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Without
   ancestor sampling the early states hardly change.
 """
 
@@ -176,7 +176,7 @@ def pmmh(
         Whether ``filter_of`` also accepts parameters (d, m), one column for each of m particles of several chains.
         The filters of all chains then run as one batch, see `mstfilter.smc.batching`. To combine a parameter with
         particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs and must be equal
-        up to rounding. Otherwise InputError is raised, or a warning is issued and the runs are made one by one.
+        up to rounding. If estimates differ, InputError is raised, or the runs are made one by one with a warning.
 
     Raises
     ------

@@ -10,8 +10,8 @@
 A function of a model with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
 observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
 
-`Component.at_step` returns a component for step t with input u. If a component or model has functions among its
-fields, `step_functions` must name these fields. Other components override `at_step`, or ignore time and inputs.
+`Component.at_step` returns a component for step t with input u. `step_functions` names the fields of a component or
+model that are functions. Other components override `at_step`, or ignore time and inputs.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _no_input(t: int, *args: Any, **named: Any) -> Any:
 
 
 class AtStep(Bounded):
-    """Base class of components and models. `at_step` binds time and input to the functions in their fields."""
+    """Base class of components and models. `at_step` binds time and input to the functions in the fields."""
 
     #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field
     #: that is a component or a model.
@@ -156,7 +156,7 @@ class AtStep(Bounded):
         t : int
             Index of the observation, from 0. The transition from x_{t-1} to x_t belongs to step t.
         u : optional
-            The input of the step, of any type; None if there is none.
+            The input of the step, of any type; None if the step has no input.
         """
         if not self.step_functions or not self._of_step:
             return self

@@ -57,8 +57,8 @@ class Component(AtStep, ABC):
     def properly_weighted(self) -> bool:
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author of a component states the property. The default is True; write ``properly_weighted = False`` in the
-        class to change the default. `mstfilter check` tests the property of resamplers. A filter reports the log
+        The author of a component declares this property. The default is True; write ``properly_weighted = False`` in
+        the class to change the default. `mstfilter check` tests the property of resamplers. A filter reports the log
         evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
@@ -107,7 +107,7 @@ class DensityTransition(Transition):
 
 
 class Update(Component):
-    """Uses the observation: reweights particles, projects particles, or makes new particles from pairs."""
+    """Uses the observation: reweights, projects, or combines predicted and proposed particles."""
 
     @abstractmethod
     def update(
@@ -136,7 +136,7 @@ class Resampler(Component):
 
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`."""
+        """Select `n` particles; ``parents["ancestor"]`` holds the (n,) indices of the selected particles."""
 
 
 class WeightResampler(Resampler):
@@ -160,8 +160,8 @@ class WeightResampler(Resampler):
         ancestors : (n,) int
             Indices into the m particles.
         log_weights : (n,) float or None
-            Log weights of the selected particles. None: every particle gets the log mean of the old weights, so the
-            estimate of the evidence does not change.
+            Log weights of the selected particles. If None, every particle gets the log mean of the old weights, so
+            the estimate of the evidence does not change.
         """
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
@@ -298,11 +298,11 @@ class Codec(ABC):
 
     @abstractmethod
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
-        """Named arrays (no object arrays) of the particles of a population."""
+        """Convert the particles of a population to named arrays, not of objects."""
 
     @abstractmethod
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The particles from the arrays of `encode`."""
+        """Convert the arrays of `encode` back to particles."""
 
 
 @dataclass(frozen=True, eq=False)

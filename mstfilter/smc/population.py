@@ -11,8 +11,8 @@ array([0.25, 0.25, 0.5 ])
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
 particles on access. `take` selects from all of these types: array rows are copied, and objects are shared.
 
-A population is immutable. A population does not copy the given arrays but holds read-only views of them. Do not write
-to an array after a population was made from it, or pass ``array.copy()`` to the population.
+A population is immutable. A population does not copy the given arrays but holds read-only views of them. If you write
+to an array later, pass ``array.copy()`` to the population.
 """
 
 from __future__ import annotations
@@ -189,9 +189,9 @@ class Population:
     Parameters
     ----------
     particles : ndarray (n, ...) | mapping of ndarray (n, ...) | sequence of n objects | Candidates
-        The particles. They must not be modified, since they are not copied.
+        The particles, which are not copied and must not be modified.
     log_weights : (n,) float
-        Unnormalised natural log weights, by default 0. A weight of 0 is -inf; NaN and +inf raise InputError.
+        Unnormalised natural log weights, by default 0. NaN and +inf raise InputError; -inf means a weight of 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
         proposed particles, -1 for none. The filter sets these indices, and an update keeps them. A resampler adds
@@ -286,7 +286,7 @@ class Population:
         return new
 
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
-        """Select particles with their parents, and with their log weights unless new ones are given.
+        """Select particles with their parents, and with their log weights unless `log_weights` are given.
 
         Raises InputError if the indices are not integers from 0 to n - 1.
         """
@@ -316,8 +316,8 @@ class Population:
     def traced_through(self, resampled: Population | None) -> Population:
         """The same particles, with parents before the resampling that preceded the prediction.
 
-        ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, they become indices into the
-        population before the resampling. The notes are dropped.
+        ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, the indices are converted to
+        indices into the population before the resampling. The notes are dropped.
         """
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         index = self.parents.get("previous")
@@ -328,7 +328,7 @@ class Population:
         return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
-        """Replace the particles by the same number of new ones. Weights and parents are kept; notes are dropped."""
+        """Replace the particles by as many new particles. Weights and parents are kept; notes are dropped."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")

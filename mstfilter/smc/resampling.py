@@ -68,7 +68,7 @@ class Stratified(WeightResampler):
 
 @dataclass(frozen=True)
 class Systematic(WeightResampler):
-    """Draws one uniform for all strata (Carpenter, Clifford, Fearnhead 1999). N_i is floor or ceil of n W_i."""
+    """Makes floor or ceil of n W_i copies, by one uniform for all strata (Carpenter, Clifford, Fearnhead 1999)."""
 
     batched: ClassVar[bool] = True
 
@@ -89,7 +89,7 @@ def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) -> np.ndarray:
-    """Round `expected` (m,), scaled to sum n, to floor or ceil by systematic draws: numbers of copies with sum n."""
+    """(m,) numbers of copies: `expected`, scaled to sum n, rounded to floor or ceil by systematic draws."""
     copies, fractions, rest = certain_copies(expected, n)
     if rest > 0:
         copies += np.bincount(inverse_cdf(fractions, rng.random(1), rest), minlength=len(copies))
@@ -98,7 +98,7 @@ def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) ->
 
 @dataclass(frozen=True)
 class Residual(WeightResampler):
-    """Makes floor(n W_i) copies. The rest is drawn independently by frac(n W_i) (Liu and Chen 1998)."""
+    """Makes floor(n W_i) copies of each particle, and draws the rest by frac(n W_i) (Liu and Chen 1998)."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)
@@ -112,11 +112,11 @@ _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
 
 @dataclass(frozen=True)
 class Ssp(WeightResampler):
-    """Srinivasan sampling process: N_i is floor or ceil of n W_i, for any order of the particles.
+    """Srinivasan sampling process: makes floor or ceil of n W_i copies, for any order of the particles.
 
     Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability down / (up +
     down), a increases and b decreases by `up`. With the remaining probability, a decreases and b increases by `down`.
-    One fraction is then 0 or 1 and final; the other fraction is paired again. All pairs of a round are processed
+    One of the fractions is then 0 or 1 and final; the other is paired again. All pairs of a round are processed
     together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative association, ordering and
     convergence of resampling methods").
     """
@@ -288,8 +288,7 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    Fewer than 2000 indices are sorted. 2000 or more are drawn in O(m + n) and sorted only between strata of the
-    weight.
+    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and indices ascend only between strata.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -365,7 +364,7 @@ def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
 
 
 def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
-    """Increase lower bounds of ``searchsorted(edges, points, side="right")`` to these, in place."""
+    """Increase lower bounds of ``searchsorted(edges, points, side="right")`` to the exact values, in place."""
     low = np.flatnonzero(edges.take(index) <= points)
     at, points = index.take(low), points.take(low)
     for _ in range(6):

@@ -10,9 +10,9 @@
 (2, 20, 50)
 
 Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. If the
-components of an arm treat each particle independently, its runs are processed together, as arrays of the particles of
-all runs (see `mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every arm has the same seed
-and random streams, so differences between arms have less noise.
+components of an arm treat each particle independently, its runs are processed together as arrays (see
+`mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every arm has the same seed and random
+streams, so differences between arms have less noise.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def run_many(
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). From that step on, the log evidence of a lost run is -inf and the other
-        results are NaN. `History.lost` explains lost runs. `History.single` explains runs made one by one.
+        an observation (`LostRunError`). After a run is lost, its log evidence is -inf and its other results are NaN.
+        `History.lost` explains lost runs. `History.single` explains runs made one by one.
 
     Warns
     -----

@@ -8,8 +8,8 @@ Three smoothers take a `Record` and return a tuple with one population per time:
 
 - `genealogy` follows the ancestors of the last particles (Kitagawa 1996), and needs only the record. After many
   resamplings, all paths have the same early states (path degeneracy).
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` has more
-  distinct particles, but is biased if a state depends on observations more than `lag` steps later.
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` keeps
+  more distinct particles, but is biased if a state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
   path degeneracy. A step evaluates N densities per path, or a few with ``method="mcmc"``.
 
@@ -84,7 +84,7 @@ def genealogy(record: Record) -> tuple[Population, ...]:
 
 
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
-    """Populations of the ancestors at time t of the particles at t + `lag` (or the end), with the later weights.
+    """For each time t, the ancestors of the particles at t + `lag` (or the end), weighted by these later particles.
 
     A lag of 0 returns the populations of the filter.
     """
@@ -127,10 +127,10 @@ def backward_paths(
         "exact" (Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
-        leave the distribution of "exact" invariant: (1 + `steps`) n densities per step. The record must have parents.
-        Few steps cause no additional bias (Dau and Chopin 2023). The reason: given x_{t+1}, a parent already has the
-        distribution of "exact" if the bootstrap filter selects independently, and up to order 1 / N otherwise. Steps
-        reduce the variance. Without accepted steps, the paths equal the paths of `genealogy`.
+        leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
+        record must have parents. A small number of steps adds no bias (Dau and Chopin 2023). Given x_{t+1}, a parent
+        has the distribution of "exact" if a bootstrap filter selects independently, and up to order 1 / N otherwise.
+        More steps reduce the variance. Without accepted steps, the paths equal the paths of `genealogy`.
     steps : int
         Number of Metropolis steps of "mcmc".
     """

@@ -122,7 +122,7 @@ class StateSpaceModel(AtStep):
     def density(self, which: str) -> Callable[..., np.ndarray]:
         """``log_initial`` or ``log_transition``.
 
-        Raises InputError if the model has no such function.
+        Raises InputError if the model was made without the density.
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:
@@ -152,7 +152,7 @@ class _OfModel(AtStep):
 
     @property
     def batched(self) -> bool | None:
-        """The value of the model, or None (a batch of runs tests the independence) if there is also a proposal."""
+        """The value of the model. If there is a proposal, True becomes None: a batch of runs tests the proposal."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
@@ -319,7 +319,7 @@ def metropolis(
     Yields
     ------
     state, accepted
-        After each step, the state and (n,) bool whether its proposal was accepted.
+        After each step: the state, and (n,) bool whether the proposal of a chain was accepted.
     """
     for _ in range(steps):
         new, log_ratio = propose(rng, state)
@@ -366,7 +366,7 @@ def guided(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The guided filter: moves by the proposal q(x_t | x_{t-1}, y_t), and weights by f g / q.
+    """The guided filter moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
 
     Parameters
     ----------

@@ -107,7 +107,7 @@ def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
 
 
 def key_of(rng: np.random.Generator) -> Key:
-    """The key of the stream of a generator, whatever numbers were drawn before."""
+    """The key of the stream of a generator at any position in the stream."""
     sequence = rng.bit_generator.seed_seq
     if isinstance(sequence, _KeySequence):
         return sequence.key
@@ -150,7 +150,7 @@ def rows_of(n: int) -> type[Rows]:
 
 
 class RunKeys:
-    """The keys of R runs. Makes the generators of one component at one step for several runs in half the time."""
+    """The keys of R runs. Makes generators of several runs in half the time of `Key.generator`."""
 
     def __init__(self, keys: list[Key]) -> None:
         self.keys = keys

@@ -159,7 +159,7 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Tempered(ResamplerWrapper):
-    """Selects by w^power and multiplies selected weights by w^(1 - power), so that light particles survive longer.
+    """Selects by w^power and multiplies selected weights by w^(1 - power), so light particles are kept more often.
 
     `power` is in [0, 1]. A power of 1 leaves the wrapped scheme unchanged. With a power of 0 all particles of
     positive weight are equally likely.

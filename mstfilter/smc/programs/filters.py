@@ -96,7 +96,7 @@ class _ProgramStep(Component):
 
 @dataclass(frozen=True)
 class ProgramInitial(_ProgramStep, Proposal):
-    """First step of a program. Draws values from the guide (if given) or the model, and weights the particles."""
+    """First step of a program. Draws values from the guide or the model, and weights the particles."""
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         return self._advance(rng, None, observation, n)
@@ -104,7 +104,7 @@ class ProgramInitial(_ProgramStep, Proposal):
 
 @dataclass(frozen=True)
 class ProgramTransition(_ProgramStep, Transition):
-    """Later step of a program. Draws values from the guide (if given) or the model, and weights the particles."""
+    """Later step of a program. Draws values from the guide or the model, and weights the particles."""
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         return self._advance(rng, population, observation, len(population))

@@ -6,9 +6,9 @@ without an error, but its weights are wrong. `Guard` checks some steps of each k
 66th, 515th, ... The numbers 8^k + k also detect a fault of every third step. A check has three parts:
 
 1. The first two steps are repeated with the same random numbers. All values and log weights must agree.
-2. A few particles run alone with the same drawn values. Their distributions and returned values must not change.
-   Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. The number of
-   particles differs from the step, so an event axis cannot pass for the particle axis.
+2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
+   change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. The
+   number of particles differs from the step, so an event axis cannot pass for the particle axis.
 3. If there is a guide, the model also draws a step. The guide must be able to draw the values of the model, and the
    two estimates of the evidence must agree.
 

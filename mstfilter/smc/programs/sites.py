@@ -37,7 +37,7 @@ def sample(name: str, distribution: Any) -> Any:
     Parameters
     ----------
     name : str
-        Unique within a step. Different branches of a `switch` may use the same name.
+        A name that is unique within a step. Different branches of a `switch` may use the same name.
     distribution : Distribution
         Distribution of this package, or frozen distribution of scipy.stats. Parameters have one row per particle.
 

@@ -1,8 +1,8 @@
-"""The base class of all contracts, a function that runs a contract without pytest, and helpers for messages.
+"""The base class of all contracts, and a function that runs a contract without pytest.
 
 A contract is a test class for pytest. The contract defines the arguments of calls (`inputs`, `variants`), the call
 (`call`), and the requirements of every result (`check_result`). Each further ``test_`` method checks one property.
-The first line of its docstring states the property, and the message of a failed assertion states the violation:
+The first line of the docstring of a test states the property, and the message of a failure states the violation:
 
 >>> class TriggerContract(Contract):
 ...     returns = bool

@@ -1,8 +1,8 @@
 """Tests of the weight of particles after a resampling: cases, statistics, and messages.
 
 A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many resamplings, the
-total weight of the copies of each particle and of each group of particles, as a fraction. `fault_message` compares
-the mean with the expected weight.
+share of the weight that the copies of each particle and of each group have. `fault_message` compares the mean with
+the expected weight.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mstfilter.smc.testing.contract import FALSE_ALARM
 
 @dataclass(frozen=True)
 class Case:
-    """Weights, number of particles to select, and number of calls at first."""
+    """Weights, number of particles to select, and initial number of calls."""
 
     weights: tuple[float, ...]
     n: int
@@ -86,9 +86,9 @@ class Sample:
     Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
     betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
     mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, the largest product
-    over any number of calls exceeds 1 / p with probability at most p. The test needs no normal approximation and no
-    variance, so an unbiased scheme passes even if it makes very many copies in rare calls. Calls may be added if the
-    result is not clear.
+    over any number of calls exceeds 1 / p with probability at most p. The test assumes no normal distribution, so an
+    unbiased scheme passes even if it makes very many copies in rare calls. Calls may be added if the result is not
+    clear.
     """
 
     def __init__(self, case: Case) -> None:
@@ -118,7 +118,7 @@ class Sample:
         """(m + k,) log evidence against the expected weight of each particle and group.
 
         The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is less than four standard
-        errors away. The limit is 16 copies larger (in all calls together), for particles that are rarely selected.
+        errors away. For particles that are rarely selected, the limit is 16 copies larger.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
@@ -169,7 +169,7 @@ def fault_message(sample: Sample, column: int) -> str:
 
 
 class ConstantGenerator(np.random.Generator):
-    """A generator whose `random` always returns one value. The test is skipped if a scheme does not end."""
+    """A generator whose `random` always returns one value. The test is skipped if the scheme does not end."""
 
     def __init__(self, value: float) -> None:
         super().__init__(np.random.PCG64(0))

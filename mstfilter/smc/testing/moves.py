@@ -86,7 +86,7 @@ class TransitionContract(ScaleContract, ExactContract):
     def _compare_moves(
         self, before: Population, after: Population, other: Population, fresh: Population, likelihood: list[Any]
     ) -> None:
-        """Compare moves and weight changes with exact moves. `likelihood` weights found and exact moves."""
+        """Compare moves and weight changes with exact moves. `likelihood` weights the found and the exact moves."""
         lw, exact_lw = (
             new.log_weights - old.log_weights + sum(log_g(new.particles) for log_g in likelihood)
             for old, new in ((before, after), (other, fresh))
@@ -200,7 +200,7 @@ class ProposalContract(ExactContract):
 
     @statistical
     def test_draws_have_their_distribution(self) -> None:
-        """Weighted draws have the exact distribution and mean weight. Means vary as means of independent draws."""
+        """Weighted draws have the exact distribution and mean weight, and vary as independent draws."""
         component = self.make()
 
         def sampled(n: int, seed: int = 2) -> Population:
@@ -227,10 +227,10 @@ class ProposalContract(ExactContract):
 class UpdateContract(ScaleContract, ExactContract):
     """The contract of every `Update`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    The statistical test needs a method ``exact(self, rng, n)`` that returns three items: n predicted particles x ~
-    p(x); exact draws of p(x | y), or the predicted particles with exact weights p(y | x); and y. Exact weights are
-    compared one by one, including a constant factor. For exact draws, the evidence is tested only if a fourth item of
-    `exact` is log p(y).
+    The statistical test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), a second
+    population, and y. The second population holds exact draws of p(x | y), or the predicted particles with exact
+    weights p(y | x). Exact weights are compared one by one, including a constant factor. For exact draws, the
+    evidence is tested only if a fourth item of `exact` is log p(y).
     """
 
     weighted = "predicted"
@@ -316,8 +316,8 @@ class UpdateContract(ScaleContract, ExactContract):
 class RejuvenationContract(ExactContract):
     """The contract of every `Rejuvenation`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    The statistical test needs a method ``exact(self, rng, n)`` that returns a population of `n` rows x_{t-1} (None at
-    the first step), a population of exact draws x_t given x_{t-1} and y_t, and y_t.
+    The statistical test needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1} (None at the first step),
+    exact draws of x_t given x_{t-1} and y_t, and y_t.
     """
 
     columns = "(x_t, x_t - x_{t-1})"
