@@ -64,9 +64,9 @@ class Reweight(Update):
 class Branching(Transition):
     """Moves `branches` copies of every particle independently. The mean weight, and so the evidence, does not change.
 
-    Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. Given only
-    n candidates for n particles, these schemes keep all of them, and the filter degenerates. If the branches of a
-    discrete state are all its successors, the filter is that of Fearnhead and Clifford (2003):
+    Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. If n
+    particles are selected from n candidates, all candidates are kept, and the filter degenerates. If the branches of
+    a discrete state are all its successors, the filter is that of Fearnhead and Clifford (2003):
 
     >>> filter = replace(
     ...     bootstrap(model, n=50),
@@ -190,7 +190,7 @@ class Kld(Size):
     delta : float
         Probability that the distance exceeds `epsilon`, in (0, 1).
     n_min, n_max : int
-        Bounds of the number of particles. If one bin is occupied, `n_min` are selected.
+        Bounds of the number of particles. For one occupied bin, `n_min` is chosen.
     """
 
     equivalence: Equivalence = Bins()

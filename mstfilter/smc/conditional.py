@@ -5,7 +5,7 @@
 
 `conditional_path` is a Markov kernel that leaves the smoothing distribution invariant for any number of particles
 (Andrieu, Doucet, Holenstein 2010). Programs are supported too. `path_log_prob` is the joint log density of a path and
-the observations. `particle_gibbs` uses both functions.
+the observations. `particle_gibbs` uses `conditional_path`; its `draw` may use `path_log_prob`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def conditional_path(
     One particle follows `path`, and the filter draws the other particles. The result is the path of one final
     particle, drawn by weight. Ancestors are drawn multinomially at every step; `resampler` and `trigger` of the
     filter are not used. If the density of the transition is known, the particle that follows the path also draws its
-    ancestors (ancestor sampling). For ancestor sampling, a program must not return values except those of its sites.
+    ancestors (ancestor sampling). For ancestor sampling, a program may return only values of its sites.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Par
 
 
 def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Particles, y: Any) -> float:
-    """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
+    """log p(x_t, y_t | x_{t-1}) of one particle, computed by the components of the filter."""
     component = filter.initial if previous is None else filter.transition
     if isinstance(component, ProgramInitial | ProgramTransition):
         _, gain = run_program(component.model, GivenHandler(row), previous, y, 1)

@@ -105,7 +105,7 @@ def run_variance(
 
     With a lag L (Olsson and Douc 2019), the estimate for the mean uses ancestors L steps earlier instead of ancestors
     at time 0. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the
-    parts are added. The lag reduces the noise of the estimates and keeps them valid when all particles share one
+    parts are added. The lag reduces the noise of the estimates. The estimates stay valid when all particles share one
     ancestor. The bias is small if x_t hardly depends on x_{t-L}.
 
     The variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15

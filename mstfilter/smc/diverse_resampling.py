@@ -10,7 +10,7 @@
 
 `ClusterStratified` divides the n particles among groups of similar particles by weight, and gives each group at least
 one particle if possible. `ClusterStratified` then selects inside each group. A group of small weight keeps a
-particle, while schemes that use only weights usually lose such a group. The schemes of this module are unbiased.
+particle; schemes that use only weights usually drop light groups. The schemes of this module are unbiased.
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -182,7 +182,7 @@ def checked_similarity(similarity: Similarity, population: Population) -> np.nda
 
 @dataclass(frozen=True)
 class ClusterStratified(Resampler):
-    """Divides n particles among clusters by weight, at least one each if possible, and draws inside each cluster.
+    """Divides n particles among clusters by weight (at least one per cluster if possible), and draws in each cluster.
 
     If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
     of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n. The
@@ -255,7 +255,7 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
     """(m,) cluster of each particle; -1 if the particle has no weight.
 
     The heaviest unassigned particle becomes the leader of a new cluster. All unassigned particles that are similar
-    enough to the leader join this cluster. The procedure ends when all particles are assigned.
+    enough to the leader join the cluster. The procedure ends when all particles are assigned.
     """
     cluster = np.full(len(weights), -1, np.int64)
     number = 0

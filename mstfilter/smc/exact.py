@@ -130,7 +130,7 @@ def kalman_filter(
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
-    """The inverse of a covariance, or the pseudo-inverse (on the range of the covariance) of a singular one."""
+    """The inverse of a covariance; for a singular covariance, the pseudo-inverse on its range."""
     values = np.linalg.eigvalsh(cov)
     if values.min() > 1e-12 * values.max():
         return np.linalg.inv(cov)
@@ -211,7 +211,7 @@ class Marginals(NamedTuple):
 def forward_backward(
     initial: Any, transition: Any, log_likelihood: Callable[..., Any], observations: Iterable[Any]
 ) -> Marginals:
-    """The forward-backward algorithm (Rabiner 1989). The arguments are those of `hidden_markov`.
+    """The forward-backward algorithm (Rabiner 1989). Takes the arguments of `hidden_markov`.
 
     Raises InputError if a shape does not fit, or if an observation has probability 0.
     """

@@ -180,7 +180,7 @@ class ParticleFilter(AtStep):
         *,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
-        """Run all steps, and return the last state and the infos. The parameters are those of `iterate`.
+        """Run all steps, and return the last state and the infos. Takes the parameters of `iterate`.
 
         ``progress=True`` shows a progress bar. A function `progress` is called as ``progress(done, total)``.
 

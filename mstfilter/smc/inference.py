@@ -14,8 +14,8 @@ A model with parameters is a function that returns a filter:
 - `ensemble` uses the estimates of the likelihood with the walkers of emcee. The walkers need no scale of steps.
 - `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, this particle also draws its ancestors (Lindsten, Jordan, Schön 2014). Without
-  ancestor sampling the early states hardly change.
+  the transition has a density, the particle on the path also draws its ancestors (Lindsten, Jordan, Schön 2014).
+  Without ancestor sampling the early states hardly change.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ from mstfilter.smc.streams import Key
 class Component(AtStep, ABC):
     """A component that takes part in a step.
 
-    At step t with input u, the filter uses ``component.at_step(t, u)`` (see `mstfilter.smc.inputs`). A class
-    attribute such as ``properly_weighted = False`` can override each of the three properties.
+    At step t with input u, the filter uses ``component.at_step(t, u)`` (see `mstfilter.smc.inputs`). Class attributes
+    can override `properly_weighted`, `draws` and `batched`: ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
@@ -57,9 +57,9 @@ class Component(AtStep, ABC):
     def properly_weighted(self) -> bool:
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author of a component declares this property. The default is True; write ``properly_weighted = False`` in
-        the class to change the default. `mstfilter check` tests the property of resamplers. A filter reports the log
-        evidence only if it has no `proposal` and all its components are properly weighted.
+        The author of a component declares if it is properly weighted. The default is True; write ``properly_weighted
+        = False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
+        reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
 
@@ -124,7 +124,7 @@ class Update(Component):
 
 
 class Resampler(Component):
-    """Selects particles by weight. A scheme that compares particles inherits this class and defines `resample`.
+    """Selects particles by weight. A scheme that compares particles inherits `Resampler` and defines `resample`.
 
     A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
     """

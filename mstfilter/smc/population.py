@@ -9,7 +9,7 @@ array([0.25, 0.25, 0.5 ])
 2.667
 
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
-particles on access. `take` selects from all of these types: array rows are copied, and objects are shared.
+particles on access. `take` selects particles of any type: array rows are copied, and objects are shared.
 
 A population is immutable. A population does not copy the given arrays but holds read-only views of them. If you write
 to an array later, pass ``array.copy()`` to the population.
@@ -194,8 +194,8 @@ class Population:
         Unnormalised natural log weights, by default 0. NaN and +inf raise InputError; -inf means a weight of 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none. The filter sets these indices, and an update keeps them. A resampler adds
-        ``"ancestor"``, the index before the resampling. A population after a step has ``"ancestor"`` if the step
+        proposed particles, -1 for none. The filter sets the indices, and an update keeps the indices. A resampler
+        adds ``"ancestor"``, the index before the resampling. A population after a step has ``"ancestor"`` if the step
         resampled after its update.
     notes : mapping
         Values that a component records: numbers, strings and lists.
@@ -299,7 +299,7 @@ class Population:
         )
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
-        """The population after a resampling: `take`, with ``parents["ancestor"]`` set and additional notes."""
+        """The population after a resampling: a `take` with ``parents["ancestor"]`` and additional notes."""
         return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:

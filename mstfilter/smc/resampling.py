@@ -89,7 +89,7 @@ def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) -> np.ndarray:
-    """(m,) numbers of copies: `expected`, scaled to sum n, rounded to floor or ceil by systematic draws."""
+    """(m,) numbers of copies. Rounds `expected`, scaled to sum n, to floor or ceil by systematic draws."""
     copies, fractions, rest = certain_copies(expected, n)
     if rest > 0:
         copies += np.bincount(inverse_cdf(fractions, rng.random(1), rest), minlength=len(copies))
@@ -98,7 +98,7 @@ def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) ->
 
 @dataclass(frozen=True)
 class Residual(WeightResampler):
-    """Makes floor(n W_i) copies of each particle, and draws the rest by frac(n W_i) (Liu and Chen 1998)."""
+    """Makes floor(n W_i) copies, and draws the rest independently by frac(n W_i) (Liu and Chen 1998)."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)
@@ -161,7 +161,7 @@ def _settle_pairs(
 
 
 def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
-    """(n,) particle of each position. Each particle gets floor(n / m) positions. A random subset gets one more."""
+    """(n,) particle of each position. Each particle gets floor(n / m) positions, or one more position at random."""
     particles = np.arange(m) if n == m else np.tile(np.arange(m), n // m)
     if n % m:
         particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
@@ -173,9 +173,9 @@ class Killing(WeightResampler):
     """A particle keeps its position with probability w_i / max w. Draws by weight fill the other positions.
 
     Most particles keep their positions if the weights are nearly equal. The reference for n = m is Del Moral (2004),
-    "Feynman-Kac formulae", section 5.6. For n != m, each particle has floor(n / m) of the n positions, and a random
-    subset has one more. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n. For n = m
-    and p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
+    "Feynman-Kac formulae", section 5.6. For n != m, each particle has floor(n / m) of the n positions, or one more at
+    random. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n. For n = m and p = w /
+    max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:

@@ -50,7 +50,7 @@ class Key:
         object.__setattr__(self, "seed", int(self.seed))
 
     def child(self, *parts: int | str) -> Key:
-        """The key that `parts` (slot, step, index) name below this key."""
+        """The key with `parts` (slot, step, index) appended to the path."""
         for part in parts:
             if type(part) is not str and (type(part) is not int or part < 0):
                 parts = tuple(map(_part, parts))

@@ -1,9 +1,9 @@
 """Checks that a program treats particles independently and draws random numbers only by `sample`.
 
 A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
-``previous["x"][0]``), draw from another generator, or keep values between steps. A program with such a fault runs
-without an error, but its weights are wrong. `Guard` checks some steps of each kind: the first two, then the 9th,
-66th, 515th, ... The numbers 8^k + k also detect a fault of every third step. A check has three parts:
+``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
+error, but its weights are wrong. `Guard` checks some steps of each kind: steps 1, 2, 9, 66, 515 and so on. The
+numbers 8^k + k also detect a fault of every third step. A check has three parts:
 
 1. The first two steps are repeated with the same random numbers. All values and log weights must agree.
 2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not

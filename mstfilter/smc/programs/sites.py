@@ -65,7 +65,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     Parameters
     ----------
     name : str
-        The index of the branch (n,) is stored in the particles under this name.
+        The index of the branch (n,) is stored in the particles under `name`.
     probs : (k,) or (n, k) array_like
         Probabilities of the k branches.
     branches : sequence of callables
@@ -243,7 +243,7 @@ class ProgramRun:
             self.calls.append(Call(self.what, k, self._rows, self._size, **fields))
 
     def _check_name(self, name: str) -> None:
-        """Raise InputError if a particle may reach two sites of this name."""
+        """Raise InputError if a particle may reach two sites with the same name."""
         if not isinstance(name, str):
             raise InputError(f"the name of a site is a {type(name).__name__}", 'write sample("x", distribution)')
         if name not in self._paths:
@@ -321,7 +321,7 @@ def _check_rows(argument: Any, size: int, k: int) -> None:
 
 
 def _blank(value: np.ndarray, n: int) -> np.ndarray:
-    """(n, ...) values of particles that do not reach a site: NaN for floats, 0 for other types."""
+    """(n, ...) values of particles that do not reach a site, which are NaN for floats and otherwise 0."""
     fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
     return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 

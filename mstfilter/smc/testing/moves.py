@@ -127,7 +127,7 @@ class TransitionContract(ScaleContract, ExactContract):
 
 
 class DensityTransitionContract(TransitionContract):
-    """The contract of every `DensityTransition`: `TransitionContract`, and properties of `log_prob`."""
+    """The contract of every `DensityTransition` adds properties of `log_prob` to `TransitionContract`."""
 
     def test_log_prob_is_of_each_move(self) -> None:
         """`log_prob` gives one finite number for each move of `predict`, independently of the other moves."""

@@ -143,7 +143,7 @@ def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
 
 
 class WeightResamplerContract(ResamplerContract):
-    """The contract of every `WeightResampler`: `ResamplerContract`, and properties of `select`."""
+    """The contract of every `WeightResampler` adds a property of `select` to `ResamplerContract`."""
 
     cases = CASES
 
