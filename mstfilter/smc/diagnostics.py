@@ -110,7 +110,8 @@ def run_variance(
 
     The variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
     % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
-    means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the variance exceeds 0.3.
+    means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the log evidence has a
+    variance above 0.3.
 
     Parameters
     ----------

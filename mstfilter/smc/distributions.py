@@ -16,9 +16,9 @@ has the classes used most often. For a distribution of another library, write a 
 from the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
-and `Student` are checked only when the distribution is sampled. The log density of a row that is out of range is NaN.
-MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values have the log
-density NaN, and the move rejects these rows.
+and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
+range is NaN. MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values
+have the log density NaN, and the move rejects these rows.
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ class _OfModel(AtStep):
 
     @property
     def batched(self) -> bool | None:
-        """The value of the model. If there is a proposal, True becomes None: a batch of runs tests the proposal."""
+        """The value of the model. With a proposal, True becomes None, so that a batch of runs tests the proposal."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 

@@ -117,8 +117,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expected weight of each particle and group.
 
-        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is less than four standard
-        errors away. For particles that are rarely selected, the limit is 16 copies larger.
+        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is within four standard
+        errors of the expectation. For particles that are rarely selected, the limit is 16 copies larger.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
