@@ -23,7 +23,7 @@
 `batching`              the runs of a filter together, as arrays
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
-`exact`                 linear-Gaussian and finite models with exact answers
+`exact`                 linear-Gaussian and finite models with exact posteriors
 `gaussian`              models with Gaussian noise; UKF proposals, Rao-Blackwellised filters
 `programs`              filters for probabilistic programs
 `distributions`         distributions for models; an adapter for those of scipy

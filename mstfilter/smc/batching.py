@@ -2,14 +2,15 @@
 
 `mstfilter.smc.run_many` uses this module where possible.
 
-The components are called once per step with the particles of all runs, as one population of R n particles. This is
-done if the `batched` of each of them is True (stated by its author) or None (tried; models of `StateSpaceModel.of`,
-programs). A component sees no axis of runs: it treats each row by itself, and takes the shape of its draws from its
-arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of each run from its stream.
+The components are called once per step with the particles of all runs, as one population of R n particles. Runs are
+batched if the `batched` of each component is True or None. Programs and models of `StateSpaceModel.of` have None:
+batching is tried. Components get arrays without an axis of runs. A component treats each row independently, and its
+draws have the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of a
+run from its stream.
 
-This is checked. At steps 0, 1, 2, 5, 12, 29, ..., at the last one, and when the number of runs changes, some runs are
-compared with a call for that run alone. If they differ, a component that states ``batched=True`` raises InputError.
-Otherwise, and if they differ by rounding only, `NotTogether` says why, and the runs have to be made one by one.
+The batch compares some runs with single runs at steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number
+of runs changes. If results differ by more than rounding and the component states ``batched=True``, InputError is
+raised. For any other difference, `NotTogether` gives the reason, and the runs must be made one by one.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _SLOTS = ("initial", "transition", "update")
 
 
 class NotTogether(Exception):
-    """The runs must be made one by one."""
+    """Raised if the runs must be made one by one."""
 
     def __init__(self, slot: str, reason: str) -> None:
         super().__init__(slot, reason)
@@ -47,7 +48,7 @@ class NotTogether(Exception):
 
 @dataclass(frozen=True)
 class RunFilters:
-    """The filters of some runs, whose components may hold different numbers."""
+    """The filters of some runs. The components of two runs may have different parameters."""
 
     one: Callable[[int], ParticleFilter]  #: the filter of a run
     rows: Callable[[np.ndarray], ParticleFilter]  #: one filter of the rows of some runs, in their order
@@ -62,7 +63,7 @@ class Collected:
 
 
 def check_together(filter: ParticleFilter) -> None:
-    """Raise `NotTogether` if a component of the filter is known to need single runs."""
+    """Raise `NotTogether` if a component of the filter cannot process several runs together."""
     for slot in ("proposal", "lookahead", "rejuvenation", "size"):
         if getattr(filter, slot) is not None:
             raise NotTogether(slot, f"the filter has a {slot}")
@@ -84,10 +85,10 @@ def run_together(
 ) -> list[Collected]:
     """The runs of some seeds with the observations `ys`.
 
-    Without `check`, runs are not compared with single runs. With `rounding`, differences by rounding are accepted.
+    If `check` is True, some runs are compared with single runs. `rounding` allows differences by rounding.
 
-    Raises `NotTogether` if the runs must be made one by one, and InputError if a component that states
-    ``batched=True`` mixes runs.
+    Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component states ``batched=True``
+    but mixes runs.
     """
     keep_freed_memory()
     check_together(filters.one(0))
@@ -95,7 +96,7 @@ def run_together(
 
 
 class _RunInfo(Info):
-    """The record of a step of one of many runs."""
+    """The record of one step of a batched run."""
 
     def __getattr__(self, name: str) -> Any:
         if name in ("notes", "seconds"):
@@ -104,7 +105,7 @@ class _RunInfo(Info):
 
 
 class _Sweep:
-    """The steps of R runs. Rows are runs that are not lost, with particles (R, n, ...) and log weights (R, n)."""
+    """The steps of R runs. Row r holds one run that is not lost: particles (R, n, ...), log weights (R, n)."""
 
     def __init__(
         self,
@@ -146,7 +147,7 @@ class _Sweep:
         return runs
 
     def step(self, t: int) -> None:
-        """Step t of all runs: the loop of `ParticleFilter.step` without the slots that runs do not share."""
+        """Step t of all runs, as in `ParticleFilter.step` without the components that need single runs."""
         filter, runs = self.filter, len(self.runs)
         self.resampled = np.zeros(runs, bool)
         self.ancestors = np.tile(identity(filter.n), (runs, 1)) if self.traced else None
@@ -167,7 +168,7 @@ class _Sweep:
 
     # --- calls of components --------------------------------------------------------------------------------------
     def call(self, t: int, slot: str) -> None:
-        """Call a component for all runs, and remove the runs that it loses."""
+        """Call a component for all runs, and remove the runs in which all weights become 0."""
         rows = np.arange(len(self.runs))
         try:
             particles, log_weights = self.together(t, slot)
@@ -213,7 +214,7 @@ class _Sweep:
         return each_array(lambda a: a.reshape(-1, *a.shape[2:]).view(rows_of(self.filter.n)), particles)
 
     def alone(self, t: int, slot: str, row: int) -> Population:
-        """What a component returns for one run; LostRunError, or `NotTogether` if it raises another error."""
+        """The result of a component for one run. Raises LostRunError, or `NotTogether` for any other error."""
         y, u = self.given[t]
         component = getattr(self.filters.one(int(self.runs[row])).at_step(t, u), slot)
         rng = self.key(t, slot, row).generator() if component.draws else None
@@ -229,7 +230,7 @@ class _Sweep:
             raise NotTogether(slot, f"step {t}: a run raises {type(error).__name__}") from error
 
     def lose(self, t: int, slot: str, rows: np.ndarray) -> None:
-        """Record the reasons why some runs are lost."""
+        """Record why some runs are lost (no particle explains the observation)."""
         for row in rows.tolist():
             try:
                 self.alone(t, slot, row)
@@ -240,7 +241,7 @@ class _Sweep:
 
     # --- checks ---------------------------------------------------------------------------------------------------
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare runs with single runs: the first and the last, or one in turn."""
+        """Compare the first and the last run, or the next run in turn, with single runs."""
         last, count = self.checked.get(slot, (0, 0))
         if t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == len(rows):
             return
@@ -262,7 +263,7 @@ class _Sweep:
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
 
     def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
-        """Refuse the component if a run differs."""
+        """Raise an error if the result of a run differs from that of the single run."""
         found = _difference(ours, alone)
         if found is None or (found[0] and self.rounding):
             return
@@ -271,14 +272,14 @@ class _Sweep:
         self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} alone")
 
     def refuse_error(self, t: int, slot: str, error: Exception) -> NoReturn:
-        """Raise `NotTogether` if a single run raises an error too, and else refuse the component."""
+        """Raise `NotTogether` if a single run raises an error too; otherwise call `refuse`."""
         for row in range(len(self.runs)):
             with suppress(LostRunError):
                 self.alone(t, slot, row)
         self.refuse(t, slot, f"a call for all runs raises {type(error).__name__}: {error}; single runs do not")
 
     def refuse(self, t: int, slot: str, reason: str) -> NoReturn:
-        """Raise InputError if the component states that it is batched, and else `NotTogether`."""
+        """Raise InputError if the component states ``batched=True``, otherwise `NotTogether`."""
         if getattr(self.filter, slot).batched is True:
             raise InputError(
                 f"step {t}, {slot}: {reason}",
@@ -290,7 +291,7 @@ class _Sweep:
 
     # --- resampling -----------------------------------------------------------------------------------------------
     def select(self, t: int) -> None:
-        """Resample the runs for which the trigger requires it."""
+        """Resample the runs that the trigger chooses."""
         self.resampled = np.array(np.broadcast_to(self.wanted(t), len(self.runs)))
         rows = np.flatnonzero(self.resampled)
         if not len(rows):
@@ -305,7 +306,7 @@ class _Sweep:
         self.particles = each_array(lambda a: _with_rows(a, rows, a[rows[:, None], index]), self.particles)
 
     def wanted(self, t: int) -> Any:
-        """(R,) bool, or a single bool: the runs to resample."""
+        """(R,) bool, or one bool for all runs: whether the trigger resamples the run."""
         trigger = self.filter.trigger
         if trigger.batched:
             runs: Any = SimpleNamespace(
@@ -316,7 +317,7 @@ class _Sweep:
         return [trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t) for row in rows]
 
     def selected(self, t: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Ancestors (len(rows), n) and log weights of some runs, in the form of `WeightResampler.select`."""
+        """Ancestors (len(rows), n) and log weights of the runs `rows`, as `WeightResampler.select` returns them."""
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
         if resampler.batched:
@@ -331,7 +332,7 @@ class _Sweep:
 
     # --- results --------------------------------------------------------------------------------------
     def key(self, t: int, slot: str, row: int) -> Key:
-        """The key of a component of one run."""
+        """The key of the random stream of a component in one run."""
         return self.streams.keys[self.runs[row]].child(slot, t)
 
     def record(self, t: int) -> None:
@@ -349,7 +350,7 @@ class _Sweep:
             self.found[name].append((self.runs, values))
 
     def seen(self, t: int, row: int) -> tuple[State, Info]:
-        """State and record of a run after step t."""
+        """State and `Info` of a run after step t."""
         assert self.ancestors is not None
         filter, ancestors = self.filter, self.ancestors[row]
         parents = {"previous": ancestors} if t else {}
@@ -363,7 +364,7 @@ class _Sweep:
         return State(t + 1, population, self.streams.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
-        """(T, R, ...) results of a collector. The results of lost runs are undefined."""
+        """(T, R, ...) results of a collector. The entries after a run is lost are undefined."""
         steps = self.found[name]
         check_one_shape(name, [values.shape[1:] for _, values in steps])
         shape = steps[0][1].shape[1:] if steps else ()
@@ -393,7 +394,7 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 
 def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
-    """The first difference of arrays or mappings of arrays, and whether it is rounding; None if they are equal."""
+    """Whether the first difference of arrays (or mappings) is rounding, and both values; None if equal."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

@@ -1,17 +1,17 @@
-"""Storage of the state of a run, so that a new process continues the run with identical results.
+"""Stores the state of a run, so that a new process can continue the run with identical results.
 
 >>> for state, info in filter.iterate(observations, seed):
 ...     save_state(path, state)
 >>> state = load_state(path)                                         # later, or in another process
 >>> state, infos = filter.run(observations[state.t:], state)
 
-The file is an .npz of plain arrays, read and written without pickle. It is written under a temporary name and
-renamed, so that a process that is killed leaves the state of a complete step. All draws depend on the seed and the
-step only, so a continued run equals an uninterrupted one. The file stores neither filter nor observations: the caller
-passes the same again.
+The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
+then renamed. If the process is killed, the file holds the state of a complete step. All draws depend on the seed and
+the step only, so a continued run equals an uninterrupted run. The file stores no filter and no observations: pass the
+same filter and observations again.
 
-`ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another kind need a `Codec`; stored
-data never import code.
+`ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another type need a `Codec`. Loading
+a file never imports code.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _FORMAT = 1
 def save_state(path: Path, state: State, codec: Codec | None = None, *, compress: bool = False) -> None:
     """Write a state after at least one step to an .npz file, atomically. The folder must exist.
 
-    `codec` is for particles other than those of `ArrayCodec`. With `compress` the file is smaller, and writing is
-    slower. Raises InputError if the particles cannot be stored or the file cannot be written.
+    `codec` encodes particles that `ArrayCodec` cannot store. `compress` makes the file smaller and writing slower.
+    Raises InputError if the particles cannot be stored or the file cannot be written.
     """
     population = state.population
     if population is None:
@@ -62,9 +62,9 @@ def save_state(path: Path, state: State, codec: Codec | None = None, *, compress
 
 
 def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> State:
-    """The state in a file.
+    """The state stored in a file.
 
-    Raises InputError if the file is missing, damaged, not a checkpoint, or its arrays need more than `limit` bytes.
+    Raises InputError if the file is missing, damaged or no checkpoint, or if arrays need more than `limit` bytes.
     """
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")
@@ -84,7 +84,7 @@ _DAMAGED = "remove it to start again, or choose another file"
 
 @contextmanager
 def _stored_state(path: Path) -> Iterator[None]:
-    """Turn errors about missing or wrong content in a block into InputError."""
+    """Convert errors about missing or wrong content of the file to InputError."""
     try:
         yield
     except InputError as error:
@@ -102,7 +102,7 @@ def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class ArrayCodec(Codec):
-    """Arrays, stored as ``x``, and mappings of arrays, stored as ``x/NAME``."""
+    """Stores an array of particles as ``x``, and a mapping of arrays as ``x/NAME``."""
 
     def encode(self, particles: Any) -> dict[str, np.ndarray]:
         if isinstance(particles, np.ndarray):

@@ -37,7 +37,7 @@ from mstfilter.smc.population import Population, as_matrix, union
 class Reweight(Update):
     """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights, as in the bootstrap filter.
 
-    Proposed particles, if any, are added to the predicted particles. `batched` states whether the function treats
+    Proposed particles, if any, are appended to the predicted particles. `batched` states whether the function treats
     each particle independently (see `Component.batched`).
     """
 
@@ -64,9 +64,9 @@ class Reweight(Update):
 class Branching(Transition):
     """Moves `branches` copies of every particle independently. The mean weight, and so the evidence, does not change.
 
-    Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. From n of
-    n particles these schemes keep all, and the filter degenerates. For discrete states with all successors as
-    branches, this is the filter of Fearnhead and Clifford (2003):
+    Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. If n
+    particles are selected from n candidates, all candidates are kept, and the filter degenerates. If the branches of
+    a discrete state are all its successors, the filter is that of Fearnhead and Clifford (2003):
 
     >>> filter = replace(
     ...     bootstrap(model, n=50),
@@ -79,7 +79,7 @@ class Branching(Transition):
     Parameters
     ----------
     inner : Transition
-        Moves the copies.
+        The transition that moves the copies.
     branches : int
         Number of copies of each particle. Copies are adjacent in the result.
     """
@@ -157,7 +157,7 @@ def first_seen(keys: Iterable[Hashable]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ExactEquality(Equivalence):
-    """Equal values: rows of arrays bit for bit, objects by their ``==`` and hash."""
+    """Array particles are equal if their bytes are equal, and objects if ``==`` and hash agree."""
 
     def classes(self, particles: Any) -> np.ndarray:
         if isinstance(particles, np.ndarray) and particles.dtype != object:
@@ -170,7 +170,7 @@ class ExactEquality(Equivalence):
 
 @dataclass(frozen=True)
 class Bins(Equivalence):
-    """Array particles in the same cell of a regular grid; `width` is the side of a cell in their units."""
+    """Array particles are equal if they lie in the same cell of a regular grid with cells of side `width`."""
 
     width: Annotated[float, Bounds(above=0, unit="side of a cell")] = 1.0
 
@@ -184,23 +184,24 @@ class Bins(Equivalence):
 
 @dataclass(frozen=True)
 class Kld(Size):
-    """The least n for which the Kullback-Leibler distance of the distribution over bins is at most epsilon.
+    """KLD-sampling: the least n that bounds the error of the distribution over bins by `epsilon`.
 
-    With k occupied bins this takes n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample size
-    in particle filters through KLD-sampling"). Fox counts the bins while drawing. Here the masses W_b of the bins are
-    known. n is the least number with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected number of bins that n
-    draws occupy. The bound holds for any resampling scheme, and gives slightly more particles than Fox's method.
+    With k occupied bins, the bound is n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
+    size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` knows the
+    weight W_b of each bin and chooses the least n with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected
+    number of bins that n draws occupy. The bound holds for any resampling scheme, and is slightly larger than Fox's
+    n.
 
     Parameters
     ----------
     equivalence : Equivalence
         Defines the bins: a grid for vectors, or classes of equal particles for objects.
     epsilon : float
-        Kullback-Leibler distance in nats, positive.
+        Bound of the Kullback-Leibler distance in nats, positive.
     delta : float
-        Probability that the distance is larger, in (0, 1).
+        Probability that the distance exceeds `epsilon`, in (0, 1).
     n_min, n_max : int
-        Bounds of the number of particles. If one bin is occupied, the number is `n_min`.
+        Bounds of the number of particles. For one occupied bin, `n_min` is chosen.
     """
 
     equivalence: Equivalence = Bins()
@@ -213,7 +214,7 @@ class Kld(Size):
         check_integer("n_max", self.n_max, f"n_min is {self.n_min}", at_least=self.n_min)
 
     def choose(self, population: Population) -> int:
-        """The least sufficient number within the bounds."""
+        """The least sufficient number of particles, from `n_min` to `n_max`."""
         population = population.realised()
         mass = np.bincount(self.equivalence.classes(population.particles), population.weights)
         mass = np.minimum(mass[mass > 0], 1.0)
@@ -229,7 +230,7 @@ class Kld(Size):
         return min(n, self.n_max)
 
     def bound(self, k: float) -> float:
-        """Number of draws for k occupied bins; 0 for one bin."""
+        """Number of draws that k occupied bins need; 0 for one bin."""
         from scipy.special import chdtri
 
         return float(chdtri(k - 1, self.delta) / (2 * self.epsilon)) if k > 1 + 1e-9 else 0.0

@@ -3,9 +3,9 @@
 >>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 
-`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant, for any number of particles
-and also for programs (Andrieu, Doucet, Holenstein 2010). `path_log_prob` is the joint log density of a path and the
-observations. `particle_gibbs` uses both.
+`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant for any number of particles
+(Andrieu, Doucet, Holenstein 2010). Programs are supported too. `path_log_prob` is the joint log density of a path and
+the observations. `particle_gibbs` uses `conditional_path`; its `draw` may use `path_log_prob`.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ def conditional_path(
 ) -> Particles:
     """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
 
-    One particle follows `path`, the others are drawn as usual, and the path of one of the final particles is
-    returned. Ancestors are multinomial at every step; `resampler` and `trigger` of the filter are not used. If the
-    density of the transition is known, the particle that follows the path also draws its ancestors. A program must
-    then keep nothing except its sites.
+    One particle follows `path`, and the filter draws the other particles. The result is the path of one final
+    particle, drawn by weight. Ancestors are drawn multinomially at every step; `resampler` and `trigger` of the
+    filter are not used. If the density of the transition is known, the particle that follows the path also draws its
+    ancestors (ancestor sampling). For ancestor sampling, a program may return only values of its sites.
 
     Parameters
     ----------
     filter : ParticleFilter
         Bootstrap or guided filter of a model or a program, with at least two particles.
     path : T particles, optional
-        The present path. Row t is the particle at time t. Without a given path, an ordinary filter draws the path.
+        The present path. Row t is the particle at time t. If `path` is None, an ordinary filter draws the path.
 
     Returns
     -------
-    array (T, ...), mapping of such, or tuple of T objects
+    array (T, ...), mapping of arrays (T, ...), or tuple of T objects
     """
     _check_conditional(filter)
     ys = list(observations)
@@ -107,7 +107,7 @@ def _ancestor(
 
 
 def _log_density(transition: Transition | None, old: Particles, new: Particles, y: Any) -> np.ndarray | None:
-    """(n,) log f(new | old), and for programs also log p(y | new, old); None if it is not known."""
+    """(n,) log f(new | old), plus log p(y | new, old) for programs; None if the density is not known."""
     if isinstance(transition, ProgramTransition):
         handler = GivenHandler(dict(new))
         particles, density = run_program(transition.model, handler, old, y, count_particles(old))
@@ -154,7 +154,7 @@ def _moved(
 def _drawn(
     rng: np.random.Generator, component: Any, past: Population | None, y: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Particles and log weights of a step, all drawn. A program runs without the checks of a filter."""
+    """Particles and log weights of a step, drawn without a given path. Programs run without `Guard` checks."""
     if not isinstance(component, ProgramInitial | ProgramTransition):
         if past is None:
             moved = component.sample(rng, y, n)
@@ -176,7 +176,7 @@ def _given_to_program(component: Any, old: Particles | None, given: Particles, y
 
 
 def _with_first(particles: Particles, first: Particles) -> Particles:
-    """The particles with the particle at index 0 replaced."""
+    """The particles, with particle 0 replaced by `first`."""
     if isinstance(particles, Mapping):
         return {name: _with_first(a, first[name]) for name, a in particles.items()}
     if not isinstance(particles, np.ndarray):
@@ -187,7 +187,7 @@ def _with_first(particles: Particles, first: Particles) -> Particles:
 
 
 def _joined(rows: list[Particles]) -> Particles:
-    """Particles of all times, from one particle each. Values that a program does not have at a time are NaN or 0."""
+    """Join one particle of each time to a path. Values that a program lacks at some time are NaN or 0."""
     if isinstance(rows[0], np.ndarray):
         return np.concatenate(rows)
     if not isinstance(rows[0], Mapping):
@@ -198,9 +198,9 @@ def _joined(rows: list[Particles]) -> Particles:
 
 
 def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Particles) -> float:
-    """log p(x_0 .. x_T, y_0 .. y_T) of a path of `conditional_path`, by the model or the program of a filter.
+    """log p(x_0 .. x_T, y_0 .. y_T) of a path, computed by the model or the program of a filter.
 
-    The filter is made from a `StateSpaceModel` with its log densities or from a `Program`.
+    The filter must be made from a `Program`, or from a `StateSpaceModel` that has log densities.
     """
     total, previous = 0.0, None
     for t, observation in enumerate(observations):
@@ -212,7 +212,7 @@ def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Par
 
 
 def _step_log_prob(filter: ParticleFilter, previous: Particles | None, row: Particles, y: Any) -> float:
-    """log p(x_t, y_t | x_{t-1}) of one particle, by the components of the filter at the step."""
+    """log p(x_t, y_t | x_{t-1}) of one particle, computed by the components of the filter."""
     component = filter.initial if previous is None else filter.transition
     if isinstance(component, ProgramInitial | ProgramTransition):
         _, gain = run_program(component.model, GivenHandler(row), previous, y, 1)

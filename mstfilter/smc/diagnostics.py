@@ -1,11 +1,11 @@
-"""How good the estimates of a run are: Monte Carlo variances from the run itself, and distances of populations.
+"""Monte Carlo variances of the estimates of a run, estimated from the same run, and distances between populations.
 
 >>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
 
-It follows ancestors, so it needs a filter whose particles all have known parents. `energy_distance` compares two
-populations, such as those before and after a selection. If the true state is known, half of the distance to it is the
-energy score of the population (Gneiting and Raftery 2007); lower is better:
+`run_variance` follows ancestors, so all particles of the filter must have known parents. `energy_distance` compares
+two populations, such as before and after a resampling. Half of the distance of a population to the true state is its
+energy score (Gneiting and Raftery 2007). A lower score is better:
 
 >>> energy_distance(population, Population(np.array([truth]))) / 2
 """
@@ -32,13 +32,13 @@ def energy_distance(
 ) -> float:
     """Energy distance between two weighted populations (Szekely and Rizzo 2013), in the units of the distance.
 
-    2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second population. For numbers
-    the distance is the square of `scipy.stats.energy_distance`. The energy distance is 0 if both populations
-    represent the same distribution, and else positive.
+    The energy distance is 2 E d(X, Y) - E d(X, X') - E d(Y, Y') for draws X, X' of the first and Y, Y' of the second
+    population. For scalar particles the result is the square of `scipy.stats.energy_distance`. The energy distance is
+    0 if both populations represent the same distribution, and positive otherwise.
 
-    ``distance(particles)`` returns (n, n), for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance must be
-    of negative type (Sejdinovic et al. 2013). For other distances, the result can be 0 for different
-    distributions. Default: The default is Euclidean, for arrays and mappings of arrays.
+    ``distance(particles)`` returns an (n, n) array, for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance
+    must be of negative type (Sejdinovic et al. 2013). For other distances, the result can be 0 for different
+    distributions. The default is the Euclidean distance of arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -86,48 +86,49 @@ def run_variance(
 ) -> RunVariance:
     """Run a filter and estimate the variance of its estimates from their ancestors.
 
-    Let A_e be the weight of the particles at time t whose ancestor at time 0 is e; all weights sum to 1. The relative
-    variance of the evidence, and so the variance of its log, is estimated by
+    Let A_e be the total weight of the particles at time t whose ancestor at time 0 is e; all weights sum to 1. The
+    variance of the log evidence (to first order, the relative variance of the evidence) is estimated by
 
         V = 1 - f (1 - sum_e A_e^2), where f = N / (N - 1) * product of f_s over the selections s.
 
     The variance of a weighted mean is estimated by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the
     particles of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
-    unbiased. Other schemes make fewer duplicates, so f_s is computed from the weights:
+    unbiased. For other schemes, which make fewer duplicates, f_s is computed from the weights:
 
         f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
 
     W_e and V_e are the weights of the descendants of e before and after the selection. The factor f_s is the ratio of
     the probabilities that two draws have different ancestors. For independent selections of particles with different
-    ancestors, it is N / (N - 1) on average. For schemes other than `Multinomial` the factor is an approximation. The
+    ancestors, the mean of f_s is N / (N - 1). For schemes other than `Multinomial`, f_s is an approximation. The
     approximation assumes that pairs of particles with different ancestors are selected in proportion to their
     weights.
 
-    With a lag L (Olsson and Douc 2019), ancestors L steps earlier replace those at time 0 in the estimate for the
-    mean. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the parts
-    are added. The lag reduces the noise of the estimates and keeps them valid when all particles share one ancestor.
-    The bias is small if the model forgets its state in L steps.
+    With a lag L (Olsson and Douc 2019), the estimate for the mean uses ancestors L steps earlier instead of ancestors
+    at time 0. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the
+    parts are added. The lag reduces the noise of the estimates. The estimates stay valid when all particles share one
+    ancestor. The bias is small if x_t hardly depends on x_{t-L}.
 
-    All estimates are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
+    The variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
     % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
-    means are 90 % too low (`experiments/run_variance/sizes.csv`). Take more particles above a variance of .3.
+    means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the log evidence has a
+    variance above 0.3.
 
     Parameters
     ----------
     filter : ParticleFilter
-        A properly weighted filter with n of at least 2.
+        A properly weighted filter with at least 2 particles.
     observations : iterable
     seed : int
     lag : int, optional
-        Number of steps, at least 1. By default, all steps. Time and memory grow with n times the lag.
+        Number of steps L, at least 1. By default, L covers all steps. Time and memory grow with n times the lag.
     function : callable, optional
-        ``(particles) -> (n, ...)``, whose weighted mean is estimated. By default, the particles if they are an array.
-        For other particles, means have the shape (T, 0).
+        ``(particles) -> (n, ...)``: the values that are averaged. By default, the values are the particles if they
+        are an array. For particles of another type, means have the shape (T, 0).
 
     Returns
     -------
     RunVariance
-        The estimates equal those of ``filter.run(observations, seed)``.
+        The log evidence and the means equal the estimates of ``filter.run(observations, seed)``.
     """
     if lag is not None:
         check_integer("lag", lag)
@@ -169,7 +170,7 @@ def _values(population: Population, function: Callable[[Any], np.ndarray] | None
 
 
 class _Selection(NamedTuple):
-    """A selection from m particles."""
+    """A resampling of m particles."""
 
     parents: np.ndarray  #: (m,) int, their parents in the population after the previous step
     before: np.ndarray  #: (m,) their weights
@@ -179,7 +180,7 @@ class _Selection(NamedTuple):
 
 @dataclass(frozen=True)
 class _Watched(ResamplerWrapper):
-    """Records the selections of a step."""
+    """Records the resamplings of a step."""
 
     selections: list[_Selection] = field(default_factory=list)
 
@@ -197,7 +198,7 @@ class _Watched(ResamplerWrapper):
 
 
 class _Ancestry:
-    """Ancestors of the particles at the times t - lag .. t, with the factor f of the selections since."""
+    """Ancestors of the particles at the times t - lag .. t, and the factor f of the selections after each time."""
 
     def __init__(self, lag: int | None) -> None:
         self.lag = lag
@@ -211,7 +212,7 @@ class _Ancestry:
         self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
 
     def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:
-        """Continue with the next population."""
+        """Update the ancestors and factors for the next population."""
         if self.lag is not None and len(self.window) > self.lag:
             self.past += self._relative(0) - self._relative(1)
             self.window.popleft()
@@ -225,7 +226,7 @@ class _Ancestry:
         self.weights = weights
 
     def _relative(self, place: int) -> float:
-        """Relative variance of the evidence that arises from the time of `place` to the present."""
+        """Relative variance of the evidence that arises from time `place` of the window to the present."""
         index, f = self.window[place]
         return 1.0 - f * _differ(index, self.weights)
 
@@ -233,7 +234,7 @@ class _Ancestry:
         return self.past + self._relative(0)
 
     def mean(self, centred: np.ndarray) -> np.ndarray:
-        """(...) variance of the weighted mean of values (n, ...) from which that mean is subtracted."""
+        """(...) variance of the weighted mean of values; `centred` (n, ...) are the values minus their mean."""
         index, f = self.window[0]
         columns = (self.weights[:, None] * centred.reshape(len(centred), -1)).T
         squares = [float(np.square(np.bincount(index, column)).sum()) for column in columns]

@@ -11,13 +11,14 @@ Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The ent
 their log densities are summed. `log_prob` is always (n,), or a number if no argument has rows.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
-of these (`as_distribution`); they take three to six times as long. This module has the classes used most often. For a
-distribution of another library, write a `Distribution` whose `sample` draws by the given generator.
+of the classes of this module (`as_distribution`). Distributions of scipy take three to six times as long. This module
+has the classes used most often. For a distribution of another library, write a `Distribution` whose `sample` draws
+from the given generator.
 
-A parameter out of range, in any row, raises InputError when the distribution is made. The arrays of `Normal` and
-`Student` raise it when the distribution is sampled, since their log density at such a row is NaN. Moves evaluate
-values that a model may exclude: inside `hypothetical` such a row has the log density NaN, which a
-move rejects.
+A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
+and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
+range is NaN. MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values
+have the log density NaN, and the move rejects these rows.
 """
 
 from __future__ import annotations
@@ -61,11 +62,11 @@ class Range(NamedTuple):
     open: bool = True  #: whether the ends are out of range
 
     def contains(self, value: np.ndarray) -> np.ndarray:
-        """Whether each number is in the range; NaN is not."""
+        """Whether each number is in the range; False for NaN."""
         return (value > self.low) & (value < self.high) if self.open else (value >= self.low) & (value <= self.high)
 
     def surely_contains(self, value: Any) -> bool:
-        """Whether all numbers of a float or float64 array are known to be in the range, from sum and minimum."""
+        """Whether the sum and the minimum of a float or a float64 array show that all entries are in the range."""
         if type(value) is float:
             return self.low < value < self.high
         if self.high < math.inf or not _is_finite(value):
@@ -78,10 +79,10 @@ POSITIVE = Range("a positive number", 0.0)
 
 
 class _Checked(Distribution):
-    """A distribution that checks its parameters, which are fields.
+    """A distribution that checks its parameters, which are its fields.
 
-    Numbers are checked when the distribution is made. Arrays are also checked then, unless they are `lazy`. Lazy
-    arrays are checked when the distribution is sampled, as the log density at a value out of range is NaN.
+    Scalar parameters are checked when the distribution is made. Arrays are checked at the same time unless `lazy` is
+    True. Lazy arrays are checked when the distribution is sampled; the log density of a row out of range is NaN.
     """
 
     draws_numbers = True
@@ -98,7 +99,7 @@ class _Checked(Distribution):
             self._check(name, parameters)
 
     def _check(self, name: str, allowed: Range) -> None:
-        """Raise InputError at the first entry of a parameter that is out of range; `hypothetical` makes it NaN."""
+        """Raise InputError at the first entry of a parameter out of range. In `hypothetical`, the rows become NaN."""
         value = getattr(self, name)
         if allowed.surely_contains(value):  # a third of the time of the rest
             return
@@ -131,7 +132,7 @@ class _Independent(_Checked):
 
     @abstractmethod
     def _mean(self) -> Any:
-        """Mean of an entry."""
+        """Means of the independent entries."""
 
     @property
     def mean(self) -> np.ndarray:
@@ -139,7 +140,7 @@ class _Independent(_Checked):
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether all numbers of a float or float64 array, and their sum, are finite."""
+    """Whether all entries of a float or a float64 array, and the sum of the entries, are finite."""
     if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
         return math.isfinite(np.add.reduce(value, axis=None))
     return type(value) is float and math.isfinite(value)
@@ -257,7 +258,7 @@ class Student(_Independent):
 
 @dataclass(frozen=True, eq=False)
 class Uniform(_Independent):
-    """Uniform on [low, high)."""
+    """Uniform distribution on [low, high)."""
 
     low: Any = 0.0
     high: Any = 1.0
@@ -356,7 +357,7 @@ class MultivariateNormal(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Bernoulli(_Independent):
-    """Booleans, True with probability `p`."""
+    """Booleans that are True with probability `p`."""
 
     p: Any
     discrete = True
@@ -377,7 +378,7 @@ class Bernoulli(_Independent):
 
 @dataclass(frozen=True, eq=False)
 class Categorical(Distribution):
-    """One of k categories, numbered from 0. The rows of `probs` (k,) or (n, k) are scaled to sum to one."""
+    """A distribution over k categories, 0 to k - 1. Rows of `probs` (k,) or (n, k) are scaled to sum to one."""
 
     probs: Any
     discrete = True
@@ -426,7 +427,7 @@ class Categorical(Distribution):
 
 
 def as_distribution(value: Any) -> Distribution:
-    """A distribution of this package, or a frozen one of scipy.stats; InputError otherwise."""
+    """Return a `Distribution`, or convert a frozen distribution of scipy.stats. InputError for other types."""
     if isinstance(value, Distribution):
         return value
     if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):

@@ -1,4 +1,4 @@
-"""Resampling that keeps different particles, with unequal output weights.
+"""Resampling schemes that keep different particles. The output weights are unequal.
 
 `FearnheadClifford` and `Chopthin` need only the weights. `ClusterStratified` compares particles by a `Similarity`.
 `FearnheadClifford` needs more candidates than particles to select.
@@ -8,9 +8,9 @@
 >>> rng = np.random.default_rng(0)
 >>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
 
-`ClusterStratified` gives every group of similar particles a share of the selection by its weight, with at least one
-particle if possible. `ClusterStratified` then selects inside each group. A light group that differs from all others
-keeps a particle. Schemes that use only weights usually lose it. The schemes are exact in expectation.
+`ClusterStratified` divides the n particles among groups of similar particles by weight, and gives each group at least
+one particle if possible. `ClusterStratified` then selects inside each group. A group of small weight keeps a
+particle; schemes that use only weights usually drop light groups. The schemes of this module are unbiased.
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -33,13 +33,13 @@ from mstfilter.smc.resampling import Systematic, checked_weights, inverse_cdf, s
 
 @dataclass(frozen=True)
 class FearnheadClifford(WeightResampler):
-    """Optimal resampling. Keeps particles with w_i >= c, and others with probability w_i / c and weight c.
+    """Optimal resampling. Keeps particles with w_i >= c, and lighter particles with probability w_i / c and weight c.
 
-    c is the solution of sum min(1, w_i / c) = n. The light particles are selected systematically, so there are no
-    duplicates. The total weight is kept exactly. Among all unbiased random weights with at most n positive ones,
-    these have the least expected squared error. If n or fewer particles have positive weight, all of these are kept.
-    So fewer than n particles may be returned. A filter that selects n of n particles therefore degenerates. Use more
-    candidates than particles (`Branching`).
+    c is the solution of sum min(1, w_i / c) = n. The lighter particles are selected systematically, so there are no
+    duplicates. The total weight is kept exactly. Among all unbiased random weights with at most n positive weights,
+    the output weights have the least expected squared error. If at most n particles have positive weight, all of them
+    are kept, and fewer than n particles may be returned. A filter that selects n of n particles therefore
+    degenerates. Use more candidates than particles (`Branching`).
 
     >>> log_weights = np.log([4.0, 3.0, 1.0, 1.0, 1.0])
     >>> ancestors, log_weights = FearnheadClifford().select(np.random.default_rng(1), log_weights, 4)
@@ -72,7 +72,7 @@ class FearnheadClifford(WeightResampler):
 def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
     """c with sum min(1, w_i / c) = n, and the (m,) bool mask of the weights with w_i >= c (fewer than n).
 
-    The (m,) weights must be positive, and m > n.
+    The weights (m,) must be positive, and m must exceed n.
     """
     heavy, kept, c = np.zeros(len(weights), bool), 0, float(weights.sum()) / n
     while True:  # c decreases until all light weights are below c; takes a few rounds
@@ -90,23 +90,23 @@ def optimal_threshold(weights: np.ndarray, n: int) -> tuple[float, np.ndarray]:
 
 @dataclass(frozen=True)
 class Chopthin(WeightResampler):
-    """Bounds the ratio of the output weights: light particles are thinned, and heavy ones are split into copies.
+    """Bounds the ratio of the output weights: light particles are thinned, heavy particles are split into copies.
 
     With a threshold a, a particle of weight w gets on average h(w) copies:
 
     - w / a if w < a, and the copy has weight a;
-    - 1 if w is between a and ratio a / 2;
-    - 2 w / (ratio a) if w is larger, and each copy has an equal share of w.
+    - 1 if w is between a and ratio a / 2, and the copy has weight w;
+    - 2 w / (ratio a) if w is larger, and the copies share w equally.
 
-    The threshold is the solution of sum h(w_i) = n. The numbers of copies are floor or ceil of h, rounded
-    systematically. Exactly n particles are returned, and all weights lie in [a, ratio a]. If the ratio of the given
-    weights is at most ratio / 2 and n of n are selected, nothing changes.
+    The threshold a is the solution of sum h(w_i) = n. Systematic resampling rounds each h(w) to floor or ceil.
+    Exactly n particles are returned, and all output weights lie in [a, ratio a]. If n of n particles are selected and
+    the largest weight is at most ratio / 2 times the smallest, the result equals the input.
 
     Parameters
     ----------
     ratio : float
         Upper bound of the ratio of the largest to the smallest output weight, at least 4. The effective sample size
-        is then at least 4 ratio / (1 + ratio)^2 of n, which is one half for the default, 3 + sqrt(8).
+        is then at least 4 ratio / (1 + ratio)^2 times n: n / 2 for the default ratio, 3 + sqrt(8).
 
     Reference: Gandy and Lau (2016), "The chopthin algorithm for resampling", IEEE Transactions on Signal Processing
     64.
@@ -131,7 +131,7 @@ class Chopthin(WeightResampler):
 
 
 def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
-    """a with sum h(w_i) = n (see `Chopthin`) for (m,) positive weights; any of them if there are several."""
+    """The threshold a with sum h(w_i) = n (see `Chopthin`) for (m,) positive weights; any solution if not unique."""
     w = np.sort(weights)
     # For a between neighbours among all w and 2 w / ratio, sum h = share / a + middle: particles below the index
     # `thinned` have w < a, those from `unchopped` on have w > ratio a / 2.
@@ -149,7 +149,7 @@ def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
 
 @dataclass(frozen=True)
 class Gaussian(Similarity):
-    """exp(-d^2 / (2 scale^2)), where d is the Euclidean distance of array particles; positive semidefinite."""
+    """exp(-d^2 / (2 scale^2)) with the Euclidean distance d of array particles; positive semidefinite."""
 
     scale: Annotated[float, Bounds(above=0, unit="distance")] = 1.0
 
@@ -182,22 +182,22 @@ def checked_similarity(similarity: Similarity, population: Population) -> np.nda
 
 @dataclass(frozen=True)
 class ClusterStratified(Resampler):
-    """Allocates particles to clusters by weight (at least one to each if n allows it), and draws by weight inside.
+    """Divides n particles among clusters by weight (at least one per cluster if possible), and draws in each cluster.
 
-    If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. With more particles,
-    cluster g gets max(1, W_g / c) particles on average, with sum max(1, W_g / c) = n, rounded systematically. The
-    particles of a cluster share its weight, so any allocation of this kind is unbiased. Clusters below `least_mass`
-    may lose all particles: each gets W_g / c on average. If this is below 1 and the cluster gets a particle, the
-    particle has weight c. ``notes["clusters"]`` is the number of clusters.
+    If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
+    of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n. The
+    numbers are rounded systematically. The particles of a cluster share its weight, so any allocation is unbiased. A
+    cluster below `least_mass` gets W_g / c particles on average and may lose all particles. If W_g / c < 1 and the
+    cluster keeps a particle, the particle has weight c. ``notes["clusters"]`` is the number of clusters.
 
     Parameters
     ----------
     at_least : float
-        Smallest similarity to the leader of a cluster for a particle of the cluster, in (0, 1].
+        Smallest similarity of a particle to the leader of its cluster, in (0, 1].
     scheme : Resampler
-        Selects inside a cluster.
+        The scheme that selects inside a cluster.
     least_mass : float
-        Share of the total weight from which a cluster always keeps a particle, in [0, 1).
+        Least share of the total weight for which a cluster always keeps a particle, in [0, 1).
     """
 
     similarity: Similarity = Gaussian()
@@ -237,7 +237,7 @@ class ClusterStratified(Resampler):
         return population.select(selected, out, clusters=len(mass))
 
     def _allocate(self, rng: np.random.Generator, mass: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Number of particles of each cluster, and the weight that they share."""
+        """Number of particles of each cluster, and the total weight of these particles."""
         sure = mass >= self.least_mass * mass.sum()
         n_sure = int(sure.sum())
         if n_sure > n or (n_sure == n and not sure.all()):
@@ -254,8 +254,8 @@ class ClusterStratified(Resampler):
 def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float) -> np.ndarray:
     """(m,) cluster of each particle; -1 if the particle has no weight.
 
-    The heaviest particle without a cluster becomes the leader of a new cluster, with all remaining particles that are
-    similar enough to it. The assignment is repeated until all particles have a cluster.
+    The heaviest unassigned particle becomes the leader of a new cluster. All unassigned particles that are similar
+    enough to the leader join the cluster. The procedure ends when all particles are assigned.
     """
     cluster = np.full(len(weights), -1, np.int64)
     number = 0
@@ -272,7 +272,7 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
 
 
 def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
-    """max(1, mass / c) for `sure` clusters and mass / c for others, with sum n. At most n clusters are sure."""
+    """Mean particles of each cluster, with sum n: max(1, mass / c) if `sure` (at most n clusters), else mass / c."""
     ordered = np.sort(mass[sure])[::-1]
     heavy = np.append(0.0, np.cumsum(ordered)) + mass[~sure].sum()
     # If the A heaviest of S sure clusters exceed 1, they and the unsure ones share n - (S - A) particles by mass.

@@ -1,4 +1,4 @@
-"""Linear-Gaussian and finite models, and their exact answers.
+"""Linear-Gaussian and finite models, and their exact posteriors.
 
 >>> filter = bootstrap(linear_gaussian(F, Q, H, R, m0, P0), n=1000)
 >>> exact = kalman_filter(F, Q, H, R, m0, P0, observations)
@@ -8,9 +8,9 @@
 >>> exact = forward_backward(initial, transition, log_likelihood, observations)
 >>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
 
-The first observation updates the initial state before any prediction, as in all filters of this package. A missing
-observation is None. Matrices of a linear model that change with time have a first axis of T entries. Entry t of F, Q
-and B moves x_{t-1} to x_t, and entry 0 is not used.
+The first observation updates the initial state before the first prediction, as in all filters of this package. A
+missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
+belongs to the transition from x_{t-1} to x_t, and entry 0 is not used.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from mstfilter.smc.state_space import StateSpaceModel
 def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = None) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = F x_{t-1} + B u_t + N(0, Q), y_t = H x_t + N(0, R); particles are (n, d).
 
-    The matrices may have a first axis of T entries. Entry t of `H` and `R` belongs to y_t. With `B` (d, j), each step
+    The matrices may have a first axis of length T. Entry t of `H` and `R` belongs to y_t. With `B` (d, j), each step
     after the first needs an input (j,), see `WithInput`. `Q` and `P0` may be singular (see `nonlinear_gaussian`).
-    `kalman_filter` has the exact answers.
+    `kalman_filter` computes the exact posteriors.
 
-    Raises InputError if shapes do not fit, and at a step without an entry or a required input.
+    Raises InputError if shapes do not fit, or if a step has no entry of a matrix or no required input.
     """
     m = _matrices(F, Q, H, R, m0, P0, B)
 
@@ -52,7 +52,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = N
 def _matrices(
     F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any, n_steps: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Checked matrices of a linear model, possibly with a first axis of `n_steps` entries (None: of any number)."""
+    """Checked matrices of a linear model. A first axis of steps must have length `n_steps` (None: any length)."""
     start = np.asarray(m0, np.float64)
     if start.ndim != 1:
         raise InputError(f"m0 has shape {start.shape}, expected one number per entry of the state: (d,)")
@@ -69,7 +69,7 @@ def _matrices(
 
 
 def _varies(array: np.ndarray) -> dict[str, bool]:
-    """The parameter t, for a function of a matrix that changes with time."""
+    """The keyword ``t`` if the matrix changes with time, in the form of `step_parameters`."""
     return {"t": True} if array.ndim == 3 else {}
 
 
@@ -79,13 +79,13 @@ def _entry(name: str, given: np.ndarray, t: int = 0, u: Any = None) -> np.ndarra
 
 
 def _input_effect(B: np.ndarray, u: Any) -> np.ndarray:
-    """B u (d,). Without BLAS, whose rounding depends on the number of rows."""
+    """B u (d,), computed without BLAS. The rounding of BLAS depends on the number of rows."""
     u = vector_of("the input", u, B.shape[1])
     return (B * u[..., None, :]).sum(axis=-1)
 
 
 class Kalman(NamedTuple):
-    """Exact answers of a linear-Gaussian model."""
+    """Exact posteriors and evidence of a linear-Gaussian model."""
 
     means: np.ndarray  #: (T, d) E[x_t | y_0 .. y_t]
     covariances: np.ndarray  #: (T, d, d) Cov[x_t | y_0 .. y_t]
@@ -97,11 +97,11 @@ class Kalman(NamedTuple):
 def kalman_filter(
     F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any], B: Any = None
 ) -> Kalman:
-    """The Kalman filter and the Rauch-Tung-Striebel smoother of filterpy for (k,) observations; None if missing.
+    """Kalman filter and Rauch-Tung-Striebel smoother of filterpy. Observations are (k,), or None if missing.
 
-    The arguments are as in `linear_gaussian`. Matrices that change with time have T entries. With `B` the inputs are
-    given with the observations, by `WithInput`. Raises InputError if shapes do not fit, an input is missing, or an
-    observation is not finite.
+    The arguments are as in `linear_gaussian`. Matrices that change with time have a first axis of length T. With `B`,
+    give each observation with its input as `WithInput`. Raises InputError if shapes do not fit, an input is missing,
+    or an observation is not finite.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -130,7 +130,7 @@ def kalman_filter(
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
-    """The inverse of a covariance, or the pseudo-inverse for conditioning on its range if it is singular."""
+    """The inverse of a covariance; for a singular covariance, the pseudo-inverse on its range."""
     values = np.linalg.eigvalsh(cov)
     if values.min() > 1e-12 * values.max():
         return np.linalg.inv(cov)
@@ -157,11 +157,11 @@ def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
 
 
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:
-    """A model with K states 0 .. K-1; particles are (n,) int. `forward_backward` has the exact answers.
+    """A hidden Markov model with K states. Particles are (n,) int from 0 to K - 1.
 
-    `initial` (K,) has the probabilities of x_0. Row i of `transition` (K, K) has those of x_t given x_{t-1} = i.
-    ``log_likelihood(y)`` (K,) is log p(y_t | x_t = 0 .. K-1, which is -inf if impossible. The function may also have
-    the parameters ``t`` and ``u``.
+    `initial` (K,) holds the probabilities of x_0. Row i of `transition` (K, K) holds the probabilities of x_t given
+    x_{t-1} = i. ``log_likelihood(y)`` (K,) returns log p(y_t | x_t) for each state, -inf if impossible. The function
+    may also have the parameters ``t`` and ``u``. `forward_backward` computes the exact posteriors.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -185,7 +185,7 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
 
 
 def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Checked probabilities of the first state (K,), and of the moves (K, K)."""
+    """Checked probabilities of the first state (K,), and of the transitions (K, K)."""
     found = []
     for name, given, axes in (("initial", initial, 1), ("transition", transition, 2)):
         p = np.asarray(given, dtype=np.float64)
@@ -201,7 +201,7 @@ def _chain(initial: Any, transition: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Marginals(NamedTuple):
-    """Exact answers of a model with K states."""
+    """Exact posteriors and evidence of a model with K states."""
 
     filtered: np.ndarray  #: (T, K) p(x_t | y_0 .. y_t)
     smoothed: np.ndarray  #: (T, K) p(x_t | y_0 .. y_{T-1})
@@ -211,9 +211,9 @@ class Marginals(NamedTuple):
 def forward_backward(
     initial: Any, transition: Any, log_likelihood: Callable[..., Any], observations: Iterable[Any]
 ) -> Marginals:
-    """The forward-backward algorithm of a model with K states (Rabiner 1989); arguments as in `hidden_markov`.
+    """The forward-backward algorithm (Rabiner 1989). Takes the arguments of `hidden_markov`.
 
-    Raises InputError if a shape does not fit, or no state explains an observation.
+    Raises InputError if a shape does not fit, or if an observation has probability 0.
     """
     start, moves = _chain(initial, transition)
     ys = [split_input(y) for y in check_observations(observations)]

@@ -4,7 +4,7 @@
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.weights, state.log_evidence
 
-A step selects, predicts, proposes, fuses and selects (y is the observation)::
+One step for an observation y::
 
     past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
@@ -12,12 +12,12 @@ A step selects, predicts, proposes, fuses and selects (y is the observation)::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-With "before", a step that ends with more than n particles resamples them too.
+With "before", a step that ends with more than n particles also resamples after the update.
 
-`ParticleFilter.step` has one line for each of these stages, and `_Step` has one method for each. Textbook filters
-have no `proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that
-weights its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a pure
-function of a `State`. So a run can be stopped, stored and resumed at any step.
+`ParticleFilter.step` has one line for each stage, and `_Step` has one method for each stage. Textbook filters have no
+`proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that weights
+its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a pure
+function of a `State`, so a run can be stopped, stored and resumed at any step.
 """
 
 from __future__ import annotations
@@ -68,23 +68,23 @@ class ParticleFilter(AtStep):
     Parameters
     ----------
     initial : Proposal
-        Draws the particles of the first step. The first observation updates these particles, and the first prediction
-        is in the second step. If `initial` is None or equal to `proposal`, the first step has only proposed
+        Draws the particles of the first step. The first observation updates the initial particles. The second step
+        makes the first prediction. If `initial` is None or equal to `proposal`, the first step has only proposed
         particles.
     transition : Transition
-        Moves the particles from the previous time to the present time. If None, the particles do not move.
+        Moves the particles from the previous time to the present time. None leaves the particles unchanged.
     proposal : Proposal, optional
         Draws new particles from the observation at every step.
     update : Update
-        Weights the particles by the observation. Not needed if the transition weights the particles.
+        Weights the particles by the observation. An update is not needed if the transition weights the particles.
     resampler : Resampler
         Selects particles by weight.
     trigger : Trigger
         Decides whether a step resamples. More than `n` particles are always resampled.
     lookahead : Lookahead, optional
-        For auxiliary filters. Particles are selected by weight times priority. Needs ``resample="before"``.
+        Auxiliary filter: particles are selected by weight times priority. Requires ``resample="before"``.
     rejuvenation : Rejuvenation, optional
-        For resample-move filters. Moves the particles at the end of a step that resampled.
+        Resample-move filter: moves the particles at the end of a step that resampled.
     size : Size, optional
         Chooses the number of particles that are selected. By default, the number is always `n`.
     n : int
@@ -93,7 +93,7 @@ class ParticleFilter(AtStep):
         Number of particles that `proposal` draws at each step. 0 means `n`.
     resample : {"after", "before"}
         With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
-        before the next prediction, as in textbooks. The weights after a step are then those of its observation.
+        before the next prediction, as in textbooks, and a step returns the weights of its update.
     """
 
     initial: Proposal | None = None
@@ -141,11 +141,11 @@ class ParticleFilter(AtStep):
         return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
 
     def step(self, state: State, observation: Any) -> tuple[State, Info]:
-        """Process one observation. If it is missing (None), the proposal and the update are skipped.
+        """Process one observation. If the observation is None (missing), the proposal and the update are skipped.
 
-        To give an input too, pass ``WithInput(observation, u)``.
+        For an observation with an input u, pass ``WithInput(observation, u)``.
 
-        Raises InputError if a component raises it. The message starts with the step and the slot of the component.
+        Raises InputError if a component raises InputError. The message starts with the step and the component.
         """
         step = _Step(self, state, observation)
         past, resampled_before = step.select_before()
@@ -162,7 +162,7 @@ class ParticleFilter(AtStep):
         Parameters
         ----------
         observations : iterable
-            One observation, or `WithInput`, for each step. A missing observation is None.
+            For each step an observation, a `WithInput`, or None if the observation is missing.
         state : State or int
             The state to continue from, or a seed.
         """
@@ -180,9 +180,9 @@ class ParticleFilter(AtStep):
         *,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
-        """Run all steps, and return the last state and the infos. Parameters as in `iterate`.
+        """Run all steps, and return the last state and the infos. Takes the parameters of `iterate`.
 
-        ``progress=True`` shows a progress bar. A function is called as ``progress(done, total)``.
+        ``progress=True`` shows a progress bar. A function `progress` is called as ``progress(done, total)``.
 
         To keep weights or particles of all steps, use `iterate`, or collectors (`mstfilter.smc.history`).
         """
@@ -233,7 +233,7 @@ class _Step:
         return selected, True
 
     def _resample(self, population: Population, n: int, stream: str) -> Population:
-        """Resampled particles. The ancestors are -1 if the resampler does not report them."""
+        """Resampled particles. The ancestors are -1 if the resampler does not report ancestors."""
         resampler = self.filter.resampler
         selected = _checked(resampler.resample(self.rng(stream), population, n), resampler)
         if "ancestor" in selected.parents:
@@ -241,7 +241,7 @@ class _Step:
         return selected.with_ancestors(np.full(len(selected), -1))
 
     def extend(self, past: Population | None) -> tuple[Population | None, Population | None]:
-        """The predicted and the proposed particles. They are independent given the observation."""
+        """The predicted and the proposed particles, which are independent given the observation."""
         if past is None or self.observation is None:
             predicted = self.predict(past)
             return predicted, self.propose(predicted)
@@ -374,7 +374,7 @@ class _Step:
 
 
 class _Slot:
-    """Wraps the calls of components. The wrapper measures wall time, and adds step and slot to error messages.
+    """Wraps the calls of components, measures wall time, and adds step and slot (component) to error messages.
 
     >>> with slot("transition"):
     ...     moved = transition.predict(rng, population, observation)
@@ -402,13 +402,13 @@ class _Slot:
             error.add_note(f"in step {self.t}, {name}")
 
     def record(self, notes: Mapping[str, Any]) -> None:
-        """Keep the notes of the component, if there are any."""
+        """Store the notes of the component, if there are any."""
         if notes:
             self.notes[self._here.name] = notes
 
 
 def _checked(found: Any, component: Component) -> Population:
-    """The population that a component returned. Raises InputError for any other result."""
+    """The population that a component returned. Raises InputError if the result is not a `Population`."""
     if isinstance(found, Population):
         return found
     name = type(component).__name__
@@ -435,8 +435,8 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 def keep_freed_memory() -> None:
     """Free one large block, once per process.
 
-    After this, glibc keeps freed arrays of up to 32 MB (its largest value) instead of returning them to the system
-    after every step. Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of
-    the time of resampling a million weights. The block is never used. Other C libraries are not affected.
+    After the call, glibc keeps freed arrays of up to 32 MB and does not return them to the system after every step.
+    Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of the time of
+    resampling a million weights. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

@@ -1,23 +1,23 @@
-"""Models with Gaussian noise, and filters that use it: UKF-guided, Rao-Blackwellised.
+"""Models with Gaussian noise, filters guided by the unscented Kalman filter, and Rao-Blackwellised filters.
 
 >>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
 
-A model with Gaussian noise and nonlinear functions has a good proposal: the update of the unscented Kalman filter.
+The update of the unscented Kalman filter is a good proposal for a nonlinear model with Gaussian noise.
 
 >>> filter = rao_blackwellised(model, n=100)
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.particles["mean"].shape           # (n, d)
 
-A Rao-Blackwellised filter draws a part of the state, u_t (a regime, a contact, an association). Given u_0 .. u_t, the
-other part z is linear and Gaussian:
+A Rao-Blackwellised filter draws a part u_t of the state (a regime, a contact, an association). Given u_0 .. u_t, the
+other part z_t is linear and Gaussian:
 
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
-A particle holds u, and the mean and covariance of z given u_0 .. u_t and y_0 .. y_t. The population is a mapping of
-arrays. A Transition draws u and predicts z, and an Update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) and corrects
-z. Reference: Doucet, de Freitas, Murphy, Russell (2000).
+A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_0 .. y_t. The particles are a mapping
+of arrays. The transition draws u_t and predicts z_t. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) and
+corrects z_t. Reference: Doucet, de Freitas, Murphy, Russell (2000).
 
-`mstfilter.smc.exact` has linear models and their exact answers.
+`mstfilter.smc.exact` has linear models and their exact posteriors.
 """
 
 from __future__ import annotations
@@ -44,12 +44,13 @@ def nonlinear_gaussian(
 ) -> StateSpaceModel:
     """x_0 ~ N(m0, P0), x_t = f(x_{t-1}) + N(0, Q), y_t = h(x_t) + N(0, R).
 
-    `f` and `h` return the next states (n, d), and the observations (n, k) without noise, of particles (n, d), row by
-    row. The functions may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of T entries.
+    `f` maps particles (n, d) to next states (n, d), and `h` maps particles to observations (n, k), row by row,
+    without noise. The functions may also have the parameters ``t`` and ``u``. `Q` and `R` may have a first axis of
+    length T, one entry per step.
 
-    `Q` and `P0` may be singular, for example if noise acts only on the velocity. With a singular `Q`, x_t has no
-    density given x_{t-1}. The model has no `log_transition` (for `P0`: no `log_initial`), and functions that need it
-    raise InputError. A conditional path is then drawn without ancestor sampling.
+    `Q` and `P0` may be singular, for example if noise acts only on the velocity. With a singular `Q`, the model has
+    no `log_transition`. With a singular `P0`, the model has no `log_initial`. Functions that need the missing density
+    raise InputError. Without `log_transition`, `conditional_path` omits ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
@@ -97,7 +98,7 @@ class _Noise:
 
 
 class _Noises:
-    """Noise with one covariance (k, k) for all steps, or one for each step, (T, k, k)."""
+    """Noise with one covariance (k, k) for all steps, or a covariance for each step, (T, k, k)."""
 
     def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
         cov = np.asarray(given, np.float64)
@@ -109,7 +110,7 @@ class _Noises:
 
 
 class _OfStep:
-    """A function of particles, and of the step `t` and its input `u` if it has these parameters."""
+    """A function of particles that may also have the parameters `t` (step) and `u` (input)."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.parameters = function, step_parameters(function, 1)
@@ -121,14 +122,14 @@ class _OfStep:
 
 
 def entry(name: str, given: Any, t: int) -> Any:
-    """Entry `t` of a list with one for each step; InputError if there is none."""
+    """Entry `t` of a list with one entry per step; InputError if the list is too short."""
     if t >= len(given):
         raise InputError(f"{name} has {len(given)} entries, and none for step {t}")
     return given[t]
 
 
 def vector_of(what: str, given: Any, size: int) -> np.ndarray:
-    """An observation or input as a vector (size,); a number counts as (1,)."""
+    """An observation or input as a vector (size,). A number becomes (1,)."""
     vector = np.atleast_1d(np.asarray(given, np.float64))
     if vector.shape != (size,):
         raise InputError(f"{what} has shape {np.shape(given)}, expected ({size},)")
@@ -153,7 +154,7 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
 
 
 class Linear(NamedTuple):
-    """Matrices of the linear part for each particle, or without the particle axis if all particles share them."""
+    """Matrices of the linear part for each particle, without the particle axis if all particles share a matrix."""
 
     F: Any  #: (n, d, d)
     Q: Any
@@ -164,12 +165,11 @@ class Linear(NamedTuple):
 
 @dataclass(frozen=True)
 class ConditionallyLinear(AtStep):
-    """A model that is linear and Gaussian given the part u, which is drawn.
+    """A model that is linear and Gaussian given u_t. The filter draws u_t.
 
     ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
-    ``linear(u)`` returns the matrices. `mean` (d,) and `cov` (d, d) are those of z_0, for any u_0. The functions may
-    also have a parameter ``t``, the index of the step. If their first parameter has another name, a parameter ``u``
-    gets the input.
+    ``linear(u)`` returns the matrices. `mean` (d,) and `cov` (d, d) are the mean and covariance of z_0 for any u_0.
+    The functions may also have a parameter ``t``, the index of the step. A further parameter ``u`` gets the input.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -253,10 +253,10 @@ def ukf_proposal(
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
     """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
 
-    Given x_{t-1} the state is N(f(x_{t-1}), Q); no derivatives are needed (van der Merwe, Doucet, de Freitas, Wan
-    2000). `alpha`, `beta` and `kappa` are those of
-    filterpy's MerweScaledSigmaPoints: spread of the points, weight of the central one, secondary spread. The other
-    arguments are as in `nonlinear_gaussian`.
+    Given x_{t-1}, the predicted state is N(f(x_{t-1}), Q). The proposal needs no derivatives (van der Merwe, Doucet,
+    de Freitas, Wan 2000). `alpha` (spread of the sigma points), `beta` (weight of the central point) and `kappa`
+    (secondary spread) are the parameters of filterpy's MerweScaledSigmaPoints. The other arguments are as in
+    `nonlinear_gaussian`.
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 

@@ -1,7 +1,7 @@
-"""Recording of quantities of a run.
+"""Records quantities of a run.
 
-A collector is a function ``(state, info) -> number or array``, called after every step. `ess`, `unique_ancestors`,
-`log_evidence`, `mean` and `resampled` are collectors.
+A collector is a function ``(state, info) -> number or array``. The run calls each collector after every step. `ess`,
+`unique_ancestors`, `log_evidence`, `mean` and `resampled` are collectors.
 
 >>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
 >>> history["ess"]                                   # (T,)
@@ -37,7 +37,7 @@ def unique_ancestors(state: State, info: Info) -> int:
 
 
 def log_evidence(state: State, info: Info) -> float:
-    """Log evidence so far; NaN if the filter does not report it."""
+    """Log evidence of the observations so far; NaN if the filter reports no evidence."""
     found = state.log_evidence
     return np.nan if found is None else found
 
@@ -61,7 +61,7 @@ def mean(state: State, info: Info) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class History(Mapping[str, np.ndarray]):
-    """Collected arrays by name."""
+    """The arrays of the collectors, by name."""
 
     values_: Mapping[str, np.ndarray]  #: name -> array whose first axes are `dims`
     dims: tuple[str, ...] = ("time",)  #: ("time",) for one run, ("seed", "time") or ("arm", "seed", "time") for many
@@ -113,13 +113,13 @@ class History(Mapping[str, np.ndarray]):
 
 
 def _summary(name: str, a: np.ndarray) -> str:
-    """One line: name, shape and range of an array."""
+    """Name, shape and range of an array, in one line."""
     found = a[np.isfinite(a)] if a.dtype.kind in "fiu" else a[:0]
     return f"{name} {a.dtype} {a.shape}" + (f", {found.min():.4g} to {found.max():.4g}" if found.size else "")
 
 
 def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> History:
-    """Iterate over a run, ``filter.iterate(observations, seed)``, and keep the results of the collectors.
+    """Run all steps of ``filter.iterate(observations, seed)`` and store the results of the collectors.
 
     Each collector is a function of (state, info). The result of a collector must have the same shape at every step.
     """

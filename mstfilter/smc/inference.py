@@ -1,4 +1,4 @@
-"""Parameters of a model, inferred by particle Markov chain Monte Carlo.
+"""Inference of model parameters by particle Markov chain Monte Carlo.
 
 A model with parameters is a function that returns a filter:
 
@@ -8,14 +8,14 @@ A model with parameters is a function that returns a filter:
 >>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
 >>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
 
-- `pmmh` is a Metropolis chain whose likelihood is the filter's unbiased estimate. The estimate for the current
-  parameters is kept until a proposal is accepted. So the chain has the exact posterior, for any number of particles
-  (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` does the same with the walkers of emcee, which need no scale.
+- `pmmh` is a Metropolis chain that uses the filter's unbiased estimate of the likelihood. The estimate for the
+  current parameters is kept until a proposal is accepted. The chain then converges to the exact posterior for any
+  number of particles (Andrieu, Doucet, Holenstein 2010).
+- `ensemble` uses the estimates of the likelihood with the walkers of emcee. The walkers need no scale of steps.
 - `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, that particle also draws its ancestors (Lindsten, Jordan, Schön 2014), without which
-  the early states hardly change.
+  the transition has a density, the particle on the path also draws its ancestors (Lindsten, Jordan, Schön 2014).
+  Without ancestor sampling the early states hardly change.
 """
 
 from __future__ import annotations
@@ -58,23 +58,23 @@ class Chains:
         return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns of a table: chain, draw, parameters, log evidence and log density, chain after chain."""
+        """Columns of a table: chain, draw, parameters, log evidence and log density. Rows are sorted by chain."""
         numbers = np.indices(self.log_density.shape)
         arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta}
         arrays |= {"log_evidence": self.log_evidence, "log_density": self.log_density}
         return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
 
     def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
-        """(d,) integrated autocorrelation times in iterations, by emcee, without the first `discard` iterations.
+        """(d,) integrated autocorrelation times in iterations, without the first `discard` iterations.
 
-        emcee logs a warning if the chains are shorter than 50 times the result, since the result is then too low.
+        emcee logs a warning if the chains are shorter than 50 times the result, because the result is then too low.
         """
         from emcee.autocorr import integrated_time
 
         return integrated_time(self.theta[discard:], quiet=True)
 
     def effective_sizes(self, discard: int = 0) -> np.ndarray:
-        """(d,) numbers of independent draws that estimate a mean equally well, after `discard` iterations."""
+        """(d,) effective sample sizes of the chains without the first `discard` iterations."""
         n_iterations, n_chains, _ = self.theta[discard:].shape
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 
@@ -85,7 +85,7 @@ _N_STARTS = 20
 
 @dataclass
 class _Posterior:
-    """Log prior and estimated log evidence of rows of parameters."""
+    """Log prior and estimated log evidence of several parameter vectors, one per row."""
 
     filter_of: FilterOf
     observations: list[Any]
@@ -105,7 +105,7 @@ class _Posterior:
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
     def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
-        """Log evidences of filters in one sweep, or one by one if this is impossible."""
+        """Log evidences of filters that run as one batch, or one by one if batching is impossible."""
         if self.batched:
             try:
                 return self._in_one_sweep(thetas, seeds)
@@ -129,7 +129,7 @@ class _Posterior:
         return found
 
     def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
-        """The estimates of a batch whose components hold the parameters of each row.
+        """Log evidences of a batch of filters. The components hold one parameter vector per particle.
 
         Batches 0, 1, 2, 4, 8, ... are compared with single runs.
         """
@@ -159,29 +159,29 @@ def pmmh(
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
-    The number of particles determines how well the chain mixes. The log evidence should have a standard deviation of
-    about 1 at the posterior mean (Doucet, Pitt, Deligiannidis, Kohn 2015).
+    More particles make the chain mix better. Choose n so that the log evidence has a standard deviation of about 1 at
+    the posterior mean (Doucet, Pitt, Deligiannidis, Kohn 2015).
 
     Parameters
     ----------
     filter_of : callable
         ``(theta) -> ParticleFilter`` for parameters (d,). The components of the filter must be properly weighted.
     log_prior : callable
-        ``(theta) -> float``; -inf outside of the support.
+        ``(theta) -> float``: the log prior density; -inf outside of the support.
     start : (d,) or (R, d) array_like
         First parameters of one chain or of R chains.
     scale : (d,) or (d, d) array_like
-        Standard deviations, or covariance, of a step. 2.4 / sqrt(d) posterior standard deviations are a good choice.
+        Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
-        Whether ``filter_of`` also accepts parameters (d, m), with a column for each of m particles of several chains.
-        All chains then move in one batch of filters, see `mstfilter.smc.batching`. A parameter that is combined with
-        particles (n, k) is ``theta[0][..., None]``. The estimates equal those of single runs up to rounding of the
-        parameters; some are compared. If they differ, InputError, or a warning and single runs.
+        Whether ``filter_of`` also accepts parameters (d, m), one column for each of m particles of several chains.
+        The filters of all chains then run as one batch, see `mstfilter.smc.batching`. To combine a parameter with
+        particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs and must be equal
+        up to rounding. If estimates differ, InputError is raised, or the runs are made one by one with a warning.
 
     Raises
     ------
     InputError
-        If a chain starts where the prior is zero, or 20 estimates of the evidence there are zero.
+        If the prior is zero at the start of a chain, or if 20 estimates of the evidence at the start are zero.
     """
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
@@ -202,7 +202,7 @@ def pmmh(
 
 
 def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
-    """The first parameters with their estimates. Lost estimates are drawn again."""
+    """The first parameters with their log densities. Estimates of zero are drawn again."""
     state = posterior(key.generator(), theta)
     for attempt in range(1, _N_STARTS + 1):
         lost = np.flatnonzero(~np.isfinite(state["log_density"]))
@@ -248,15 +248,15 @@ def ensemble(
 ) -> Chains:
     """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
 
-    emcee keeps the log density of a walker until the walker moves, together with the estimated evidence (as a blob).
-    For parameters that do not change, no estimate is drawn again. So the chain has the exact posterior.
+    emcee keeps the log density and the estimated evidence (as a blob) of a walker until the walker moves. No estimate
+    is drawn again for unchanged parameters, so the chain converges to the exact posterior.
 
     Parameters
     ----------
     filter_of, observations, log_prior, batched
-        As in `pmmh`; with `batched`, half of the walkers are evaluated in one sweep.
+        As in `pmmh`. If `batched` is True, the filters of half of the walkers run as one batch.
     start : (n_walkers, d) array_like
-        First parameters. At least 2 d different parameters are needed.
+        First parameters of the walkers. At least 2 d walkers are needed, with different parameters.
     """
     import emcee
 
@@ -293,8 +293,8 @@ def particle_gibbs(
     filter_of : callable
         ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
     draw : callable
-        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. The draw is an exact
-        draw if the prior is conjugate, or a Metropolis step with `path_log_prob`.
+        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. Examples are an exact
+        draw if the prior is conjugate, and a Metropolis step with `path_log_prob`.
     start : (d,) array_like
         First parameters.
     """

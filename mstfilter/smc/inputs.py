@@ -1,4 +1,4 @@
-"""Observations, time and inputs, which a step gives to the functions of its components.
+"""Observations, time and inputs: the values that a step passes to the functions of its components.
 
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
@@ -7,12 +7,11 @@
 ... )
 >>> filter.run([WithInput(y, u) for y, u in zip(observations, odometry)])
 
-If a function of a model has a parameter named ``t`` or ``u``, it gets time or input by keyword. The first observation
-has t = 0. The transition to x_t is called with t >= 1. An observation without input is given unchanged.
+A function of a model with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
+observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
 
-A filter gives both to a component by `Component.at_step`, which returns the component for that step. A component or
-model that has functions among its fields names them in `step_functions`. Others override `at_step`, or ignore time
-and inputs.
+`Component.at_step` returns a component for step t with input u. `step_functions` names the fields of a component or
+model that are functions. Other components override `at_step`, or ignore time and inputs.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ from mstfilter.fields import Bounded
 
 @dataclass(frozen=True, eq=False)
 class WithInput:
-    """An observation with the input of its step, given to a filter instead of the observation.
+    """An observation with the input of its step. Pass `WithInput` to a filter instead of the observation.
 
-    The filter gives `y` to its components as the observation. The input belongs to the move from x_{t-1} to x_t. At
-    the first step the input is available to the initial distribution and the likelihood.
+    The filter passes `y` to its components as the observation. The input `u` belongs to the transition from x_{t-1}
+    to x_t. At the first step, the initial distribution and the likelihood can use the input.
     """
 
     y: Any  #: the observation; None if missing
@@ -43,18 +42,18 @@ class WithInput:
 
 
 def split_input(observation: Any) -> tuple[Any, Any]:
-    """The observation and the input of a step; the input is None if there is none."""
+    """The observation and the input of a step; None for a missing input."""
     if isinstance(observation, WithInput):
         return observation.y, observation.u
     return observation, None
 
 
 def check_observations(observations: Iterable[Any], where: str = "") -> Any:
-    """The same observations.
+    """Return the observations unchanged if they are valid.
 
-    Raises InputError for a table, a mapping or a text, and for an observation that is NaN in every entry.
+    Raises InputError for a table, a mapping or a string, and for an observation whose entries are all NaN.
 
-    Iteration over a data frame or a mapping yields names of columns, not observations. `where` begins the message.
+    Iteration over a data frame or a mapping yields names of columns. `where` is the start of the error message.
     """
     if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
         raise InputError(
@@ -78,7 +77,7 @@ def _all_nan(y: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class StepFunction:
-    """A function with keyword parameters ``t`` and ``u`` that its signature does not show."""
+    """A function whose signature does not show that it accepts ``t`` and ``u`` by keyword."""
 
     function: Callable[..., Any]
     parameters: Mapping[str, bool]  #: as `step_parameters` returns them
@@ -90,7 +89,7 @@ class StepFunction:
 def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
     """Which of ``t`` and ``u`` a function accepts after its first `n_arguments` parameters, and which are required.
 
-    A parameter with a default value is not required.
+    A parameter without a default value is required.
     """
     if isinstance(function, StepFunction):
         return dict(function.parameters)
@@ -108,12 +107,12 @@ def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
 
 
 def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> Callable[..., Any]:
-    """A function ``(*arguments, **step)`` that accepts the given parameters by name."""
+    """Mark a function ``(*arguments, **step)`` as accepting the given parameters by keyword."""
     return StepFunction(function, parameters) if parameters else function
 
 
 def bind_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: int, u: Any) -> Callable[..., Any]:
-    """The function with ``t`` and ``u`` given. A call raises InputError if a required input is missing."""
+    """The function with ``t`` and ``u`` bound. A call raises InputError if a required input is missing."""
     given = {name: value for name, value in (("t", t), ("u", u)) if name in parameters}
     if u is None and "u" in given:
         if parameters["u"]:
@@ -130,7 +129,7 @@ def _no_input(t: int, *args: Any, **named: Any) -> Any:
 
 
 class AtStep(Bounded):
-    """Base class of components and models: `at_step` gives time and input to the functions in their fields."""
+    """Base class of components and models. `at_step` binds time and input to the functions in the fields."""
 
     #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field
     #: that is a component or a model.
@@ -138,7 +137,7 @@ class AtStep(Bounded):
 
     @cached_property
     def _of_step(self) -> dict[str, dict[str, bool] | None]:
-        """The fields that change with the step, and their parameters; None for a component or model."""
+        """Map each field that depends on the step to its parameters, or to None for a component or model."""
         found: dict[str, dict[str, bool] | None] = {}
         for name, n_arguments in self.step_functions.items():
             value = getattr(self, name)
@@ -150,14 +149,14 @@ class AtStep(Bounded):
         return found
 
     def at_step(self, t: int, u: Any = None) -> Self:
-        """The component or model at step `t` with input `u`, or the object itself if it does not depend on them.
+        """The component or model at step `t` with input `u`; the object itself if no field depends on the step.
 
         Parameters
         ----------
         t : int
-            Index of the observation, from 0. The transition from x_{t-1} to x_t belongs to t.
+            Index of the observation, from 0. The transition from x_{t-1} to x_t belongs to step t.
         u : optional
-            The input of the step, of any type; None if there is none.
+            The input of the step, of any type; None if the step has no input.
         """
         if not self.step_functions or not self._of_step:
             return self

@@ -1,4 +1,4 @@
-"""Interfaces of the components of a particle filter, and its `State` and `Info`.
+"""Interfaces of the components of a particle filter, `State` and `Info`.
 
 A component is a frozen dataclass. The fields of a component are hyperparameters, with bounds in their annotations
 (see `mstfilter.fields`), and one method defines its behaviour. Methods that draw random numbers take the generator as
@@ -16,12 +16,12 @@ first argument. All methods work on whole populations, so a component can share 
 ...         return Population(population.particles + step, population.log_weights)
 
 A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
-to the log weights. `mstfilter.smc.Dynamics` does so for any model with densities.
+to the log weights. `mstfilter.smc.Dynamics` can guide any model that has densities.
 
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
 `Transition` and an `Update`. Optional components are `Size` (number of particles), `Lookahead` (auxiliary filter),
-`Rejuvenation` (resample-move) and `Codec` (checkpoints of other particle types). Two interfaces extend another one
-with an additional ability: `DensityTransition` and `WeightResampler`. Models and programs use `Distribution` objects.
+`Rejuvenation` (resample-move) and `Codec` (checkpoints of other particle types). `DensityTransition` extends
+`Transition`, and `WeightResampler` extends `Resampler`. Models and programs use `Distribution` objects.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from mstfilter.smc.streams import Key
 class Component(AtStep, ABC):
     """A component that takes part in a step.
 
-    The filter uses ``component.at_step(t, u)``, the component at step t with its input (see `mstfilter.smc.inputs`).
-    Class attributes can override the three properties: ``properly_weighted = False``.
+    At step t with input u, the filter uses ``component.at_step(t, u)`` (see `mstfilter.smc.inputs`). Class attributes
+    can override `properly_weighted`, `draws` and `batched`: ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
@@ -55,35 +55,36 @@ class Component(AtStep, ABC):
 
     @property
     def properly_weighted(self) -> bool:
-        """Whether weighted means of the result are unbiased up to the normalising constant.
+        """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author of a component states this. The default is True, and ``properly_weighted = False`` in the class
-        changes it. `mstfilter check` tests the statement for resamplers. A filter reports the log evidence only if
-        all its components are properly weighted and it has no `proposal`.
+        The author of a component declares if it is properly weighted. The default is True; write ``properly_weighted
+        = False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
+        reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
 
     @property
     def draws(self) -> bool:
-        """Whether the component uses the given generator. If False, the component must not use the generator."""
+        """Whether the component draws random numbers. If False, the component must not use the generator."""
         return True
 
     @property
     def batched(self) -> bool | None:
         """Whether the component treats each particle independently, so that it can process several runs together.
 
-        True states that particles are independent. With None, `run_many` tries this, and makes the runs one by one if
-        the results differ (see `mstfilter.smc.batching`). Default: With False, the runs are made one by one.
+        With True, the author states that particles are independent. With None, `run_many` tries a batch, and makes
+        the runs one by one if results differ (see `mstfilter.smc.batching`). With False, the default, the runs are
+        made one by one.
         """
         return False
 
 
 class Proposal(Component):
-    """Draws particles from the observation alone."""
+    """Draws particles given only the observation."""
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
-        """Draw `n` particles. Some are repeated if fewer distinct particles exist."""
+        """Draw `n` particles. If fewer distinct particles exist, some particles are repeated."""
 
 
 class Transition(Component):
@@ -91,7 +92,7 @@ class Transition(Component):
 
     @abstractmethod
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Move all particles. `observation` is None if it is missing."""
+        """Move all particles. A missing `observation` is None."""
 
 
 class DensityTransition(Transition):
@@ -99,43 +100,43 @@ class DensityTransition(Transition):
 
     @abstractmethod
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """Log density (n,) float64 of each move from row i of `previous` to row i of `new`; -inf if it is impossible.
+        """Log density (n,) float64 of the move from row i of `previous` to row i of `new`; -inf if impossible.
 
-        `observation` is the one given to `predict`; None if it is missing.
+        `observation` is the observation passed to `predict`, or None if missing.
         """
 
 
 class Update(Component):
-    """Uses the observation. Weights particles, projects them, or makes new ones from pairs."""
+    """Uses the observation: reweights, projects, or combines predicted and proposed particles."""
 
     @abstractmethod
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
-        """The updated population, of any size, from the predicted and the proposed particles.
+        """Make the updated population, of any size, from the predicted and the proposed particles.
 
-        At least one of the two is given.
+        At least one of `predicted` and `proposed` is not None.
 
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
-        `proposed` are new particles; None if the filter has no proposal. The result has the ``parents`` of the
-        particles from which it was made (see `union`).
+        `proposed` are new particles; None if the filter has no proposal. Each particle of the result keeps the
+        ``parents`` of the particles from which it was made (see `union`).
         """
 
 
 class Resampler(Component):
-    """Selects particles by weight. Base class of schemes that compare particles. The schemes define `resample`.
+    """Selects particles by weight. A scheme that compares particles inherits `Resampler` and defines `resample`.
 
     A scheme that needs only the weights inherits `WeightResampler` and defines `select`.
     """
 
     @property
     def exact_size(self) -> bool:
-        """Whether the result always has `n` particles. Schemes without duplicates may return fewer."""
+        """Whether the result always has `n` particles. Schemes without duplicates may return fewer particles."""
         return True
 
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Select `n` particles; ``parents["ancestor"]`` of the result are their (n,) indices in `population`."""
+        """Select `n` particles; ``parents["ancestor"]`` holds the (n,) indices of the selected particles."""
 
 
 class WeightResampler(Resampler):
@@ -159,8 +160,8 @@ class WeightResampler(Resampler):
         ancestors : (n,) int
             Indices into the m particles.
         log_weights : (n,) float or None
-            Log weights of the selected particles. If None, all get the log mean of the old weights, which keeps the
-            estimate of the evidence.
+            Log weights of the selected particles. If None, every particle gets the log mean of the old weights, so
+            the estimate of the evidence does not change.
         """
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
@@ -183,25 +184,25 @@ class Trigger(Bounded, ABC):
 
 
 class Size(Bounded, ABC):
-    """Chooses the number of particles of a resampling. With a size, `n` is only the number of the first particles."""
+    """Chooses the number of particles to select. The `n` of a filter with a size is only the number at the start."""
 
     @abstractmethod
     def choose(self, population: Population) -> int:
-        """Number of particles (at least 1), from the weighted particles that will be resampled."""
+        """Number of particles to select (at least 1), given the weighted particles before the resampling."""
 
     def checked(self, population: Population) -> int:
-        """The number that `choose` returns. Raises InputError if it is not an integer of at least 1."""
+        """The number that `choose` returns. Raises InputError if the number is not an integer of at least 1."""
         n = self.choose(population)
         check_integer(f"number of particles that {type(self).__name__} chose", n)
         return int(n)
 
 
 class Similarity(Bounded, ABC):
-    """Similarity of particles."""
+    """Measures the similarity of particles."""
 
     @abstractmethod
     def matrix(self, particles: Any) -> np.ndarray:
-        """(n, n) symmetric similarities in [0, 1], 1 on the diagonal; need not be positive semidefinite."""
+        """(n, n) symmetric similarities in [0, 1], with diagonal 1. The matrix need not be positive semidefinite."""
 
 
 class Equivalence(Bounded, ABC):
@@ -225,7 +226,7 @@ class Lookahead(Component):
 
 
 class Rejuvenation(Component):
-    """Moves particles after a step that resampled, by a kernel that keeps their distribution (resample-move)."""
+    """Moves particles after a step that resampled, by a kernel that preserves their distribution (resample-move)."""
 
     @abstractmethod
     def move(
@@ -233,10 +234,10 @@ class Rejuvenation(Component):
     ) -> Population:
         """Move x_t without changing its distribution.
 
-        `population` holds the weighted particles x_t after the observation. `previous` holds their x_{t-1} row by
-        row; None at the first step. The result has as many particles in the same order and with unchanged log
-        weights. The particles are moved by a kernel that leaves p(x_t | x_{t-1}, y_t) invariant. `observation` is
-        y_t; None if it is missing.
+        `population` holds the weighted particles x_t after the observation. `previous` holds the x_{t-1} of each
+        particle in the same row; None at the first step. The result has the same number of particles in the same
+        order, with unchanged log weights. The kernel must leave p(x_t | x_{t-1}, y_t) invariant. `observation` is
+        y_t, or None if missing.
         """
 
 
@@ -246,9 +247,9 @@ class Distribution(ABC):
     Attributes
     ----------
     discrete : bool
-        Whether the values are integers: a move then draws new values.
+        Whether the values are integers or booleans.
     draws_numbers : bool
-        Whether draws are known not to be NaN. If False, programs check the draws.
+        Whether draws are never NaN. If False, programs check the draws for NaN.
     """
 
     discrete = False
@@ -256,7 +257,7 @@ class Distribution(ABC):
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
-        """``(n, *event_shape)``, ``(1, *event_shape)``, or () for a number whose parameters all particles share."""
+        """``(n, *event_shape)``; ``(1, *event_shape)`` or () if all particles share the parameters."""
         return np.shape(self.mean)
 
     @property
@@ -297,16 +298,16 @@ class Codec(ABC):
 
     @abstractmethod
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
-        """Named arrays (no object arrays) of the particles of a population."""
+        """Convert the particles of a population to named arrays, not of objects."""
 
     @abstractmethod
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """The particles from the arrays of `encode`."""
+        """Convert the arrays of `encode` back to particles."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that a filter needs to continue."""
+    """The state of a run: all data that a filter needs to continue."""
 
     t: int  #: number of observations so far
     population: Population | None  #: the particles after the last observation; None before the first
@@ -330,7 +331,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Record of a step. The size of the record does not depend on n. The `State` has the weights and parents."""
+    """Record of a step, of a size that does not depend on n. The `State` holds the weights and parents."""
 
     t: int  #: index of the observation, from 0
     n: int  #: particles after the step

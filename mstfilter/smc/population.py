@@ -9,10 +9,10 @@ array([0.25, 0.25, 0.5 ])
 2.667
 
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
-particles on access. `take` selects from all of these. Rows of arrays are copied, and objects are shared.
+particles on access. `take` selects particles of any type: array rows are copied, and objects are shared.
 
-A population is immutable. A population does not copy the given arrays but holds read-only views of them. Do not write
-to an array after a population was made from it; pass ``array.copy()`` if you need to.
+A population is immutable. A population does not copy the given arrays but holds read-only views of them. If you write
+to an array later, pass ``array.copy()`` to the population.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Particles = Any  # ndarray (n, ...) | mapping name -> ndarray (n, ...) | sequenc
 
 
 def log_mean_exp(log_weights: np.ndarray) -> float:
-    """``log(mean(exp(log_weights)))`` without overflow; -inf if all are -inf."""
+    """``log(mean(exp(log_weights)))`` without overflow; -inf if all log weights are -inf."""
     top = np.max(log_weights)
     if top == -np.inf:
         return -np.inf
@@ -53,16 +53,16 @@ def normalise(log_weights: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def identity(n: int) -> np.ndarray:
-    """0 .. n-1, read-only and shared: the parents of particles that kept their positions."""
+    """The read-only, cached array 0 .. n-1: the parents of particles that kept their positions."""
     return frozen_view(np.arange(n))
 
 
 class Candidates(Sequence[_T], Generic[_T]):
-    """Particles ``build(index)`` that are built on first access, and then stored.
+    """Particles ``build(index)`` that are built at the first access and then stored.
 
-    In MST the weight of a candidate depends only on its pair of parents, so candidates can be resampled before they
-    are built. `build` must return the same particle at every call with the same index, from any thread. `indices`
-    (n,) are the candidates in order. An index may occur more than once. An integer n means 0 .. n-1.
+    In MST the weight of a candidate is known before the candidate is built, so only selected candidates are built.
+    `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) are the
+    indices of the candidates in order; repeated indices are allowed. An integer n means the indices 0 .. n-1.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ def frozen_view(array: np.ndarray) -> np.ndarray:
 
 
 def _freeze(particles: Particles) -> Particles:
-    """Read-only views of arrays, a tuple of objects."""
+    """Make read-only views of arrays, and a tuple of objects."""
     if isinstance(particles, np.ndarray):
         return frozen_view(particles)
     if isinstance(particles, (dict, Mapping)):
@@ -176,7 +176,7 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
 
 
 def _integers(what: str, index: Any) -> np.ndarray:
-    """An index array as int64; raises InputError if it contains other values than integers."""
+    """An index array as int64; raises InputError if the array does not have an integer type."""
     index = np.asarray(index)
     if index.dtype.kind not in "iu":
         raise InputError(f"{what} are of type {index.dtype}, expected integers")
@@ -184,7 +184,7 @@ def _integers(what: str, index: Any) -> np.ndarray:
 
 
 def _within(index: np.ndarray, n: int) -> np.ndarray:
-    """Indices of n particles; raises InputError if an index is negative or too large."""
+    """The given indices of n particles; raises InputError if an index is negative or too large."""
     if len(index) and index.view(np.uint64).max() >= n:  # as unsigned integers, negative ones are too large
         wrong = int(np.flatnonzero((index < 0) | (index >= n))[0])
         raise InputError(
@@ -201,16 +201,16 @@ class Population:
     Parameters
     ----------
     particles : ndarray (n, ...) | mapping of ndarray (n, ...) | sequence of n objects | Candidates
-        The particles, treated as immutable; shared, not copied.
+        The particles, which are not copied and must not be modified.
     log_weights : (n,) float
-        Natural log, unnormalised. -inf is a weight of 0; NaN and +inf raise InputError. The default is 0.
+        Unnormalised natural log weights, by default 0. NaN and +inf raise InputError; -inf means a weight of 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none. The filter numbers both, an update takes the numbers over. A resampler adds
-        ``"ancestor"``, the index before the resampling; a population after a step has it if the step resampled after
-        its update.
+        proposed particles, -1 for none. The filter sets the indices, and an update keeps the indices. A resampler
+        adds ``"ancestor"``, the index before the resampling. A population after a step has ``"ancestor"`` if the step
+        resampled after its update.
     notes : mapping
-        Values that a component records: plain numbers, strings and lists.
+        Values that a component records: numbers, strings and lists.
     """
 
     particles: Particles
@@ -266,7 +266,7 @@ class Population:
         return self._summary()[1]
 
     def _summary(self) -> tuple[float, float]:
-        """Effective sample size and log mean weight, computed together and stored, since steps use them often."""
+        """Effective sample size and log mean weight, computed together and cached, because each step uses both."""
         if "_both" not in self.__dict__:
             top = self.log_weights.max()
             weights = self.log_weights - top
@@ -278,13 +278,13 @@ class Population:
 
     @property
     def unique_ancestors(self) -> int:
-        """Number of particles of the previous population that have descendants; 0 if unknown."""
+        """Number of particles of the previous population that have descendants; 0 if the parents are unknown."""
         previous = self.parents.get("previous", np.zeros(0, np.int64))
         return len(np.unique(previous[previous >= 0]))
 
     @property
     def best(self) -> Any:
-        """The particle of largest weight; the first one if several have equal weights."""
+        """The particle of largest weight; the first particle if several have the largest weight."""
         index = int(np.argmax(self.log_weights))
         if isinstance(self.particles, Mapping):
             return {name: a[index] for name, a in self.particles.items()}
@@ -292,13 +292,13 @@ class Population:
 
     @classmethod
     def unchecked(cls, particles: Particles, log_weights: np.ndarray) -> Population:
-        """A population of particles and log weights that have been checked."""
+        """Make a population from particles and log weights that were checked before."""
         new = object.__new__(cls)
         new.__dict__.update(particles=_freeze(particles), log_weights=frozen_view(log_weights), parents={}, notes={})
         return new
 
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
-        """Select particles with their parents, and with their log weights unless new ones are given.
+        """Select particles with their parents, and with their log weights unless `log_weights` are given.
 
         Raises InputError if the indices are not integers from 0 to n - 1.
         """
@@ -311,7 +311,7 @@ class Population:
         )
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
-        """The result of a resampling. The result is `take` with ``parents["ancestor"]`` and additional notes."""
+        """The population after a resampling: a `take` with ``parents["ancestor"]`` and additional notes."""
         return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
@@ -326,10 +326,10 @@ class Population:
         return new
 
     def traced_through(self, resampled: Population | None) -> Population:
-        """The same particles, with parents traced through a resampling before the prediction.
+        """The same particles, with parents before the resampling that preceded the prediction.
 
-        ``parents["previous"]`` are indices into `resampled`; they become indices into the population that was
-        resampled, if it is known. The notes are dropped.
+        ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, the indices are converted to
+        indices into the population before the resampling. The notes are dropped.
         """
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         index = self.parents.get("previous")
@@ -340,7 +340,7 @@ class Population:
         return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
-        """Replace the particles by the same number of new ones. Weights and parents are kept, notes are dropped."""
+        """Replace the particles by as many new particles. Weights and parents are kept; notes are dropped."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")
@@ -349,7 +349,7 @@ class Population:
         return new
 
     def realised(self) -> Population:
-        """The same population with every candidate built."""
+        """The same population, with all `Candidates` built."""
         if isinstance(self.particles, Candidates):
             return replace(self, particles=self.particles.built())
         return self
@@ -366,7 +366,7 @@ class Population:
 
 
 def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
-    """Columns of arrays whose first `axes` axes are the rows: ``x_0``, ``x_1`` for several entries in a row."""
+    """Table columns from arrays. The first `axes` axes are the rows; entries of a row become ``x_0``, ``x_1``, ..."""
     columns = {}
     for name, a in arrays.items():
         a = np.asarray(a)
@@ -376,7 +376,7 @@ def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarr
 
 
 def _kind(particles: Particles) -> str:
-    """The kind of the particles, in a few words."""
+    """A short description of the type of the particles."""
     if isinstance(particles, Candidates):
         return f"candidates, {particles.n_built} built"
     if isinstance(particles, Mapping):
@@ -388,7 +388,7 @@ def _kind(particles: Particles) -> str:
 
 
 def union(predicted: Population | None, proposed: Population | None) -> Population:
-    """Predicted and proposed particles in one population, with their weights and parents; either may be None."""
+    """Join predicted and proposed particles, with their weights and parents. One of the populations may be None."""
     if predicted is None or proposed is None:
         population = predicted if predicted is not None else proposed
         if population is None:

@@ -1,4 +1,4 @@
-"""Resampling by weight: schemes with equal output weights.
+"""Resampling schemes that use only the weights. The output weights are equal.
 
 W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, and f = frac(n
 W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. The schemes differ in the variance of N_i.
@@ -19,16 +19,16 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 >>> Systematic().select(rng, np.log([0.5, 0.25, 0.25]), 4)[0]
 array([0, 0, 1, 2])
 
-Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from their number.
-A particle of weight zero is never selected. `InputError` is raised if a log weight is NaN or +inf, or if all weights
-are zero.
+Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from the number of
+weights. A particle of weight zero is never selected. `InputError` is raised if a log weight is NaN or +inf, or if all
+weights are zero.
 
-All schemes share functions for the inverse of the cumulative weights, at the end of this module: `inverse_cdf` takes
-one point in each of n equal strata, `independent_draws` takes n independent points, and `draw_rows` takes one point
-for each row of a matrix. A user's scheme is a `WeightResampler` whose `select` uses them.
+Three functions invert the cumulative weights: `inverse_cdf` takes one point in each of n equal strata,
+`independent_draws` takes n independent points, and `draw_rows` takes one point for each row of a matrix. The `select`
+method of your own `WeightResampler` can use these functions.
 
-Random schemes do not compare weights, so they have no ties. If weights are equal, `LargestWeights.select` (a stable
-sort), `coalesce`, and the clusters of `mstfilter.smc.diverse_resampling` take the first particle.
+Of several particles with equal weights, `LargestWeights`, `coalesce` and `leader_clusters` take the first. Random
+schemes do not compare weights.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
@@ -47,7 +47,7 @@ from mstfilter.smc.interfaces import WeightResampler
 
 @dataclass(frozen=True)
 class Multinomial(WeightResampler):
-    """Independent draws by weight (Gordon, Salmond, Smith 1993); a reference, with the largest variance."""
+    """Independent draws by weight (Gordon, Salmond, Smith 1993). The variance is the largest of all schemes."""
 
     batched: ClassVar[bool] = True
 
@@ -57,7 +57,7 @@ class Multinomial(WeightResampler):
 
 @dataclass(frozen=True)
 class Stratified(WeightResampler):
-    """One uniform in each of n equal strata (Kitagawa 1996)."""
+    """Draws one uniform in each of n equal strata (Kitagawa 1996)."""
 
     batched: ClassVar[bool] = True
 
@@ -68,7 +68,7 @@ class Stratified(WeightResampler):
 
 @dataclass(frozen=True)
 class Systematic(WeightResampler):
-    """One uniform for all strata (Carpenter, Clifford, Fearnhead 1999); N_i is floor or ceil of n W_i."""
+    """Makes floor or ceil of n W_i copies, by one uniform for all strata (Carpenter, Clifford, Fearnhead 1999)."""
 
     batched: ClassVar[bool] = True
 
@@ -89,7 +89,7 @@ def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) -> np.ndarray:
-    """(m,) numbers of copies with sum n and means `expected`, scaled to sum n: floor or ceil, by systematic draws."""
+    """(m,) numbers of copies. Rounds `expected`, scaled to sum n, to floor or ceil by systematic draws."""
     copies, fractions, rest = certain_copies(expected, n)
     if rest > 0:
         copies += np.bincount(inverse_cdf(fractions, rng.random(1), rest), minlength=len(copies))
@@ -98,7 +98,7 @@ def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) ->
 
 @dataclass(frozen=True)
 class Residual(WeightResampler):
-    """floor(n W_i) copies of each particle. The rest is drawn independently by frac(n W_i) (Liu and Chen 1998)."""
+    """Makes floor(n W_i) copies, and draws the rest independently by frac(n W_i) (Liu and Chen 1998)."""
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         copies, fractions, rest = certain_copies(checked_weights(log_weights, n), n)
@@ -112,13 +112,13 @@ _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
 
 @dataclass(frozen=True)
 class Ssp(WeightResampler):
-    """Srinivasan sampling process: N_i is floor or ceil of n W_i, for any order of the particles.
+    """Srinivasan sampling process: makes floor or ceil of n W_i copies, for any order of the particles.
 
     Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability down / (up +
     down), a increases and b decreases by `up`. With the remaining probability, a decreases and b increases by `down`.
-    After this step, one of the two is 0 or 1, which is final. The other fraction is paired again. Here all pairs of a
-    round are processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative
-    association, ordering and convergence of resampling methods").
+    One of the fractions is then 0 or 1 and final; the other is paired again. All pairs of a round are processed
+    together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative association, ordering and
+    convergence of resampling methods").
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -141,7 +141,7 @@ class Ssp(WeightResampler):
 def _settle_pairs(
     rng: np.random.Generator, copies: np.ndarray, index: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One round of `Ssp`. Adds settled fractions to `copies` in place, and returns the remaining particles."""
+    """One round of `Ssp`: adds final fractions to `copies` in place, and returns the remaining particles."""
     a, b = value[:-1:2], value[1::2]
     total = a + b
     exceeds = total >= 1
@@ -161,7 +161,7 @@ def _settle_pairs(
 
 
 def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
-    """(n,) particle of each position. Each particle gets floor(n / m) positions, a random subset one more."""
+    """(n,) particle of each position. Each particle gets floor(n / m) positions, or one more position at random."""
     particles = np.arange(m) if n == m else np.tile(np.arange(m), n // m)
     if n % m:
         particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
@@ -170,13 +170,12 @@ def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.n
 
 @dataclass(frozen=True)
 class Killing(WeightResampler):
-    """A particle keeps its position with probability w_i / max w. The other positions are filled by draws by weight.
+    """A particle keeps its position with probability w_i / max w. Draws by weight fill the other positions.
 
-    Most particles keep their positions if the weights are nearly equal. Del Moral (2004), "Feynman-Kac formulae",
-    section 5.6, for n = m. For n != m each of the n positions belongs to one particle. Each particle has floor(n / m)
-    positions, and a random subset has one more. Each position then survives or is replaced. E[N_i] = n W_i for any n.
-    For n = m and p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 -
-    W_i).
+    Most particles keep their positions if the weights are nearly equal. The reference for n = m is Del Moral (2004),
+    "Feynman-Kac formulae", section 5.6. For n != m, each particle has floor(n / m) of the n positions, or one more at
+    random. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n. For n = m and p = w /
+    max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -194,8 +193,8 @@ class LargestWeights(WeightResampler):
 
     The scheme is not properly weighted.
 
-    If weights are equal, the first particle is selected, since the sort in `select` is stable. If fewer than n
-    particles have positive weight, they are repeated in turn.
+    If several weights are equal, the first particle is selected (stable sort). If fewer than n particles have
+    positive weight, these particles are repeated in turn.
     """
 
     properly_weighted: ClassVar[bool] = False
@@ -230,7 +229,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """`checked_weights` of a run. The weights of the runs of a batch, (R, m), are not checked."""
+    """The result of `checked_weights` for one run. Weights (R, m) of a batch of runs are not checked."""
     if log_weights.ndim != 2:
         return checked_weights(log_weights, n)
     weights = log_weights - log_weights.max(axis=1, keepdims=True)
@@ -268,7 +267,7 @@ def _subtract(positions: np.ndarray, shifts: np.ndarray) -> None:
 
 
 def expanded(ends: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) indices in which i has the places from ends[i - 1] to ends[i]: place k has the number of ends <= k."""
+    """(..., n) indices. Index i fills the positions ends[i - 1] to ends[i] - 1."""
     if ends.ndim == 1:
         counts = np.bincount(ends[:-1], minlength=n)[:n]
         return counts.cumsum(out=counts)
@@ -279,7 +278,7 @@ def expanded(ends: np.ndarray, n: int) -> np.ndarray:
 
 
 def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-    """(n,) indices, one for each row of (n, m) weights, by uniforms (n,) in [0, 1)."""
+    """Draw one index for each row of weights (n, m), given uniforms (n,) in [0, 1)."""
     cumulative = np.cumsum(weights, axis=-1)
     total = cumulative[:, -1:]
     index = (cumulative <= uniforms[:, None] * total).sum(axis=1)  # "at" a point skips weights of zero
@@ -289,8 +288,7 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    Fewer than 2000 indices are in ascending order. More indices are drawn in O(m + n). The indices ascend only from
-    one stratum of the weight to the next.
+    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and indices ascend only between strata.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -309,7 +307,7 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
 
 
 def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) indices of the intervals of the cumulative weights (m,), scaled to [0, 1), that contain the points."""
+    """(n,) indices: the interval of the cumulative weights (m,), scaled to [0, 1), that contains each point."""
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
@@ -317,12 +315,12 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices of many points, which are distributed to strata of equal weight.
+    """(n,) indices drawn independently by weight. The points are first distributed to strata of equal weight.
 
-    The method is four times as fast as a search for 10^6 points.
+    For 10^6 points, the method is four times as fast as a search.
 
-    Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. The
-    bound is increased where it is too small.
+    Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. Bounds
+    that are too small are increased.
     """
     # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
     bits = 62 - max(n.bit_length() - 14, 0)
@@ -355,7 +353,7 @@ def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> n
 def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
     """(m,) int64 cumulative weights that end at `total`, at most 2^62.
 
-    Integers are added exactly, and four times as fast as floats.
+    Sums of integers are exact, and four times as fast as sums of floats.
     """
     cumulative = np.empty(len(weights), np.int64)
     np.multiply(weights, total / weights.sum(), out=cumulative, casting="unsafe")
@@ -366,7 +364,7 @@ def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
 
 
 def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
-    """Increase lower bounds of ``searchsorted(edges, points, side="right")`` to these, in place."""
+    """Increase lower bounds of ``searchsorted(edges, points, side="right")`` to the exact values, in place."""
     low = np.flatnonzero(edges.take(index) <= points)
     at, points = index.take(low), points.take(low)
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""Many runs: several filters and seeds.
+"""Many runs of several filters (arms) and seeds.
 
 >>> runs = run_many(bootstrap(model, n=100), observations, seeds=range(200), ess=ess, log_evidence=log_evidence)
 >>> runs["ess"].shape                                  # (seed, time)
@@ -9,10 +9,10 @@
 >>> runs["log_evidence"].shape                         # (arm, seed, time)
 (2, 20, 50)
 
-Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. The
-runs of an arm are processed together, as arrays of the particles of all runs, if its components treat each particle
-independently (see `mstfilter.smc.batching`). In other cases the runs are made one by one. Run k of every arm has the
-same seed and so the same random streams. So differences between arms have less noise than those of independent runs.
+Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. If the
+components of an arm treat each particle independently, its runs are processed together as arrays (see
+`mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every arm has the same seed and random
+streams, so differences between arms have less noise.
 """
 
 from __future__ import annotations
@@ -46,31 +46,31 @@ def run_many(
     progress: bool | Callable[[int, int | None], None] = False,
     **collectors: Collector,
 ) -> History:
-    """Run one filter, or each of several arms, with each seed.
+    """Run one filter, or each of several filters (arms), with each seed.
 
     Parameters
     ----------
     filters : ParticleFilter or mapping
         A filter, or a mapping from names of arms to filters. All arms get the same observations and seeds.
     observations : iterable
-        T observations, the same for all runs. None is a missing observation; use `WithInput` for an input.
+        T observations, the same for all runs. A missing observation is None. Use `WithInput` for an input.
     seeds : iterable of int
         Different non-negative integers.
     workers : int
-        Number of processes; 1 uses the calling process. More are started by joblib's loky, as new interpreters that
-        get the filters by cloudpickle, and limit the numerical libraries to one thread. InputError if a worker dies,
-        with the runs that may have ended it.
+        Number of processes; 1 uses the calling process. joblib's loky starts workers as new interpreters. The workers
+        get the filters by cloudpickle and limit the numerical libraries to one thread. If a worker dies, InputError
+        names the runs that may have ended the process.
     progress : bool or callable
-        True shows a progress bar. A function is called as ``progress(done, total)`` when runs finish.
+        True shows a progress bar. When runs finish, a function is called as ``progress(done, total)``.
     **collectors
-        As for `collect`; default `log_evidence`.
+        Collectors by name, as in `collect`. The default is `log_evidence`.
 
     Returns
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). From that step on, the log evidence of a lost run is -inf and the other
-        results are NaN. `History.lost` has the reasons. `History.single` has the reasons for single runs.
+        an observation (`LostRunError`). After a run is lost, its log evidence is -inf and its other results are NaN.
+        `History.lost` explains lost runs. `History.single` explains runs made one by one.
 
     Warns
     -----
@@ -119,7 +119,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Job:
-    """The task of `run_many`."""
+    """The filters, observations, seeds and collectors of `run_many`."""
 
     arms: dict[str, ParticleFilter]
     ys: list[Any]
@@ -127,11 +127,11 @@ class _Job:
     collectors: dict[str, Collector]
 
     def where(self, arm: str, seed: int | None = None) -> str:
-        """Place for error messages; a single filter has no name."""
+        """Name of arm and seed for error messages. A single filter has no name."""
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
     def chunks(self, workers: int) -> list[_Chunk]:
-        """Runs that a worker makes in one go: many seeds if they can be processed together."""
+        """Divide the runs into tasks for workers. A task has many seeds if runs can be processed together."""
         chunks = []
         for arm, filter in self.arms.items():
             share = -(-len(self.seeds) // (4 * workers if workers > 1 else 1))
@@ -163,14 +163,14 @@ class _Job:
         return [self.single(arm, seed) for seed in seeds], why
 
     def single(self, arm: str, seed: int) -> Collected:
-        """One run, up to the step at which it is lost."""
+        """One run, up to the step at which the run is lost."""
         lost: list[str] = []
         with naming(self.where(arm, seed)):
             steps = _until_lost(self.arms[arm].iterate(self.ys, seed), lost)
             return Collected(dict(collect(steps, **self.collectors)), "".join(lost))
 
     def history(self, found: Mapping[_Task, Collected], single: Mapping[str, str], has_arms: bool) -> History:
-        """The results of all runs; without the axis of arms for a single filter."""
+        """The results of all runs. For a single filter, the axis of arms is omitted."""
         sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys)}
         coords = {"arm": list(self.arms), "seed": np.asarray(self.seeds), "time": np.arange(sizes["time"])}
         runs = [found[task] for task in product(self.arms, self.seeds)]
@@ -183,7 +183,7 @@ class _Job:
         return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost, single=dict(single))
 
     def joined(self, name: str, rows: list[np.ndarray], n_steps: int) -> np.ndarray:
-        """(run, time, ...) values of a collector; -inf or NaN after a run is lost."""
+        """Values (run, time, ...) of a collector. Values after a run is lost are -inf or NaN."""
         longest = max(rows, key=len)
         check_one_shape(name, [row.shape[1:] for row in rows if len(row)])
         complete = all(len(row) == n_steps for row in rows)
@@ -196,7 +196,7 @@ class _Job:
 
 
 def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
-    """The steps of a run. If the run is lost, the reason is appended."""
+    """The steps of a run. If no particle explains an observation, the reason is appended to `lost`."""
     try:
         yield from steps
     except LostRunError as error:
@@ -207,7 +207,7 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
 def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
     """Results of chunks of runs in the order in which they finish.
 
-    Workers are new processes, since a fork of a process with threads can deadlock.
+    Workers are new processes, because a fork of a process with threads can deadlock.
     """
     if workers == 1:
         yield from (job.run(*chunk) for chunk in chunks)
@@ -235,7 +235,7 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
 
 
 def _in_worker(job: _Job, arm: str, seeds: list[int]) -> _Part:
-    """Run a chunk with one thread in libraries that ignore the environment variables."""
+    """Run a chunk of runs, with one thread in libraries that ignore the environment variables."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "cv2" in sys.modules:

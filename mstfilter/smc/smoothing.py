@@ -1,21 +1,21 @@
-"""Smoothing: the states given all observations, from the populations of a filter.
+"""Smoothing estimates the states given all observations from the populations of a filter.
 
 >>> record = keep(bootstrap(model, n=500), observations, seed=0)
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
 >>> [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_T], t = 0 .. T
 
-Three smoothers of a record return a tuple with one population per time:
+Three smoothers take a `Record` and return a tuple with one population per time:
 
-- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). `genealogy` needs only the record. After
-  many resamplings all paths have the same beginning.
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` has more
-  distinct particles. The result has a bias if the state depends on observations more than `lag` steps later.
+- `genealogy` follows the ancestors of the last particles (Kitagawa 1996), and needs only the record. After many
+  resamplings, all paths have the same early states (path degeneracy).
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` keeps
+  more distinct particles, but is biased if a state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
-  path degeneracy. A step takes N densities per path, or a few with ``method="mcmc"``.
+  path degeneracy. A step evaluates N densities per path, or a few with ``method="mcmc"``.
 
-The paths are valid for any filter with proper weights: guided, auxiliary, with moves, resampled before or after.
+The paths are valid for any properly weighted filter, also with guided moves, a lookahead or rejuvenation.
 
-`mstfilter.smc.conditional` draws single paths, also of programs.
+`mstfilter.smc.conditional` draws single paths of models and of programs.
 """
 
 from __future__ import annotations
@@ -79,14 +79,14 @@ def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State 
 
 
 def genealogy(record: Record) -> tuple[Population, ...]:
-    """Paths of the last particles. Row k of all populations is one path, weighted by the last particle."""
+    """Paths of the last particles. Row k of all populations is one path, with the weight of the last particle."""
     return _traced(record, len(record) - 1, 0)
 
 
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
-    """At each time t, the ancestors of the particles at t + `lag` (or the end), with the weights of these particles.
+    """For each time t, the ancestors of the particles at t + `lag` (or the end), weighted by these later particles.
 
-    A lag of 0 steps returns the filter's populations.
+    A lag of 0 returns the populations of the filter.
     """
     check_integer("lag", lag, at_least=0)
     last = len(record) - 1
@@ -94,7 +94,7 @@ def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
 
 
 def _traced(record: Record, end: int, begin: int) -> tuple[Population, ...]:
-    """Ancestors from `begin` to `end` of the particles at `end`."""
+    """Ancestors, at the times from `begin` to `end`, of the particles at time `end`."""
     weights = record.populations[end].log_weights
     index = np.arange(len(weights))
     path = []
@@ -121,19 +121,19 @@ def backward_paths(
     Parameters
     ----------
     transition : DensityTransition
-        That of the model, ``Dynamics(model)``. One with a proposal cannot be used: its density is that of the
-        proposal.
+        The transition of the model, ``Dynamics(model)``. A transition with a proposal has another density and cannot
+        be used.
     method : "exact" or "mcmc"
-        "exact" (Godsill, Doucet, West 2004) evaluates the densities of all N particles for each path: n N per step.
+        "exact" (Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 
-        "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes independent Metropolis
-        steps, which leave the law of "exact" invariant: (1 + `steps`) n densities. The method needs a record with
-        parents. The chain need not converge. Given x_{t+1}, a parent already has the distribution of "exact" after
-        independent selections of a bootstrap filter, and up to order 1 / N after other selections. So a small number
-        of steps causes no additional bias (Dau and Chopin 2023). Steps reduce the variance. Without accepted steps,
-        the paths equal the paths of `genealogy`.
+        "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
+        leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
+        record must have parents. A small number of steps adds no bias (Dau and Chopin 2023). The parent of x_{t+1}
+        already has the distribution of "exact" after independent selections of a bootstrap filter. After other
+        selections, the error is of order 1 / N. More steps reduce the variance. Without accepted steps, the paths
+        equal the paths of `genealogy`.
     steps : int
-        Metropolis steps of "mcmc".
+        Number of Metropolis steps of "mcmc".
     """
     check_integer("n", n)
     check_component("transition", transition, DensityTransition)
@@ -162,7 +162,7 @@ class _Move:
     t: int
 
     def _log_density(self, index: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """(k,) log density of the moves from particles `index` to the later ones at `rows` (default: all)."""
+        """(k,) log density of the moves from particles `index` to the later particles `rows` (default: all)."""
         later = self.later if rows is None else take(self.later, rows)
         found = self.transition.log_prob(take(self.population.particles, index), later, self.y)
         density = np.asarray(found, dtype=np.float64)
@@ -173,7 +173,7 @@ class _Move:
         return density
 
     def exact(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """(n,) indices of predecessors, drawn from their law."""
+        """(n,) indices of predecessors, drawn from their exact distribution."""
         m, drawn = len(self.population), []
         for rows in np.split(np.arange(n), range(max(1, _PAIRS // m), n, max(1, _PAIRS // m))):
             density = self._log_density(np.tile(np.arange(m), len(rows)), np.repeat(rows, m))

@@ -13,8 +13,8 @@
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
 
-`metropolis` is the Metropolis-Hastings kernel of all chains of this package: of particles (`RandomWalkMove`), of
-parameters (`pmmh`) and of the ancestors of `backward_paths`.
+All Markov chains of this package use the Metropolis-Hastings kernel `metropolis`: chains of particles
+(`RandomWalkMove`), parameters (`pmmh`) and ancestors (`backward_paths`).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _Chains = TypeVar("_Chains")  # states of Markov chains
 class StateSpaceModel(AtStep):
     """A hidden Markov model on any state space.
 
-    If a function also has a parameter ``t``, it gets the index of the step. A parameter ``u`` gets the input (see
+    A further parameter ``t`` of a function gets the index of the step, and a parameter ``u`` gets the input (see
     `mstfilter.smc.inputs`).
 
     Parameters
@@ -62,12 +62,12 @@ class StateSpaceModel(AtStep):
     log_likelihood : callable
         ``(particles, y) -> (n,)`` log p(y_t | x_t).
     log_initial : callable, optional
-        ``(particles) -> (n,)`` log p(x_0). The function is needed by guided filters and moves.
+        ``(particles) -> (n,)`` log p(x_0), for guided filters and moves.
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     batched : bool or None
-        Whether the functions treat each particle independently, so that they can be called with the particles of many
-        runs (see `mstfilter.smc.batching`). None: With None, `run_many` tests this.
+        Whether the functions treat each particle independently, so that one call can process the particles of many
+        runs (see `mstfilter.smc.batching`). With None, `run_many` tests the independence.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -87,10 +87,11 @@ class StateSpaceModel(AtStep):
 
     @classmethod
     def of(cls, initial: Any, transition: Callable[..., Any], observation: Callable[..., Any]) -> StateSpaceModel:
-        """A model from distributions of this package, or frozen ones of scipy.stats.
+        """Make a model from distributions of this package, or frozen distributions of scipy.stats.
 
-        `initial` is the distribution of x_0, ``transition(particles)`` that of x_t, and ``observation(particles)``
-        that of y_t, with one row per particle. The functions may also have the parameters ``t`` and ``u``.
+        `initial` is the distribution of x_0. ``transition(particles)`` and ``observation(particles)`` return the
+        distributions of x_t and y_t, with one row per particle. The functions may also have the parameters ``t`` and
+        ``u``.
         """
         first = as_distribution(initial)
         for name, function in (("transition", transition), ("observation", observation)):
@@ -121,7 +122,7 @@ class StateSpaceModel(AtStep):
     def density(self, which: str) -> Callable[..., np.ndarray]:
         """``log_initial`` or ``log_transition``.
 
-        Raises InputError if the model was made without it.
+        Raises InputError if the model was made without the density.
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:
@@ -133,7 +134,7 @@ class StateSpaceModel(AtStep):
 
 
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
-    """(n,) log p(y | x). Without this check, entries of a vector would be compared with the particles one by one."""
+    """(n,) log p(y | x). Checks the shape of y, because numpy would broadcast entries of y against particles."""
     found, event = () if isinstance(y, float) else np.shape(y), distribution.event_shape
     if found not in (event, (1, *event)) and (found, event) != ((), (1,)):
         raise InputError(
@@ -151,7 +152,7 @@ class _OfModel(AtStep):
 
     @property
     def batched(self) -> bool | None:
-        """The value of the model. A batch tests whether a proposal treats each particle independently."""
+        """The value of the model. With a proposal, True becomes None, so that a batch of runs tests the proposal."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
@@ -179,7 +180,7 @@ class Prior(_OfModel, Proposal):
         return Population(x, self.model.density("log_initial")(x) - q.log_prob(x))
 
     def log_weight(self, new: Any, observation: Any) -> np.ndarray:
-        """(n,) log p(x_0) - log q(x_0 | y_0) of given particles; 0 without a proposal."""
+        """(n,) log p(x_0) - log q(x_0 | y_0) of given particles; 0 without a proposal or observation."""
         if self.proposal is None or observation is None:
             return np.zeros(count_particles(new))
         return self.model.density("log_initial")(new) - as_distribution(self.proposal(observation)).log_prob(new)
@@ -195,7 +196,7 @@ class Dynamics(_OfModel, DensityTransition):
         The model, with `log_transition` if there is a proposal.
     proposal : callable, optional
         ``(particles, y) -> distribution`` of x_t, one row per particle. The tails of the distribution must not be
-        lighter than those of f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
+        lighter than the tails of f(x_t | x_{t-1}) p(y_t | x_t). If y_t is missing, particles move by f.
     """
 
     model: StateSpaceModel
@@ -212,13 +213,13 @@ class Dynamics(_OfModel, DensityTransition):
         return Population(new, population.log_weights + gain, population.parents)
 
     def log_prob(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """(n,) log density of the move: q, or f without a proposal or observation."""
+        """(n,) log density of the move: log q, or log f if there is no proposal or no observation."""
         if self.proposal is None or observation is None:
             return self.model.density("log_transition")(previous, new)
         return as_distribution(self.proposal(previous, observation)).log_prob(new)
 
     def log_weight(self, previous: Any, new: Any, observation: Any) -> np.ndarray:
-        """(n,) log f - log q of given moves; 0 without a proposal."""
+        """(n,) log f - log q of given moves; 0 if there is no proposal or no observation."""
         if self.proposal is None or observation is None:
             return np.zeros(count_particles(new))
         return self.model.density("log_transition")(previous, new) - self.log_prob(previous, new, observation)
@@ -226,7 +227,7 @@ class Dynamics(_OfModel, DensityTransition):
 
 @dataclass(frozen=True)
 class PriorityLookahead(Lookahead):
-    """Priority given by a function ``(particles, y) -> (n,)`` of x_{t-1} and y_t."""
+    """Log priority given by a function ``(particles, y) -> (n,)`` of x_{t-1} and y_t."""
 
     function: Callable[..., np.ndarray]
     step_functions: ClassVar = {"function": 2}
@@ -241,15 +242,15 @@ class RandomWalkMove(Rejuvenation):
 
     ``notes["accepted"]`` is the acceptance rate.
 
-    After a resampling several particles share a parent. A Markov kernel separates these particles, and leaves p(x_t |
-    x_{t-1}, y_t) invariant. The weights do not change.
+    After a resampling several particles share a parent. The Metropolis kernel separates these particles and leaves
+    p(x_t | x_{t-1}, y_t) invariant. The weights do not change.
 
     Parameters
     ----------
     model : StateSpaceModel
-        The model with its log densities. Particles are floating-point arrays (n,) or (n, d), or mappings of them.
+        The model with its log densities. Particles are float arrays (n,) or (n, d), or mappings of such arrays.
     scale : float or array_like
-        Standard deviation of a step, in the units of the state. The scale is fixed, so that the evidence is unbiased.
+        Standard deviation of a step, in the units of the state. A fixed scale keeps the evidence unbiased.
     steps : int
         Number of Metropolis steps per move.
     """
@@ -291,7 +292,7 @@ class RandomWalkMove(Rejuvenation):
 
 
 def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
-    """Rows of `new` where `accepted` is True, and else rows of `old`; arrays, or mappings of arrays."""
+    """Rows of `new` if `accepted` is True, otherwise rows of `old`. The rows are in arrays or mappings of arrays."""
     if isinstance(old, Mapping):
         return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
     rows = accepted if old.ndim == 1 else accepted.reshape(-1, *(1,) * (old.ndim - 1))
@@ -309,16 +310,16 @@ def metropolis(
     Parameters
     ----------
     state
-        One row per chain: an array, or a mapping of arrays. The state also holds the log densities, so that those of
-        the present state are not evaluated again.
+        One row per chain: an array, or a mapping of arrays. The state includes the log densities, so no density of
+        the present state is evaluated again.
     propose : callable
         ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
-        q(new | old)). A ratio of NaN (both states are impossible) is rejected.
+        q(new | old)). A proposal with a log ratio of NaN (both states are impossible) is rejected.
 
     Yields
     ------
     state, accepted
-        After each step, the state and (n,) bool whether its proposal was accepted.
+        After each step: the state, and (n,) bool whether the proposal of a chain was accepted.
     """
     for _ in range(steps):
         new, log_ratio = propose(rng, state)
@@ -365,14 +366,14 @@ def guided(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The guided filter: moves by q(x_t | x_{t-1}, y_t), weights by f g / q.
+    """The guided filter moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
 
     Parameters
     ----------
     model : StateSpaceModel
         The model with its log densities.
     proposal : callable
-        ``(particles, y) -> distribution`` of x_t; None: the transition of the model.
+        ``(particles, y) -> distribution`` q of x_t; None means the transition f of the model.
     initial : callable, optional
         ``(y) -> distribution`` of x_0; the default is the prior of the model.
     **components
@@ -391,7 +392,7 @@ def auxiliary(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The auxiliary filter (Pitt and Shephard 1999): selects by weight times priority, then divides by the priority.
+    """The auxiliary filter (Pitt and Shephard 1999) selects by weight times priority, and divides by the priority.
 
     Parameters
     ----------

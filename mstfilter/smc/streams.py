@@ -1,7 +1,7 @@
-"""Keyed random streams.
+"""Random streams that are named by keys.
 
-All random numbers of a run are drawn from streams named by their use: (seed, step, slot, index). So the number of
-workers, the order of work, and the removal of a component change no other stream.
+All random numbers of a run are drawn from streams named by their use: (seed, slot, step, index). A slot is a
+component of the filter. The streams do not depend on the number of workers, the order of work, or other components.
 
 >>> from mstfilter.smc import Key, child
 >>> rng = Key(seed=1).child("transition", 3).generator()     # of step 3, as `ParticleFilter` makes it
@@ -9,12 +9,12 @@ workers, the order of work, and the removal of a component change no other strea
 True
 
 A `Key` is data (an integer and a tuple) and can be stored. Generators are not stored. The generator of a key is
-numpy's PCG64. The seed of a generator of 256 bits is the hash SHAKE-128 (FIPS 202) of the key. Streams of different
-keys are independent as far as a cryptographic hash behaves like a random function. The probability that two of a
-billion streams have the same seed is below 1e-50.
+numpy's PCG64. The 256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys
+are independent as far as a cryptographic hash behaves like a random function. The probability that two of a billion
+streams have the same seed is below 1e-50.
 
-If components are called once for R runs of n particles, rows (R n, ...) are the particles, run by run. `Rows` are
-arrays of this form. `RunGenerators` draw `Rows`, with row r of every array from the generator of run r.
+A batched component is called once for R runs of n particles. The particles are `Rows`: arrays (R n, ...), run by run.
+`RunGenerators` draw `Rows`; the generator of run r draws the rows of run r.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Key:
         object.__setattr__(self, "seed", int(self.seed))
 
     def child(self, *parts: int | str) -> Key:
-        """The key of a step, a slot (by name) or an index below this key."""
+        """The key with `parts` (slot, step, index) appended to the path."""
         for part in parts:
             if type(part) is not str and (type(part) is not int or part < 0):
                 parts = tuple(map(_part, parts))
@@ -90,7 +90,7 @@ class _KeySequence(ISpawnableSeedSequence):
 
 @lru_cache(maxsize=1 << 13)
 def _seeds(seed: int, path: tuple[int | str, ...], block: int | None) -> np.ndarray:
-    """(16, 4) uint64 seeds of PCG64, one for each index of a block of a path, or one for the path itself."""
+    """(16, 4) uint64 seeds of PCG64: one per index of a block of a path, or the seed of the path in row 0."""
     return np.frombuffer(_digest(seed, path, block), "<u8").reshape(_BLOCK, 4)
 
 
@@ -99,7 +99,7 @@ def _digest(seed: int, path: tuple[int | str, ...], block: int | None) -> bytes:
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
-    """A stream derived from the stream of `rng` and named by `parts`, for example ``"object", 7``.
+    """A generator of the stream named `parts` below the stream of `rng`, for example ``"object", 7``.
 
     `rng` must be made from a seed, for example by numpy.random.default_rng or `Key`. `rng` is not advanced.
     """
@@ -107,7 +107,7 @@ def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
 
 
 def key_of(rng: np.random.Generator) -> Key:
-    """The key of the stream of a generator, for any current position in the stream."""
+    """The key of the stream of a generator at any position in the stream."""
     sequence = rng.bit_generator.seed_seq
     if isinstance(sequence, _KeySequence):
         return sequence.key
@@ -145,19 +145,19 @@ class Rows(np.ndarray):
 
 @lru_cache(maxsize=64)
 def rows_of(n: int) -> type[Rows]:
-    """The class of arrays with `n` rows for each run. numpy gives it to the results of operations."""
+    """The subclass of `Rows` with `n` rows for each run. Results of numpy operations keep the subclass."""
     return type("Rows", (Rows,), {"n": n})
 
 
 class RunKeys:
-    """The keys of R runs: makes the generators of a component at a step for some of them, in half the time."""
+    """The keys of R runs. Makes generators of several runs in half the time of `Key.generator`."""
 
     def __init__(self, keys: list[Key]) -> None:
         self.keys = keys
         self._blocks: dict[str, tuple[int, np.ndarray]] = {}  # slot -> number of a block of steps, (R, 16, 4) seeds
 
     def generators(self, slot: str, t: int, runs: np.ndarray) -> list[np.random.Generator]:
-        """``keys[r].child(slot, t).generator()`` for each r of `runs`; these generators have no children."""
+        """``keys[r].child(slot, t).generator()`` for each r of `runs`. The generators have no child streams."""
         block, row = divmod(t, _BLOCK)
         if slot not in self._blocks or self._blocks[slot][0] != block:
             digests = [_digest(key.seed, (*key.path, slot), block) for key in self.keys]
@@ -167,7 +167,7 @@ class RunKeys:
 
 
 class _SeedsInTurn(ISeedSequence):
-    """Seeds (k, 4) of k generators, each of which asks for its seed once. One object takes less time than k."""
+    """Gives k generators their seeds (k, 4) in turn. One object takes less time than k objects."""
 
     def __init__(self, words: np.ndarray) -> None:
         self._rows = iter(words)
@@ -180,8 +180,8 @@ class RunGenerators:
     """The generators of R runs, for batched components. The generator of run r draws row r of every array.
 
     ``standard_normal``, ``random`` and ``standard_exponential`` are fast. Any other method of
-    `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. With `n`, the
-    arrays have n rows for each run, and a first axis of length R n.
+    `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. If `n` is
+    given, arrays have n rows for each run, and a first axis of length R n.
     """
 
     def __init__(self, generators: list[np.random.Generator], n: int | None = None) -> None:
@@ -219,7 +219,7 @@ class RunGenerators:
         return draw
 
     def _inner(self, size: Any) -> tuple[int, ...]:
-        """Shape of the numbers of one run."""
+        """Shape of the numbers that one run draws."""
         shape = tuple(size) if isinstance(size, (tuple, list)) else (size,)
         if shape[:1] != (self._length,):
             what = f"{len(self)} runs" if self._n is None else f"{len(self)} runs of {self._n} particles"
@@ -257,7 +257,7 @@ def _signature(method: str) -> inspect.Signature:
 
 
 def summaries(log_weights: np.ndarray, top: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n), equal to those of `Population`.
+    """Effective sample sizes (R,) and log mean weights (R,) of log weights (R, n), as `Population` computes them.
 
     `top` are the largest log weights (R,), if they are known.
     """
@@ -272,7 +272,7 @@ def summaries(log_weights: np.ndarray, top: np.ndarray | None = None) -> tuple[n
 
 
 def each_array(function: Callable[[np.ndarray], np.ndarray], particles: Any) -> Any:
-    """A function of the particles if they are an array, or of every array of a mapping."""
+    """Apply a function to the particles if they are an array, or to every array of a mapping."""
     if isinstance(particles, Mapping):
         return {name: function(a) for name, a in particles.items()}
     if isinstance(particles, np.ndarray):
@@ -281,5 +281,5 @@ def each_array(function: Callable[[np.ndarray], np.ndarray], particles: Any) -> 
 
 
 def of_runs(particles: Any, row: Any) -> Any:
-    """Particles of one run, or of several runs of an index."""
+    """Particles of one run, or of several runs if `row` is an index array."""
     return each_array(lambda a: a[row], particles)

@@ -1,7 +1,7 @@
-"""Resampling around another scheme.
+"""Resamplers that wrap another resampler (`scheme`).
 
-`Sorted`, `Shuffled`, `Coalesced`, `Tempered` and `KeepWeights` wrap a scheme. The wrappers change the order of the
-particles, merge equal ones, or change the weights.
+`Sorted` and `Shuffled` change the order of the particles, `Coalesced` merges equal particles, and `Tempered` and
+`KeepWeights` change the weights.
 
 >>> import numpy as np
 >>> from mstfilter.smc import Coalesced, FearnheadClifford, Population
@@ -31,7 +31,7 @@ from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, checke
 class ResamplerWrapper(Resampler):
     """Base class of resamplers that change the input or the result of another resampler, `scheme`.
 
-    The wrapper is properly weighted if the wrapped resampler is.
+    The wrapper is properly weighted if `scheme` is properly weighted.
     """
 
     scheme: Resampler = Systematic()  # noqa: RUF009 (frozen)
@@ -47,12 +47,12 @@ class ResamplerWrapper(Resampler):
 
 @dataclass(frozen=True)
 class Sorted(ResamplerWrapper):
-    """Orders the particles before the selection, for schemes whose result depends on the order.
+    """Sorts the particles before the selection, for schemes that depend on the order.
 
-    The order is by value, or along a Hilbert curve for particles that are vectors. In one dimension, the distribution
-    function of the particles that `Systematic` or `Stratified` select differs from the weighted one by at most 1 / n.
-    Gerber, Chopin, Whiteley (2019), "Negative association, ordering and convergence of resampling methods"; Li, Wang,
-    Deng, Liu (2022), "Stratification and optimal resampling for sequential Monte Carlo".
+    Scalar particles are sorted by value, and vectors along a Hilbert curve. In one dimension, `Systematic` and
+    `Stratified` change the weighted distribution function by at most 1 / n. Gerber, Chopin, Whiteley (2019),
+    "Negative association, ordering and convergence of resampling methods"; Li, Wang, Deng, Liu (2022),
+    "Stratification and optimal resampling for sequential Monte Carlo".
     """
 
     scheme: Resampler = Stratified()  # noqa: RUF009 (frozen)
@@ -64,7 +64,7 @@ class Sorted(ResamplerWrapper):
 
 
 def _line(x: np.ndarray) -> np.ndarray:
-    """(n,) numbers that order (n, d) rows: the value if d = 1, and else the position along a Hilbert curve."""
+    """(n,) sort keys of rows (n, d): the value if d = 1, otherwise the position along a Hilbert curve."""
     d = x.shape[1]
     if d == 1:
         return x[:, 0]
@@ -79,7 +79,7 @@ def _line(x: np.ndarray) -> np.ndarray:
 
 
 def hilbert_position(cells: np.ndarray, bits: int) -> np.ndarray:
-    """(n,) int64 position along the Hilbert curve of (n, d) cells with coordinates 0 .. 2^bits - 1, d bits < 63.
+    """(n,) int64 positions on the Hilbert curve of cells (n, d) with coordinates 0 .. 2^bits - 1; d * bits < 63.
 
     Neighbours on the curve are neighbours in space. Skilling (2004), "Programming the Hilbert curve".
     """
@@ -120,11 +120,11 @@ class Shuffled(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class Coalesced(ResamplerWrapper):
-    """Merges particles that are equal by `equivalence`, with the sum of their weights, before the selection.
+    """Merges particles that are equal by `equivalence`, and sums their weights, before the selection.
 
-    The heaviest particle of a class is kept; if several have equal weights, the first. The result represents the same
-    distribution with fewer particles. The population grows again only if a transition or update makes more
-    candidates. ``notes["distinct"]`` is the number of different particles of positive weight.
+    The first of the heaviest particles of each class is kept. The result represents the same distribution with fewer
+    particles. The population grows again only if a transition or update makes more candidates. ``notes["distinct"]``
+    is the number of different particles of positive weight.
     """
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
@@ -140,11 +140,11 @@ class Coalesced(ResamplerWrapper):
 
 
 def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Select one particle for each class: the heaviest, with the weight of the class.
+    """Select the heaviest particle of each class, with the total weight of the class.
 
     Returns the representatives (k,) in ascending order and their log weights (k,). If several particles have equal
-    weights, the first is the representative. A log weight is the log of the summed weights times k / m, which keeps
-    the log mean. Classes of weight zero are omitted.
+    weights, the first is the representative. The log weights are the logs of the class weights times k / m, so the
+    log mean does not change. Classes of weight zero are omitted.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)
@@ -159,10 +159,10 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Tempered(ResamplerWrapper):
-    """Selects by w^power and multiplies selected weights by w^(1 - power), so that light particles survive longer.
+    """Selects by w^power and multiplies selected weights by w^(1 - power), so light particles are kept more often.
 
-    `power` is in [0, 1]. With 1 this is the wrapped scheme. With 0 all particles of positive weight are equally
-    likely.
+    `power` is in [0, 1]. A power of 1 leaves the wrapped scheme unchanged. With a power of 0 all particles of
+    positive weight are equally likely.
     """
 
     power: Share = 0.5
@@ -180,9 +180,9 @@ class Tempered(ResamplerWrapper):
 
 @dataclass(frozen=True)
 class KeepWeights(ResamplerWrapper):
-    """Selected particles keep their weights, as in the program of the MST authors.
+    """The selected particles keep their weights, as in the program of the MST authors.
 
-    Selecting by weight and keeping the weight counts evidence twice, so this scheme is not properly weighted.
+    The evidence counts twice (in the selection and the weights), so the scheme is not properly weighted.
     """
 
     scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)

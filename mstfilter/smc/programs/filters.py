@@ -1,4 +1,4 @@
-"""Filters from a program: bootstrap and guided."""
+"""Bootstrap and guided filters of a probabilistic program."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _HERE = str(Path(__file__).parent)
 
 @dataclass(frozen=True)
 class Program:
-    """A model given as a function, and its filters with `n` particles.
+    """A model given as a function. The methods make filters of the model with `n` particles.
 
     ``model(previous, observation)`` calls `sample` and `observe`, and returns None or a mapping of further values to
-    keep. If the model or guide also has a parameter ``t``, it gets the index of the step. A parameter ``u`` gets the
-    input of `WithInput`. The methods accept other fields of `ParticleFilter` by name, such as ``resampler``.
+    keep. A parameter ``t`` of a model or guide gets the index of the step, and a parameter ``u`` gets the input of
+    `WithInput`. The methods accept other fields of `ParticleFilter` by name, such as ``resampler``.
     """
 
     model: Model
@@ -43,8 +43,8 @@ class Program:
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
         """Guided filter, which draws from the guide.
 
-        The guide is a program that draws every site of the model, by name, given the observation. If the observation
-        is missing, particles are drawn from the model.
+        The guide is a program that samples every name of the model, given the observation. If the observation is
+        missing, particles are drawn from the model.
         """
         return self._filter(guide, n, components)
 
@@ -55,7 +55,7 @@ class Program:
 
 @dataclass(frozen=True)
 class _ProgramStep(Component):
-    """A step of a program: draws, by the guide if there is one, and weights."""
+    """A step of a program: draws values from the guide or the model, and weights the particles."""
 
     model: Model
     guide: Model | None = None
@@ -65,7 +65,7 @@ class _ProgramStep(Component):
 
     @cached_property
     def schedule(self) -> Schedule:
-        """The steps that are checked."""
+        """The `Schedule` of the steps that are checked."""
         return Schedule.of(self.model, self.guide)
 
     def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
@@ -96,7 +96,7 @@ class _ProgramStep(Component):
 
 @dataclass(frozen=True)
 class ProgramInitial(_ProgramStep, Proposal):
-    """First step of a program. Draws values, from the guide if there is one, and weights them."""
+    """First step of a program. Draws values from the guide or the model, and weights the particles."""
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
         return self._advance(rng, None, observation, n)
@@ -104,7 +104,7 @@ class ProgramInitial(_ProgramStep, Proposal):
 
 @dataclass(frozen=True)
 class ProgramTransition(_ProgramStep, Transition):
-    """A step of a program. Draws values, from the guide if there is one, and weights them."""
+    """Later step of a program. Draws values from the guide or the model, and weights the particles."""
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         return self._advance(rng, population, observation, len(population))
@@ -113,7 +113,7 @@ class ProgramTransition(_ProgramStep, Transition):
 def program_step(
     rng: np.random.Generator, model: Model, guide: Model | None, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Particles, drawn from the guide if there is one, and the changes of the log weights."""
+    """Particles, drawn from the guide (if given) or the model, and the changes of the log weights."""
     if guide is None:
         return run_program(model, SampleHandler(rng), previous, observation, n)
     proposed = GuideHandler(rng, n)
@@ -124,12 +124,12 @@ def program_step(
 def run_program(
     model: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> tuple[Particles, np.ndarray]:
-    """Run a program, or its guide, over n particles. The handler determines the values of the sites.
+    """Run a program, or its guide, over n particles. The handler determines the value of each `sample` call.
 
     Returns
     -------
     particles : mapping of arrays (n, ...)
-        Values of the sites, and the values that the program returned.
+        Values of the `sample` calls by name, and the values that the program returned.
     gain : (n,) float64
         Change of the log weights.
     """
@@ -140,7 +140,7 @@ def run_program(
 def _run_once(
     function: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> ProgramRun:
-    """One pass of a function."""
+    """Run the function of a program once."""
     run = ProgramRun(handler, n)
     run.function = function
     if isinstance(previous, dict):
@@ -191,7 +191,7 @@ _RAW_ERRORS = {
 
 
 def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
-    """The error of a program with its place and a hint. Only errors of Python, numpy or scipy are changed."""
+    """The error of a program with its line and a hint. Only errors of Python, numpy or scipy are changed."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
     place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
     if frames:
@@ -213,7 +213,7 @@ def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
 
 
 def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
-    """Check the values that a program returned: one row per particle."""
+    """Check that the values returned by a program have one row per particle."""
     if returned is None:
         return {}
     if not isinstance(returned, Mapping):
@@ -246,7 +246,7 @@ def _equal(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _values_of(run: ProgramRun) -> dict[str, Any]:
-    """All particles after a run: values of the sites, and returned values."""
+    """The particles after a run: values of the `sample` calls, and returned values."""
     particles = {**run.values, **run.returned}
     if not particles:
         raise InputError("the program sampled nothing and returned nothing: a particle would be empty")

@@ -1,17 +1,16 @@
-"""Checks that a program treats its particles independently and draws only by `sample`.
+"""Checks that a program treats particles independently and draws random numbers only by `sample`.
 
 A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
-``previous["x"][0]``), draw from another generator, or keep values between steps. A program with this fault runs
-without an error, but its weights are wrong. `Guard` checks some steps of each kind: the first and the second, then
-the 9th, 66th, 515th, ... (8^k + k, which also detects a fault of every third step):
+``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
+error, but its weights are wrong. `Guard` checks some steps of each kind: steps 1, 2, 9, 66, 515 and so on. The
+numbers 8^k + k also detect a fault of every third step. A check has three parts:
 
-1. The first two steps run again with the same random numbers. All values and log weights must equal those of the
-   first run.
-2. A few particles run alone with the values that they had: their distributions and returned values must be those of
-   the step. They are taken from the smallest and from the largest values, so that a maximum or ``any`` changes too.
-   Their number differs from that of the step, so that an axis of events cannot be mistaken for that of the particles.
-3. With a guide, a step is drawn by the model: the guide must be able to draw these values, and the two estimates of
-   the evidence must agree.
+1. The first two steps are repeated with the same random numbers. All values and log weights must agree.
+2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
+   change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. The
+   number of particles differs from the step, so an event axis cannot pass for the particle axis.
+3. If there is a guide, the model also draws a step. The guide must be able to draw the values of the model, and the
+   two estimates of the evidence must agree.
 
 The results of a filter do not depend on these checks.
 """
@@ -53,7 +52,7 @@ Run = Callable[..., ProgramRun]  #: of a function, a handler, the previous parti
 
 
 class Guard:
-    """The checks of one step of a program, made before the step."""
+    """The checks of one step of a program."""
 
     def __init__(
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any, count: int
@@ -65,7 +64,7 @@ class Guard:
         self.fresh = {id(f): _copy(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
-        """Particles and change of the log weights, as returned by ``step()``. Raises InputError if a check fails."""
+        """The particles and log weight changes that ``step()`` returns. Raises InputError if a check fails."""
         with recorded() as runs:
             particles, gain = step()
         if self.count <= 2:
@@ -91,7 +90,7 @@ class Guard:
 
     # --- a few particles alone --------------------------------------------------------------------------------------
     def _check_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> None:
-        """Compare some particles in a run with the same particles in a separate run."""
+        """Compare some particles of a run with the same particles in a run of only these particles."""
         few = self._run_alone(run, whole, rows)
         for call in few.calls or ():
             if call.distribution is not None:
@@ -106,7 +105,7 @@ class Guard:
             _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
 
     def _run_alone(self, run: Run, whole: ProgramRun, rows: np.ndarray) -> ProgramRun:
-        """A run of some particles, with the values that they had."""
+        """Run only some particles, with the values of the whole run."""
         previous = None if self.previous is None else take(self.previous, rows)
         handler = GivenHandler(whole.values, rows, weigh=False)
         fresh = self.fresh.get(id(whole.function))
@@ -121,7 +120,7 @@ class Guard:
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
-        """Compare the guide with draws of the model."""
+        """Check the guide with draws of the model."""
         n, old = len(gain), 0.0 if self.past is None else self.past.log_weights
         try:
             drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
@@ -158,7 +157,7 @@ class Guard:
 
 
 class Schedule(Counter[Any]):
-    """Numbers of the steps of a model and its guide, by kind. Programs with the same functions share them."""
+    """Counts the steps of a model and its guide, by kind. Programs with the same functions share the counts."""
 
     @classmethod
     def of(cls, model: Any, guide: Any) -> Schedule:
@@ -171,7 +170,7 @@ class Schedule(Counter[Any]):
     def guard(
         self, rng: np.random.Generator, past: Population | None, observation: Any, model: Any, guide: Any
     ) -> Guard | None:
-        """A guard if the next step must be checked."""
+        """A `Guard` if the next step must be checked, otherwise None."""
         shape = observation.shape if type(observation) is np.ndarray else None
         kind = (past is None, observation is None, guide is None, shape)
         self[kind] += 1
@@ -182,9 +181,9 @@ _SCHEDULES: dict[tuple[Any, ...], tuple[Schedule, list[Any]]] = {}
 
 
 def _parts(function: Any) -> list[Any]:
-    """The code of a function, and the values of its closure and defaults except numbers.
+    """The code of a function, and the values of its closure and defaults except floats and arrays.
 
-    The models of many parameter values, as in PMMH, have the same parts.
+    Models that differ only in their parameter values, as in PMMH, have the same parts.
     """
     while isinstance(function, partial):
         function = function.func
@@ -196,7 +195,7 @@ def _parts(function: Any) -> list[Any]:
 
 
 def _copy(function: Any) -> Any:
-    """A copy of an object that is a program; functions, and objects that cannot be copied, are shared."""
+    """A deep copy of a program. Functions, and objects that cannot be copied, are returned unchanged."""
     try:
         return deepcopy(function)
     except Exception:
@@ -204,7 +203,7 @@ def _copy(function: Any) -> Any:
 
 
 def _groups(run: ProgramRun) -> list[np.ndarray]:
-    """Two groups of particles to run alone, of small and of large values, with particles of every branch."""
+    """Two groups of particles to run alone: particles with small and with large values, from every branch."""
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
     column = np.arange(run.n) if numbers is None else numbers.reshape(run.n, -1)[:, 0]
     order, size = np.argsort(column), max(run.n // 3, 1)
@@ -212,7 +211,7 @@ def _groups(run: ProgramRun) -> list[np.ndarray]:
 
 
 def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
-    """Some rows of a part of the particles: at least two, since one row might be broadcast, but not all."""
+    """Choose some particles of `part`: at least two, because one row could be broadcast, but not all."""
     rows = list(part[[len(part) // 2, 0, len(part) // 4]])
     for call in run.calls or ():
         if call.rows is not None and len(rows) < 8:
@@ -235,7 +234,7 @@ def _close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> Any:
-    """Size of the differences between particles, used as the unit of rounding errors."""
+    """Range of the finite values of all particles, used as the unit of rounding errors."""
     if values.dtype.kind != "f":
         return 0.0
     finite = values[np.isfinite(values)]
@@ -243,7 +242,7 @@ def _spread(values: np.ndarray) -> Any:
 
 
 def _first_difference(particles: Mapping[str, np.ndarray], again: Mapping[str, np.ndarray]) -> str | None:
-    """The first name whose values differ between two populations."""
+    """The first name with different values in two populations."""
     if list(particles) != list(again):
         return f"the names {sorted(set(particles) ^ set(again))}"
     pairs = ((name, np.asarray(a), np.asarray(again[name])) for name, a in particles.items())
@@ -255,7 +254,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
-    """Raise unless particles have the same distributions in a call of all particles and alone."""
+    """Raise InputError unless the particles `rows` have the same log densities among all particles and alone."""
     position = call.positions(rows)
     here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
     among = call.densities(call.value)
@@ -284,7 +283,7 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
 
 
 def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np.ndarray) -> None:
-    """Raise unless particles have the same returned values among the others and alone."""
+    """Raise InputError unless the particles `rows` have the same returned values among all particles and alone."""
     if alone.shape[1:] != values.shape[1:]:
         raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}", *_ALONE)
     different = ~_close(values[rows], alone, _VALUE, _spread(values))
@@ -302,13 +301,12 @@ _KNOWN: set[type] = set()
 
 
 def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
-    """Raise if draws of a user's distribution of numbers do not have its density.
+    """Raise InputError if the draws of a user's scalar distribution do not have its density.
 
-    The density is checked once for each class.
+    Each class is checked once.
 
-    The distribution function is the integral of the density between sorted draws. The distance of this integral from
-    the uniform distribution is below .12 for 1000 draws of the true distribution, with a false-alarm rate of 1e-12
-    (Dvoretzky, Kiefer, Wolfowitz).
+    For 1000 sorted draws, the integral of the density must differ from the empirical distribution function by less
+    than .12. The false-alarm rate is 1e-12 (Dvoretzky, Kiefer, Wolfowitz).
     """
     from scipy.integrate import cumulative_trapezoid
 

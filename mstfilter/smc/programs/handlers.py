@@ -1,6 +1,6 @@
-"""Handlers, which determine the values of the sites of a program.
+"""Handlers determine the values of the sites of a program. A site is a call of `sample`.
 
-A value is a draw, a replayed draw of a guide, or given.
+A handler draws a value, replays the draw of a guide, or takes a given value.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mstfilter.smc.interfaces import Distribution
 
 
 class Site(NamedTuple):
-    """A call of `sample` in a run."""
+    """A call of `sample` in the run of a program."""
 
     name: str
     distribution: Distribution
@@ -30,14 +30,14 @@ class Site(NamedTuple):
 
 
 class SiteHandler(ABC):
-    """Determines the values of sites.
+    """Determines the values of sites (calls of `sample`).
 
     Attributes
     ----------
     observes : bool
-        Whether the program may observe.
+        Whether the program may call `observe`.
     draws : bool
-        Whether the values are new rather than given.
+        False if the handler takes given values.
     """
 
     observes = True
@@ -48,11 +48,11 @@ class SiteHandler(ABC):
         """Values (size, ...) of a site, and the change of the log weights (None: no change)."""
 
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
-        """End a pass in which the sites have the given values."""
+        """Called at the end of a run of the program, with the values of all sites."""
 
 
 class SampleHandler(SiteHandler):
-    """Draws every site."""
+    """Draws the value of every site from its distribution."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -62,7 +62,7 @@ class SampleHandler(SiteHandler):
 
 
 class GuideHandler(SiteHandler):
-    """Draws every site for n particles, and stores values and log densities for a `ReplayHandler`."""
+    """Draws the value of every site of a guide, and stores values and log densities for a `ReplayHandler`."""
 
     observes = False
 
@@ -82,7 +82,7 @@ class GuideHandler(SiteHandler):
 
 
 class ReplayHandler(SiteHandler):
-    """Takes the values of a guide and weights them by f / q."""
+    """Takes the values of a guide, and weights particles by f / q (density of the model / density of the guide)."""
 
     def __init__(self, guide: GuideHandler) -> None:
         self.guide = guide
@@ -122,16 +122,16 @@ def check_shape(what: str, value: np.ndarray, distribution: Distribution, size: 
 
 
 class GivenHandler(SiteHandler):
-    """Takes given values of each site.
+    """Takes the value of each site from given values.
 
     Parameters
     ----------
     values : mapping of arrays (m, ...)
-        Values by site.
+        Given values by the name of the site.
     rows : (n,) int, optional
-        The rows of the values that belong to the n particles. By default, all rows.
+        The rows of `values` that belong to the n particles. By default, all rows are used.
     weigh : bool
-        Whether the density of the values weights the particles.
+        Whether the particles are weighted by the density of the values.
     """
 
     draws = False

@@ -1,4 +1,4 @@
-"""The functions that a program calls (`sample`, `observe`, `switch`), and `ProgramRun`, one pass of a program."""
+"""The functions that a program calls (`sample`, `observe`, `switch`), and `ProgramRun`, one run of a program."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RECORDED: ContextVar[list[ProgramRun] | None] = ContextVar("runs that record th
 
 @contextmanager
 def recorded() -> Iterator[list[ProgramRun]]:
-    """The runs of programs in the block, each with its `calls`."""
+    """The `ProgramRun` of each program run inside the block. Each run records its `calls`."""
     runs: list[ProgramRun] = []
     token = _RECORDED.set(runs)
     try:
@@ -32,14 +32,14 @@ def recorded() -> Iterator[list[ProgramRun]]:
 
 
 def sample(name: str, distribution: Any) -> Any:
-    """A random value of the step, stored in the particle under `name`.
+    """Draw a random value for each particle, and store the value in the particles under `name`.
 
     Parameters
     ----------
     name : str
-        Unique within a step, except for sites in different branches of a `switch`.
+        A name that is unique within a step. Different branches of a `switch` may use the same name.
     distribution : Distribution
-        Of this package or frozen of scipy.stats; parameters have one row per particle.
+        Distribution of this package, or frozen distribution of scipy.stats. Parameters have one row per particle.
 
     Returns
     -------
@@ -50,11 +50,11 @@ def sample(name: str, distribution: Any) -> Any:
 
 
 def observe(name: str, distribution: Any, value: Any) -> None:
-    """Weight the particles by the probability of an observed value; None is a missing value and has no effect.
+    """Weight the particles by the density of an observed value; None (a missing value) has no effect.
 
     `distribution` is the distribution of the observation given the particle. The value has the event shape of the
-    distribution. Or the value is one value for each particle, of shape ``(n, *event_shape)``, such as the reading
-    that the particle assigns to an object. `name` is used in messages.
+    distribution, or shape ``(n, *event_shape)`` if each particle has its own value, such as the reading that it
+    associates with an object. Error messages use `name`.
     """
     _current().observe(name, distribution, value)
 
@@ -65,15 +65,15 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     Parameters
     ----------
     name : str
-        The index of the branch (n,) is stored in the particles under this name.
+        The index of the branch (n,) is stored in the particles under `name`.
     probs : (k,) or (n, k) array_like
         Probabilities of the k branches.
     branches : sequence of callables
         Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
-        `observe` and `switch`. A site with the same name in several branches is one array. The value is NaN (0 for
-        integers) for particles that did not reach the site. A branch without particles is also called.
+        `observe` and `switch`. A name that several branches sample is one array. The entries of particles that do not
+        reach the call are NaN (0 for integers). A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Arguments that are split by rows. Values shared by all particles are passed by closure.
+        Arguments whose rows are split among the branches. Branches get values shared by all particles by closure.
 
     Returns
     -------
@@ -106,11 +106,11 @@ class Call(NamedTuple):
 
     @property
     def reached(self) -> np.ndarray:
-        """(size,) indices of the particles."""
+        """(size,) indices of the particles that reach the call."""
         return np.arange(self.size) if self.rows is None else self.rows
 
     def positions(self, rows: np.ndarray) -> np.ndarray:
-        """(k,) positions of some particles among those of the call; -1 for a particle that does not reach it."""
+        """(k,) positions of `rows` among the particles of the call; -1 for particles that do not reach the call."""
         if self.rows is None:
             return rows
         if not self.size:
@@ -119,7 +119,7 @@ class Call(NamedTuple):
         return np.where(self.rows[k] == rows, k, -1)
 
     def densities(self, values: Any) -> np.ndarray:
-        """(size,) log densities of an observation, or of values (size, ...) at a site."""
+        """(size,) log densities of an observation, or of `values` (size, ...) at a site."""
         log_prob = self.log_prob
         if self.distribution is not None:
             with np.errstate(all="ignore"):
@@ -129,7 +129,7 @@ class Call(NamedTuple):
 
 
 class ProgramRun:
-    """One pass of a program over n particles; the handler decides the values."""
+    """One run of a program over n particles. The handler determines the values of the sites."""
 
     def __init__(self, handler: SiteHandler, n: int) -> None:
         self.handler, self.n = handler, n
@@ -149,13 +149,13 @@ class ProgramRun:
 
     @property
     def what(self) -> str:
-        """The last site or observation, for messages."""
+        """Description of the last site or observation, for error messages."""
         kind, name, where = self._last
         return f"{kind} {name!r}{where}" if kind else ""
 
     @property
     def _size(self) -> int:
-        """Number of particles of the branch."""
+        """Number of particles in the current branch."""
         return self.n if self._rows is None else len(self._rows)
 
     def sample(self, name: str, distribution: Any) -> Any:
@@ -197,7 +197,7 @@ class ProgramRun:
         self.inside = False
 
     def _check_event(self, distribution: Distribution, found: tuple[int, ...]) -> None:
-        """Raise unless an observed value of shape `found` is one event, or one for each particle."""
+        """Raise InputError unless an observed value of shape `found` is one event, or one event per particle."""
         size = self._size
         event = distribution.value_shape(size)[1:]
         if found == event or found in ((1, *event), (size, *event)) or (found, event) == ((), (1,)):
@@ -237,13 +237,13 @@ class ProgramRun:
         return merged
 
     def _note(self, **fields: Any) -> None:
-        """Record the present call if calls are recorded."""
+        """Append the present call to `calls` if calls are recorded."""
         if self.calls is not None:
             k = sum(call.what == self.what for call in self.calls)
             self.calls.append(Call(self.what, k, self._rows, self._size, **fields))
 
     def _check_name(self, name: str) -> None:
-        """Raise if a particle may reach two sites of this name."""
+        """Raise InputError if a particle may reach two sites with the same name."""
         if not isinstance(name, str):
             raise InputError(f"the name of a site is a {type(name).__name__}", 'write sample("x", distribution)')
         if name not in self._paths:
@@ -295,7 +295,7 @@ class ProgramRun:
 
 
 def _check_draws(value: np.ndarray, distribution: Distribution) -> None:
-    """Raise if a draw is NaN, or is an integer of a continuous distribution."""
+    """Raise InputError if a draw is NaN, or if a continuous distribution draws integers."""
     if value.dtype.kind == "f":
         if not math.isfinite(np.vdot(value, value)) and np.isnan(value).any():
             rows = np.unique(np.nonzero(np.isnan(value))[0])
@@ -310,7 +310,7 @@ def _check_draws(value: np.ndarray, distribution: Distribution) -> None:
 
 
 def _check_rows(argument: Any, size: int, k: int) -> None:
-    """Raise unless the argument of a switch has one row per particle."""
+    """Raise InputError unless the argument of a `switch` has one row per particle."""
     for value in argument.values() if isinstance(argument, Mapping) else (argument,):
         if value is not None and (np.ndim(value) == 0 or len(value) != size):
             raise InputError(
@@ -321,13 +321,13 @@ def _check_rows(argument: Any, size: int, k: int) -> None:
 
 
 def _blank(value: np.ndarray, n: int) -> np.ndarray:
-    """(n, ...) values of a site that was not reached: NaN for floats, and else 0."""
+    """(n, ...) values of particles that do not reach a site, which are NaN for floats and otherwise 0."""
     fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
     return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 
 
 def _merge(results: list[Any], groups: list[np.ndarray], n: int) -> Any:
-    """Values returned by the branches, each in its rows."""
+    """Merge the values returned by the branches: each branch fills the rows of its particles."""
     if all(r is None for r in results):
         return None
     if all(isinstance(r, Mapping) for r in results):

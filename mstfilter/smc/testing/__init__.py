@@ -1,6 +1,6 @@
-"""Contracts: properties that every component of a filter has, as test classes for your components and ours.
+"""Contracts: test classes of the properties that every component of a filter must have.
 
-Inherit the contract of the interface and define `make`. ``pytest`` then tests the component:
+Inherit the contract of an interface and define `make`, and ``pytest`` tests your component:
 
 >>> from mstfilter.smc.testing import WeightResamplerContract
 >>> from mine import MyResampler
@@ -8,12 +8,12 @@ Inherit the contract of the interface and define `make`. ``pytest`` then tests t
 ...     def make(self):
 ...         return MyResampler()
 
-`check_properties` runs the same class without pytest and states which property is violated:
+`check_properties` runs the same test class without pytest and states which property is violated:
 
 >>> for result in check_properties(MyResampler(), WeightResamplerContract):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
-Contracts of components of scenes, and a check that finds the contract of a component, are in `mstfilter.testing`.
+`mstfilter.testing` has contracts for components of scenes, and a check that finds the contract of a component.
 """
 
 from mstfilter.lazy import attach

@@ -1,15 +1,15 @@
-"""Common parts of all contracts: the base class, its run without pytest, and helpers that describe failures.
+"""The base class of all contracts, and a function that runs a contract without pytest.
 
-A contract is a test class for pytest. It defines the arguments of calls (`inputs`, `variants`), the call (`call`),
-and the requirements of every result (`check_result`). Each further ``test_`` method checks one more property. The
-first line of its docstring states the property, and the message of a failed assertion states how it is violated:
+A contract is a test class for pytest. The contract defines the arguments of calls (`inputs`, `variants`), the call
+(`call`), and the requirements of every result (`check_result`). Each further ``test_`` method checks one property.
+The first line of the docstring of a test states the property, and the message of a failure states the violation:
 
 >>> class TriggerContract(Contract):
 ...     returns = bool
 ...     def call(self, component, rng, inputs):
 ...         return component.wants(inputs["population"], 0)
 
-pytest is not imported: `SkipTest` skips a test, in pytest too.
+This module does not import pytest; pytest also accepts `SkipTest`.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _Test = TypeVar("_Test", bound=Callable[..., None])
 
 
 def statistical(test: _Test) -> _Test:
-    """Mark a test that uses random samples. It fails with probability `FALSE_ALARM` for a correct component."""
+    """Mark a test with random samples. For a correct component, the test fails with probability `FALSE_ALARM`."""
     test.statistical = True  # type: ignore[attr-defined]
     return test
 
 
 def prerequisite(test: _Test) -> _Test:
-    """Mark a test on which later tests depend. If it fails, `check_properties` skips the later tests."""
+    """Mark a test on which later tests depend. If the test fails, `check_properties` skips the later tests."""
     test.prerequisite = True  # type: ignore[attr-defined]
     return test
 
@@ -50,9 +50,9 @@ def seeded(seed: int = 0) -> np.random.Generator:
 
 
 class Contract:
-    """Base class of all contracts. Inherit one of its subclasses and define `make`. pytest does the rest.
+    """Base class of all contracts. Inherit the contract of an interface, define `make`, and run pytest.
 
-    A contract for another interface defines `inputs`, `call` and `check_result`, and adds tests.
+    A contract for a new interface defines `inputs`, `call` and `check_result`, and adds tests.
     """
 
     returns: ClassVar[type] = object  #: type of the result of a call
@@ -62,11 +62,11 @@ class Contract:
         raise NotImplementedError(f"{type(self).__name__} needs a method make(self) that returns the component")
 
     def example(self, rng: np.random.Generator, n: int) -> tuple[Population, Any]:
-        """A population of `n` weighted particles (by default numbers) for the component, and an observation."""
+        """A population of `n` weighted particles for the component (by default floats), and an observation."""
         return Population(rng.standard_normal(n), 0.5 * rng.standard_normal(n)), 0.5
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
-        """Arguments of a typical call, without the generator: the example of `n` particles."""
+        """Arguments of a typical call, without the generator. By default, `example` makes the arguments."""
         population, observation = self.example(seeded(seed), n)
         return {"population": population, "observation": observation}
 
@@ -75,10 +75,10 @@ class Contract:
         raise NotImplementedError
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
-        """Assert the requirements of every result, beyond its type."""
+        """Assert the requirements that every result must meet, except its type."""
 
     def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
-        """Call the component once. An exception or a wrong result is reported with a description of the inputs."""
+        """Call the component once and check the result. The message of an exception describes the inputs."""
         with reports_errors(inputs):
             result = self.call(component, seeded(3) if rng is None else rng, inputs)
         kind, expected = type(result).__name__, self.returns.__name__
@@ -87,13 +87,13 @@ class Contract:
         return result
 
     def variants(self) -> list[dict[str, Any]]:
-        """Arguments of calls for which the properties must hold: six particles, and for arrays also one particle."""
+        """Arguments of the calls that the tests make: six particles, and for array particles also one particle."""
         few = self.inputs(6)
         objects = isinstance(getattr(few.get("population"), "particles", None), tuple)
         return [few] if objects else [few, self.inputs(1)]
 
     def fresh(self) -> Any:
-        """A component that has not been used: a copy of the result of `make`, if it can be copied."""
+        """A component that has not been used: a copy of the result of `make`, if copying is possible."""
         return copied(self.make())
 
     @prerequisite
@@ -104,7 +104,7 @@ class Contract:
 
     @prerequisite
     def test_does_not_change_input(self) -> None:
-        """It leaves its input unchanged."""
+        """A call leaves its input unchanged."""
         for inputs in self.variants():
             before = copy.deepcopy(_plain(inputs))
             try:
@@ -116,7 +116,7 @@ class Contract:
 
     @prerequisite
     def test_depends_on_its_arguments_only(self) -> None:
-        """Equal arguments and generators give equal results; with ``draws = False`` it does not use its generator."""
+        """Equal arguments and generators give equal results. With ``draws = False`` the generator is not used."""
         used, draws, found = self.fresh(), getattr(self.make(), "draws", True), []
         for inputs in (self.inputs(6, 1), *self.variants()):
             rngs = [seeded(7) for _ in range(3)]
@@ -141,7 +141,7 @@ class ScaleContract(Contract):
     weighted: ClassVar[str] = "population"
 
     def test_scale_of_weights_is_irrelevant(self) -> None:
-        """A common factor of the weights has no effect, except that the weights of the result have it too."""
+        """A common factor of the input weights has no effect, except the same factor of the output weights."""
         component, inputs = self.make(), self.variants()[0]
         population, result = inputs[self.weighted], self.checked_call(component, inputs)
         for shift in (0.5, 50.0, -50.0, 1e4, -1e4):
@@ -162,7 +162,7 @@ class ScaleContract(Contract):
 
 
 def _selected(population: Population) -> list[np.ndarray]:
-    """Arrays that describe the particles of a result: their parents, and their coordinates if they have some."""
+    """Arrays that describe the particles of a result: parents, and coordinates of array particles."""
     numbers = isinstance(population.particles, (np.ndarray, Mapping))
     return [*population.parents.values(), *([as_matrix(population.particles)] if numbers else [])]
 
@@ -176,7 +176,7 @@ def copied(component: Any) -> Any:
 
 
 def skip_unless_properly_weighted(component: Any) -> Any:
-    """The component. Skips a test of the weights if it declares ``properly_weighted = False``."""
+    """The component. Skips the test if the component declares ``properly_weighted = False``."""
     if not component.properly_weighted:
         raise SkipTest("the component declares properly_weighted = False")
     return component
@@ -184,7 +184,7 @@ def skip_unless_properly_weighted(component: Any) -> Any:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The outcome of one property."""
+    """The result of the test of one property."""
 
     name: str  #: name of the test without ``test_``
     statement: str  #: the property: the first line of the docstring of the test
@@ -229,13 +229,13 @@ def check_properties(
 
 
 def _test_names(tests: type) -> list[str]:
-    """The test methods: those of the base classes first."""
+    """The names of the test methods, those of base classes first."""
     names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
     return list(dict.fromkeys(names))
 
 
 def _outcome(test: Callable[[], None]) -> tuple[str | None, str | None]:
-    """Failure and reason of a skip of a test."""
+    """Failure message of a test, and the reason if the test was skipped."""
     try:
         test()
     except SkipTest as reason:
@@ -265,7 +265,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def skips_errors() -> Iterator[None]:
-    """Skip a general test if the component raises an exception, since the tests of its interface report it."""
+    """Skip a general test if the component raises an exception; the tests of its interface report the exception."""
     try:
         yield
     except Exception as error:
@@ -273,7 +273,7 @@ def skips_errors() -> Iterator[None]:
 
 
 def _description(inputs: dict[str, Any]) -> str:
-    """The sizes of populations, and arguments that are None or numbers: "6 particles, observation=None"."""
+    """Sizes of populations, and arguments that are None or integers, as in "6 particles, observation=None"."""
     sizes = [f"{len(value)} {name} particles" for name, value in inputs.items() if isinstance(value, Population)]
     values = [f"{name}={value}" for name, value in inputs.items() if value is None or isinstance(value, int)]
     return ", ".join(sizes + values).replace("population ", "")
@@ -289,7 +289,7 @@ def close(a: Any, b: Any) -> bool:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two values are equal: arrays bit by bit, dataclasses by field; True without an equality."""
+    """Whether two values are equal: arrays bit by bit, dataclasses by field. True for types without ``==``."""
     if a is b:
         return True
     if type(a) is not type(b):
@@ -308,7 +308,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """A population, or a mapping that holds some, as lists of particles, log weights and parents."""
+    """Convert a population, or populations in a mapping, to lists of particles, log weights and parents."""
     if isinstance(value, Population):
         return [value.realised().particles, value.log_weights, dict(value.parents)]
     if isinstance(value, dict):

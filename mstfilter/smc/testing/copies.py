@@ -1,8 +1,8 @@
-"""Weight of particles after a resampling: test cases, their statistics, and likely faults.
+"""Tests of the weight of particles after a resampling: cases, statistics, and messages.
 
-A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many calls, the weight
-that each particle and each group of particles carries, in units of the total weight. `fault_message` compares the
-mean with the expected weights.
+A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many resamplings, the
+share of the weight that the copies of each particle and of each group have. `fault_message` compares the mean with
+the expected weight.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mstfilter.smc.testing.contract import FALSE_ALARM
 
 @dataclass(frozen=True)
 class Case:
-    """Weights, number of particles to select, and first number of calls."""
+    """Weights, number of particles to select, and initial number of calls."""
 
     weights: tuple[float, ...]
     n: int
@@ -27,10 +27,10 @@ class Case:
 
 
 def _mixed(m: int, heavy: float) -> tuple[float, ...]:
-    """(m,) weights: one heavy weight, zeros, ties and light weights, with more mass in the second half.
+    """(m,) weights: one heavy weight, zeros, ties and light weights. The second half has more weight.
 
-    The first weight of the second half is the fraction `heavy` of the total. An eighth of the others is zero, and a
-    quarter is at most 5e-4 of the heaviest weight.
+    The first weight of the second half is the fraction `heavy` of the total. An eighth of the other weights is zero,
+    and a quarter is at most 5e-4 of the heaviest weight.
     """
     kind = np.arange(m) % 8
     weights = np.select(
@@ -81,13 +81,13 @@ _STAKES = 0.9 * 0.5 ** np.arange(10)
 
 
 class Sample:
-    """The weight that particles and groups of particles of a case carry, over many calls.
+    """The weight of the copies of particles and of groups of particles in many resamplings of a case.
 
     Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
     betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
-    mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, its largest value
-    over any number of calls exceeds 1 / p with probability at most p. This needs no normal approximation and no
-    variance. So a scheme that gives very many copies in rare calls passes. Calls may be added if the result is not
+    mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, the largest product
+    over any number of calls exceeds 1 / p with probability at most p. The test assumes no normal distribution, so an
+    unbiased scheme passes even if it makes very many copies in rare calls. Calls may be added if the result is not
     clear.
     """
 
@@ -98,27 +98,27 @@ class Sample:
         self._most = 1.0  # largest total weight of a call
 
     def add(self, ancestors: np.ndarray, weights: np.ndarray) -> None:
-        """Add a call with its ancestors and its output weights in units of the old mean."""
+        """Add the ancestors of a call, and the output weights in units of the mean input weight."""
         self._rows.append(np.bincount(ancestors, weights, minlength=len(self.case.weights)) / len(weights))
         self.calls += 1
         self._most = max(self._most, float(weights.mean()))
 
     @property
     def carried(self) -> np.ndarray:
-        """(calls, m + k) fraction of the weight that each particle and each of k groups carries."""
+        """(calls, m + k) fraction of the total weight for the copies of each particle and each of k groups."""
         rows = np.array(self._rows)
         return np.concatenate([rows, rows @ groups_of(self.case).T], axis=1)
 
     @property
     def largest(self) -> float:
-        """Largest weight that a call can carry: 1, or four times the largest observed if the total is not kept."""
+        """Upper bound of a fraction: 1, or four times the largest total weight if the total is not constant."""
         return 1.0 if self._most <= 1 + 1e-9 else 4 * self._most
 
     def evidence(self) -> np.ndarray:
-        """(m + k,) log evidence against the expectation of each particle and group.
+        """(m + k,) log evidence against the expected weight of each particle and group.
 
-        It exceeds log(2 / p) with probability at most p. The result is 0 if the mean is less than four standard
-        errors away. 16 copies are added to all calls, for particles that are rarely selected.
+        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is within four standard
+        errors of the expectation. For particles that are rarely selected, the limit is 16 copies larger.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
@@ -136,13 +136,13 @@ class Sample:
 
 
 def quantile(n_tails: int) -> float:
-    """z of a normal variable that exceeds it with probability FALSE_ALARM / n_tails."""
+    """The value z that a normal variable exceeds with probability FALSE_ALARM / n_tails."""
     return -NormalDist().inv_cdf(FALSE_ALARM / n_tails)
 
 
 @lru_cache(maxsize=64)
 def groups_of(case: Case) -> np.ndarray:
-    """(k, m) masks as floats: all particles, the first half, the light ones, and those of each common weight."""
+    """(k, m) masks of groups: all particles, the first half, light particles, and particles of each common weight."""
     w = np.asarray(case.weights)
     values, counts = np.unique(w, return_counts=True)
     masks = [np.ones(len(w), bool), np.arange(len(w)) < len(w) // 2, (w > 0) & (w < 1e-3 * w.max())]
@@ -150,7 +150,7 @@ def groups_of(case: Case) -> np.ndarray:
 
 
 def fault_message(sample: Sample, column: int) -> str:
-    """How a particle or group violates its expectation."""
+    """Message: how the mean weight of a particle or group differs from the expected weight."""
     case, expected, mean = sample.case, sample.expected[column], sample.carried[:, column].mean()
     m, n = len(case.weights), case.n
     who = f"particle {column}"
@@ -169,7 +169,7 @@ def fault_message(sample: Sample, column: int) -> str:
 
 
 class ConstantGenerator(np.random.Generator):
-    """A generator whose `random` always returns one value. A scheme that does not end with it is skipped."""
+    """A generator whose `random` always returns one value. The test is skipped if the scheme does not end."""
 
     def __init__(self, value: float) -> None:
         super().__init__(np.random.PCG64(0))

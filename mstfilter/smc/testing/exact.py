@@ -1,4 +1,4 @@
-"""Comparison of weighted particles with exact draws: distributions, mean weights, and independence."""
+"""Compares weighted particles with exact draws: distributions, mean weights, and independence."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 
 
 class ExactContract(Contract):
-    """Properties of components with exact draws to compare with.
+    """Properties of components that are tested with exact draws.
 
-    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. It returns three
-    items. The first is a population of `n` particles before the call. The second is a population of exact draws, or
-    with exact weights, after the call. The third is the observation. An optional fourth item
-    ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides. It makes the weights f / q of a guided
-    move even. The test is skipped if one of 10,000 weights exceeds 1 % of the total.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. The method returns
+    a population of `n` particles before the call, a population of exact draws (or with exact weights) after the call,
+    and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the weights of both
+    populations, so that the weights f / q of a guided move vary less. The test is skipped if a weight exceeds 1 % of
+    the total.
 
-    The rows of `exact` are independent draws, or x_{t-1} lies on a grid. With 200,000 rows, the tests detect a
-    standard deviation that is wrong by 3 %, and a shift by 3 % of it. They also detect missing tails with 0.1 % of
-    the probability, and a correlation of 0.02 between particles.
+    The rows of `exact` must be independent draws, or x_{t-1} may lie on a grid. With 200,000 rows, the tests detect
+    an error of 3 % in the standard deviation, and a shift by 3 % of the standard deviation. The tests also detect
+    missing tails of probability 0.1 %, and a correlation of 0.02 between particles.
     """
 
     returns = Population
@@ -37,7 +37,7 @@ class ExactContract(Contract):
     n_draws: ClassVar[int] = 200_000  #: rows of `exact` in a test; fewer for a slow component find larger faults only
 
     def exact_case(self, seed: int, n: int) -> tuple[Any, ...]:
-        """Exact draws. Skips the test if there are none."""
+        """Exact draws. Skips the test if no `exact` is defined."""
         if self.exact is None:
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
         return self.exact(seeded(seed), n)
@@ -45,11 +45,11 @@ class ExactContract(Contract):
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
         """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.
 
-        Probabilities of intervals are compared. The sums detect columns that share a random number.
+        Distribution functions are compared at several quantiles. The sums detect columns that share a random number.
 
-        The difference of two weighted means is normal, up to errors that a twentieth of the level allows for. A tail
-        is compared if its probability is at least that of 50 of the largest weights, so that no rare weight is
-        decisive.
+        The bounds assume a normal difference of two weighted means, with a false-alarm rate 20 times smaller than
+        needed. A tail is compared only if its probability is so large that single large weights do not decide the
+        test.
         """
         samples = []
         for log_weights in (lw, exact_lw):
@@ -99,21 +99,21 @@ class ExactContract(Contract):
 
 
 def check_parents(result: Population, name: str, n: int) -> None:
-    """Assert that the parents called `name`, if there are some, are indices of `n` particles, or -1 for none."""
+    """Assert that the parents called `name`, if there are any, are indices of `n` particles, or -1 for no parent."""
     index = result.parents.get(name, np.array([-1]))
     wrong = index[(index < -1) | (index >= n)]
     assert not len(wrong), f'parents "{name}" contain {wrong[0]}, and there were {n} particles'
 
 
 def _pairs(d: int) -> list[tuple[int, int]]:
-    """At most 20 pairs of d columns, with neighbours first."""
+    """At most 20 pairs of d columns, neighbouring columns first."""
     return sorted(combinations(range(min(d, 40)), 2), key=lambda pair: pair[1] - pair[0])[:20]
 
 
 def _with_sums(
     found: np.ndarray, exact: np.ndarray, w: np.ndarray, pairs: list[tuple[int, int]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two samples with sums of pairs of columns as additional columns, each divided by its exact spread."""
+    """Add sums of pairs of columns to two samples. Each summand is divided by its exact standard deviation."""
     scale = [_sd(column, w) or 1.0 for column in exact.T]
     first, second = (
         np.column_stack([x, *(x[:, j] / scale[j] + x[:, k] / scale[k] for j, k in pairs)]) for x in (found, exact)
@@ -136,7 +136,7 @@ def _sd(x: np.ndarray, w: np.ndarray) -> float:
 
 
 def check_uncorrelated(a: np.ndarray, b: np.ndarray, n_tests: int, what: str) -> None:
-    """Check that two samples have no rank correlation; `n_tests` share the false-alarm rate."""
+    """Check that two samples have no rank correlation. The false-alarm rate is divided by `n_tests`."""
     from scipy.stats import spearmanr
 
     if np.ptp(a) > 0 and np.ptp(b) > 0:
@@ -148,7 +148,7 @@ def check_uncorrelated(a: np.ndarray, b: np.ndarray, n_tests: int, what: str) ->
 
 
 def check_same_law(found: np.ndarray, expected: np.ndarray, n_tests: int, fault: str) -> None:
-    """Check that the columns of two samples have the same distributions; `n_tests` share the false-alarm rate."""
+    """Check that columns of two samples have equal distributions. The false-alarm rate is divided by `n_tests`."""
     from scipy.stats import ks_2samp
 
     for x, y in zip(found.T, expected.T, strict=True):
@@ -158,7 +158,7 @@ def check_same_law(found: np.ndarray, expected: np.ndarray, n_tests: int, fault:
 
 
 def check_mean_weight(w: np.ndarray, v: np.ndarray) -> None:
-    """Check that two samples of weights have one mean."""
+    """Check that two samples of weights have the same mean."""
     bound = quantile(2 * 20) * np.hypot(w.std() / len(w) ** 0.5, v.std() / len(v) ** 0.5) + 1e-9
     assert abs(w.mean() - v.mean()) <= bound, (
         f"the mean weight is {w.mean():.4g}, expected {v.mean():.4g}: constant factors change the evidence"

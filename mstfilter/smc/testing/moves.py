@@ -33,11 +33,11 @@ _N = 6
 
 
 class TransitionContract(ScaleContract, ExactContract):
-    """The contract of every `Transition`. Its two statistical tests have a false-alarm rate of at most 1e-6 each.
+    """The contract of every `Transition`. The two statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    One needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}) given
-    these rows, and the observation. For a guided move it also returns log p(y_t | x_t), as a function of x_t. If the
-    transition weights by the observation, the population of x_t has these weights.
+    One test needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}),
+    and the observation. For a guided move, `exact` also returns the function log p(y_t | x_t) of x_t. If the
+    transition weights by the observation, the draws of x_t must have the exact weights.
     """
 
     columns = "(x_t, x_t - x_{t-1})"
@@ -62,7 +62,7 @@ class TransitionContract(ScaleContract, ExactContract):
 
     @statistical
     def test_weighted_moves_are_those_of_the_model(self) -> None:
-        """Weighted moves have the distribution of the model, also jointly with x_{t-1}, and keep the total weight."""
+        """Weighted pairs (x_{t-1}, x_t) have the distribution of the model, and the mean weight is exact."""
         component = skip_unless_properly_weighted(self.make())
 
         def moved(n: int, missing: bool = False) -> tuple[Population, Population]:
@@ -86,7 +86,7 @@ class TransitionContract(ScaleContract, ExactContract):
     def _compare_moves(
         self, before: Population, after: Population, other: Population, fresh: Population, likelihood: list[Any]
     ) -> None:
-        """Compare moves and the change of their weights with exact ones; `likelihood` weights both."""
+        """Compare moves and weight changes with exact moves. `likelihood` weights the found and the exact moves."""
         lw, exact_lw = (
             new.log_weights - old.log_weights + sum(log_g(new.particles) for log_g in likelihood)
             for old, new in ((before, after), (other, fresh))
@@ -96,7 +96,7 @@ class TransitionContract(ScaleContract, ExactContract):
 
     @statistical
     def test_order_of_particles_is_irrelevant(self) -> None:
-        """Particles move independently, whatever their positions."""
+        """Particles move independently, and the order of the particles has no effect."""
         component, inputs = self.make(), self.inputs(_N)
         population = inputs["population"]
         if not isinstance(population.particles, (np.ndarray, dict)):
@@ -117,7 +117,7 @@ class TransitionContract(ScaleContract, ExactContract):
     def _moves(self, component: Any, inputs: dict[str, Any], seed: int = 0) -> np.ndarray:
         """(300, n, d + 1) results of 300 calls: coordinates, and the change of the log weight.
 
-        The results are rounded, since the order of a sum changes its last bits.
+        The results are rounded, because the order of summation changes the last bits.
         """
         given, moves = inputs["population"], []
         for k in range(300):
@@ -127,10 +127,10 @@ class TransitionContract(ScaleContract, ExactContract):
 
 
 class DensityTransitionContract(TransitionContract):
-    """The contract of every `DensityTransition`: that of a `Transition`, and properties of `log_prob`."""
+    """The contract of every `DensityTransition` adds properties of `log_prob` to `TransitionContract`."""
 
     def test_log_prob_is_of_each_move(self) -> None:
-        """`log_prob` gives one finite number for each move that `predict` makes, whatever the others are."""
+        """`log_prob` gives one finite number for each move of `predict`, independently of the other moves."""
         component, rows = self.make(), np.array([4, 0, 3])
         for n in (1, _N):
             inputs = self.inputs(n)
@@ -144,11 +144,11 @@ class DensityTransitionContract(TransitionContract):
 
     @statistical
     def test_log_prob_is_the_density_of_its_moves(self) -> None:
-        """Moves have the distribution of `log_prob`, up to a constant factor of the density.
+        """The moves of `predict` have the density of `log_prob`, up to a constant factor.
 
-        Suppose that a move from a and a move from b are equally likely. Then p = f(x' | a) / (f(x' | a) + f(x' | b))
-        is the probability that the move is from a. For p of the true origin, (1 - p) log(p / (1 - p)) has mean 0.
-        Pairs are particles some positions apart in the order of their first coordinate.
+        Let x' be a move from particle a or b, with probability 1/2 each. Then p = f(x' | a) / (f(x' | a) + f(x' | b))
+        is the probability of a given x'. If p is the probability of the true origin, (1 - p) log(p / (1 - p)) has
+        mean 0. The test pairs particles a number of positions apart in the order of the first coordinate.
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
@@ -178,11 +178,11 @@ class DensityTransitionContract(TransitionContract):
 
 
 class ProposalContract(ExactContract):
-    """The contract of every `Proposal`. Its one statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Proposal`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of the weighted
-    particles, and the observation. For the initial proposal these are draws of p(x_0). An optional third item
-    ``log_likelihood(particles) -> (n,)`` multiplies the weights on both sides, which makes them even.
+    The statistical test needs a method ``exact(self, rng, n)`` that returns n exact draws from the distribution of
+    the weighted particles, and the observation. For an initial proposal the exact draws are from p(x_0). An optional
+    third item ``log_likelihood(particles) -> (n,)`` multiplies all weights, so that the weights vary less.
     """
 
     def inputs(self, n: int, seed: int = 0) -> dict[str, Any]:
@@ -200,7 +200,7 @@ class ProposalContract(ExactContract):
 
     @statistical
     def test_draws_have_their_distribution(self) -> None:
-        """Weighted draws have the exact distribution and mean weight, and n of them are worth n independent ones."""
+        """Weighted draws have the exact distribution and mean weight, and vary as independent draws."""
         component = self.make()
 
         def sampled(n: int, seed: int = 2) -> Population:
@@ -225,12 +225,12 @@ class ProposalContract(ExactContract):
 
 
 class UpdateContract(ScaleContract, ExactContract):
-    """The contract of every `Update`. Its one statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Update`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), exact draws of p(x |
-    y) or the predicted particles with exact weights p(y | x), and y. Exact weights are compared one by one, with
-    their constant factor, which is part of the evidence. For exact draws the factor is arbitrary, unless a fourth
-    item of `exact` is the number log p(y).
+    The statistical test needs a method ``exact(self, rng, n)`` that returns n predicted particles x ~ p(x), a second
+    population, and y. The second population holds exact draws of p(x | y), or the predicted particles with exact
+    weights p(y | x). Exact weights are compared one by one, including a constant factor. For exact draws, the
+    evidence is tested only if a fourth item of `exact` is log p(y).
     """
 
     weighted = "predicted"
@@ -246,7 +246,7 @@ class UpdateContract(ScaleContract, ExactContract):
         return component.update(rng, **inputs)
 
     def variants(self) -> list[dict[str, Any]]:
-        """Predicted particles, proposed ones, or both."""
+        """Inputs with predicted particles, with proposed particles, and with both."""
         return [{**self.inputs(_N), **absent} for absent in ({"proposed": None}, {"predicted": None}, {})]
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
@@ -255,7 +255,7 @@ class UpdateContract(ScaleContract, ExactContract):
                 check_parents(result, name, len(given))
 
     def test_parents_belong_to_their_particles(self) -> None:
-        """A predicted particle that it keeps has that particle as parent "previous"."""
+        """A particle that equals a predicted particle has the index of that particle as parent "previous"."""
         inputs = {**self.inputs(_N), "proposed": None}
         out = self.checked_call(self.make(), inputs).realised()
         index = out.parents.get("previous", np.arange(len(out)))
@@ -314,11 +314,10 @@ class UpdateContract(ScaleContract, ExactContract):
 
 
 class RejuvenationContract(ExactContract):
-    """The contract of every `Rejuvenation`. The only statistical test has a false-alarm rate of at most 1e-6.
+    """The contract of every `Rejuvenation`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    That test needs exact draws of p(x_t | x_{t-1}, y_t). Define a method ``exact(self, rng, n)`` that returns a
-    population of `n` rows x_{t-1} (None: the first step), a population of draws x_t given these rows and y_t, and
-    y_t.
+    The statistical test needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1} (None at the first step),
+    exact draws of x_t given x_{t-1} and y_t, and y_t.
     """
 
     columns = "(x_t, x_t - x_{t-1})"
@@ -342,7 +341,7 @@ class RejuvenationContract(ExactContract):
 
     @statistical
     def test_keeps_the_distribution(self) -> None:
-        """It leaves p(x_t | x_{t-1}, y_t) unchanged, and moves particles independently."""
+        """Moves leave p(x_t | x_{t-1}, y_t) invariant, and particles move independently."""
         component = skip_unless_properly_weighted(self.make())
 
         def moved(n: int) -> np.ndarray:
@@ -365,7 +364,7 @@ class RejuvenationContract(ExactContract):
 
 
 def _columns(previous: Population | None, population: Population) -> np.ndarray:
-    """x_t, and x_t - x_{t-1} if both have as many columns."""
+    """Columns x_t, and x_t - x_{t-1} if x_t and x_{t-1} have the same shape."""
     x = as_matrix(population.particles)
     if previous is None:
         return x

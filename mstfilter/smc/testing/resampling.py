@@ -1,8 +1,8 @@
 """Contracts of resamplers.
 
-A resampler must be properly weighted. A particle of normalised weight W_i gets n W_i copies on average, or copies
-that together carry W_i if their weights differ. `mstfilter.smc.testing.copies` lists the weights and numbers of
-particles of the tests: n = m, n < m and n > m, ties, zeros, heavy and light weights.
+A properly weighted resampler makes n W_i copies on average of a particle of normalised weight W_i. If output weights
+differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test cases: n =
+m, fewer and more particles, ties, zeros, heavy and light weights.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 
 
 class ResamplerContract(ScaleContract):
-    """The contract of every `Resampler`. Its statistical tests have a false-alarm rate of at most 1e-6 each.
+    """The contract of every `Resampler`. The statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    The particles of the example must differ. The tests detect a deviation of a mean of about six standard errors in
-    the calls of a `Case`, and at least 0.3 % of the particle's weight.
+    The particles of `example` must differ. The tests detect a deviation of a mean of about six standard errors in the
+    calls of a `Case`, and at least 0.3 % of the particle's weight.
     """
 
     returns = Population
@@ -43,7 +43,7 @@ class ResamplerContract(ScaleContract):
     )
 
     def population(self, weights: Any) -> Population:
-        """The particles of the example with given weights, and with parents that identify them."""
+        """The particles of `example` with the given weights. The parents identify the particles."""
         n = len(weights)
         particles = self.example(seeded(0), n)[0].realised().particles
         index = np.arange(n)
@@ -55,7 +55,7 @@ class ResamplerContract(ScaleContract):
         return {"population": self.population(np.linspace(1, 2 + seed, 40)), "n": 25}
 
     def variants(self) -> list[dict[str, Any]]:
-        """More particles than are selected, as many, and fewer; also weights of zero."""
+        """Inputs with m > n, m = n and m < n particles, and with weights of zero."""
         cases = [(np.linspace(1, 2, m), n) for m, n in ((40, 25), (20, 20), (30, 80), (1, 3), (2, 1))]
         cases.append((np.array(_ZEROS[0]), 5))
         return [{"population": self.population(weights), "n": n} for weights, n in cases]
@@ -76,7 +76,7 @@ class ResamplerContract(ScaleContract):
         return self.checked_call(component, {"population": population, "n": n}, rng)
 
     def test_zero_weights_are_never_chosen(self) -> None:
-        """A particle of weight zero is never selected, also by the uniform numbers 0 and 1 - 2^-53."""
+        """A particle of weight zero is never selected, even if all uniform numbers are 0 or 1 - 2^-53."""
         component = self.make()
         for when, rng, n in _typical_and_extreme():
             for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
@@ -88,7 +88,7 @@ class ResamplerContract(ScaleContract):
                 )
 
     def test_keeps_parents(self) -> None:
-        """Selected particles are those of the ancestors and keep their parents."""
+        """The selected particles equal the particles at the ancestors, and keep their parents."""
         component = self.make()
         for n in (1, 4, 5, 12):
             population = self.population((1.0, 2.0, 1.5, 0.5, 2.0))
@@ -104,16 +104,16 @@ class ResamplerContract(ScaleContract):
 
     @statistical
     def test_carried_weight(self) -> None:
-        """A particle gets n W_i copies on average, or copies that carry W_i if their weights differ."""
+        """A particle gets n W_i copies on average, or copies of total weight W_i if output weights differ."""
         component = skip_unless_properly_weighted(self.make())
         for seed, case in enumerate(self.cases):
             sample = self._carried(component, case, seed)
             assert self._excess(sample) <= 0, fault_message(sample, int(np.argmax(sample.evidence())))
 
     def _carried(self, component: Resampler, case: Case, seed: int) -> Sample:
-        """What each particle and each group carries in many calls.
+        """The weight of the copies of each particle and each group in many calls.
 
-        Calls are added while a mean is suspicious and the evidence is not sufficient.
+        Calls are added while a mean deviates but the evidence is not sufficient.
         """
         given = self.population(case.weights)
         population = Population(given.particles, given.log_weights + 3.0)  # faster without parents
@@ -128,13 +128,13 @@ class ResamplerContract(ScaleContract):
             calls *= 2
 
     def _excess(self, sample: Sample) -> float:
-        """Largest log evidence against a mean, minus its bound for one of all cases at level `FALSE_ALARM`."""
+        """Largest log evidence against a mean, minus the bound at level `FALSE_ALARM` for all cases together."""
         evidence = sample.evidence()
         return float(evidence.max() - np.log(2 * len(evidence) * len(self.cases) / FALSE_ALARM))
 
 
 def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
-    """Description of the generator, the generator, and a number of particles to select."""
+    """For each test: description of the generator, the generator, and the number of particles to select."""
     for seed in range(60):
         yield f"the generator has seed {seed}", seeded(seed), (1, 4, 5, 11)[seed % 4]
     for value in (0.0, 1 - 2.0**-53):
@@ -143,13 +143,13 @@ def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
 
 
 class WeightResamplerContract(ResamplerContract):
-    """The contract of every `WeightResampler`: that of a `Resampler`, and properties of `select`."""
+    """The contract of every `WeightResampler` adds a property of `select` to `ResamplerContract`."""
 
     cases = CASES
 
     @statistical
     def test_many_particles(self) -> None:
-        """Small weights are not lost by rounding among 100 000 particles."""
+        """Small weights of 100 000 particles are not lost by rounding."""
         component = skip_unless_properly_weighted(self.make())
         few, many = self._light_copies(component, 100, 60), self._light_copies(component, 100_000, 5)
         # If all are draws of one law, the five are above, or below, all sixty with probability 1 / C(65, 5) = 1.2e-7.
@@ -159,7 +159,7 @@ class WeightResamplerContract(ResamplerContract):
         )
 
     def _light_copies(self, component: WeightResampler, n_light: int, calls: int) -> np.ndarray:
-        """Copies of all particles but the first, which has 1000 times their total weight, among 100 000 copies."""
+        """Copies of light particles among 100 000 copies. The first particle has 1000 times their total weight."""
         n, rng, copies = 100_000, seeded(n_light), []
         weights = np.append(1.0, np.full(n_light, 1e-3 / n_light))
         population = Population(np.arange(float(len(weights))), np.log(weights))

@@ -1,4 +1,4 @@
-"""Contracts without random numbers: triggers, sizes, lookaheads, similarities, equivalences and codecs."""
+"""Contracts of triggers, sizes, lookaheads, similarities, equivalences and codecs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _SELECTIONS: dict[str, tuple[np.ndarray, ...]] = {
 
 
 class RowsContract(Contract):
-    """Properties of components whose result depends on the particles, and not on their order."""
+    """Properties of components whose result depends on the particles, but not on the order of the particles."""
 
     compared: ClassVar[tuple[str, ...]] = ("in another order", "if there are copies")  #: keys of the selections
 
     def relation(self, result: Any) -> np.ndarray:
-        """What is compared of a result."""
+        """The part of a result that the tests compare."""
         return np.asarray(result)
 
     def of_rows(self, relation: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """The part of an answer (), scores (9,) or pairs (9, 9) that belongs to a selection of nine particles."""
+        """The entries `rows` of a relation of nine particles: one answer (), scores (9,) or pairs (9, 9)."""
         return relation[np.ix_(*[rows] * relation.ndim)]
 
     def test_order_of_particles_is_irrelevant(self) -> None:
-        """The result for a particle, or a pair, depends neither on the order of the particles nor on copies."""
+        """The result for a particle or pair depends neither on the order of the particles nor on copies."""
         component = self.make()
         for seed in range(3):
             inputs = self.inputs(9, seed)
@@ -92,7 +92,7 @@ class LookaheadContract(ScoreContract):
         return np.asarray(component.log_priority(inputs["population"], inputs["observation"]), dtype=np.float64)
 
     def test_ignores_weights(self) -> None:
-        """It does not depend on the weights, which the filter multiplies by the priorities."""
+        """The priorities do not depend on the weights. The filter multiplies priorities and weights."""
         component, inputs = self.make(), self.inputs(6)
         scores = self.checked_call(component, inputs)
         for log_weights in (np.linspace(0, 2, 6), np.full(6, 1000.0), np.full(6, -1000.0)):
@@ -166,7 +166,7 @@ class CodecContract(Contract):
 
     @prerequisite
     def test_decoded_particles_are_equal(self) -> None:
-        """It encodes particles as named arrays; decoded particles equal the stored ones bit by bit."""
+        """Particles are encoded as named arrays, and decoded particles equal the encoded particles bit by bit."""
         component = self.make()
         for n in (*_SIZES, 300):
             population = self.inputs(n)["population"]
