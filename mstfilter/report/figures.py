@@ -172,9 +172,9 @@ def time_figure(
 
     `values` is family -> arm -> pause -> values. There is one value for each scene and seed, or for each hypothesis.
     `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are omitted. An arm
-    has the same colour in all figures with the same `every_arm` of at most twelve arms. A box contains the middle half
-    of the values, the bar is the median, and whiskers reach the 5th and 95th percentile. Points are values, and lines
-    join the means.
+    has the same colour in all figures with the same `every_arm`, if `every_arm` has at most twelve arms. A box
+    contains the middle half of the values, the bar is the median, and whiskers reach the 5th and 95th percentile.
+    Points are values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)
@@ -272,8 +272,8 @@ def differences_figure(
 ) -> str:
     """Differences of a measure between arms and the reference, with t intervals, by family.
 
-    An entry of `differences` is (family, arm, arm minus reference). `arms` determines the colours. `side` is "left" or
-    "right": the side of zero on which the reference is better.
+    An entry of `differences` is (family, arm, arm minus reference). `arms` determines the colours. `side` is the side
+    of zero on which the reference is better, "left" or "right".
     """
     colours = _arm_colours(arms)
     rows = [(family, arm, (d.mean, d.low, d.high), colours[arm]) for family, arm, d in differences]

@@ -44,7 +44,7 @@ def write_report(
 ) -> Path:
     """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
 
-    `numbers` is the result of `read_numbers`, if already known. Returns the path of the file. Raises InputError if the
+    `numbers` is the result of `read_numbers`, if known. Returns the path of the file. Raises InputError if the
     folder is not a run folder, or the file cannot be written.
     """
     from markupsafe import Markup

@@ -61,7 +61,7 @@ def write_study_report(study: StudyFolder | str | Path, out: str | Path | None =
 
     Default: ``report.html`` in the study folder.
 
-    Returns the path of the file. Raises InputError if the folder is not a study folder, or the file cannot be written.
+    Returns the file path. Raises InputError if the folder is not a study folder, or the file cannot be written.
     """
     study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
     path = study.path / "report.html" if out is None else Path(out)

@@ -4,8 +4,8 @@
 >>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
 The two primary endpoints are means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality of the
-hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats after recalibration on
-other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the same pauses.
+hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats, after recalibration
+on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the same pauses.
 Values are averaged over filter seeds first, then over scenes. A difference is arm minus reference. The p values of
 both endpoints are adjusted together.
 """
