@@ -93,7 +93,7 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset with changes. Commas make a grid of filters."""
+    """A filter to compare: a preset with changes. Values with commas give one filter each."""
 
     preset: Texts = ("mst",)  #: names, or paths of TOML files
     set: Texts = ()  #: ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms
@@ -178,7 +178,7 @@ def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
-    """The arms of a study, with grids expanded. The `overrides` are applied to each arm; a comma makes a grid."""
+    """The arms of a study, with grids expanded. Values with commas in `overrides` give one arm each."""
     for entry in study.arms:
         yield from _expand(entry, study.folder, overrides)
 
@@ -209,7 +209,7 @@ def _stem(preset: str) -> str:
 
 
 def split_grid(text: str) -> list[str]:
-    """``"path=a,b"`` as ``["path=a", "path=b"]``. Commas inside brackets and quotes do not separate."""
+    """``"path=a,b"`` as ``["path=a", "path=b"]``. Commas inside brackets and quotes do not separate values."""
     path, equals, values = text.partition("=")
     if not equals:
         return [text]

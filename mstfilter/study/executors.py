@@ -41,8 +41,8 @@ class Executor(Bounded, ABC):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
-        Jobs start in the order of `jobs`, except that jobs of one ``share`` go to the same worker if possible. `tell`
-        is called in the calling thread. An exception in `tell` stops all jobs.
+        Jobs start in the order of `jobs`, except that jobs with the same ``share`` go to the same worker if possible.
+        `tell` is called in the calling thread. An exception in `tell` stops all jobs.
         """
 
 

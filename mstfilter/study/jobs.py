@@ -1,4 +1,4 @@
-"""The jobs of a study, which simulate a recording or run a filter on one.
+"""The jobs of a study, which simulate a recording or run a filter on a recording.
 
 >>> perform({"kind": "run", "name": "mst on demo-0", ...})
 JobOutcome(status='done')

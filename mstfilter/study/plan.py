@@ -58,7 +58,7 @@ class StudyScene:
 
 @dataclass(frozen=True)
 class StudyRun:
-    """An arm on a scene with a seed of the filter."""
+    """A run of an arm on a scene with a seed of the filter."""
 
     arm: Arm
     scene: StudyScene
@@ -67,7 +67,7 @@ class StudyRun:
 
     @property
     def name(self) -> str:
-        """Name in messages."""
+        """Name of the run in messages."""
         return f"{self.arm.name} on {self.scene.name}, seed {self.seed}"
 
     @property
@@ -89,15 +89,15 @@ class Plan:
 
     @property
     def reference(self) -> str:
-        """The arm with which the others are compared."""
+        """Name of the arm with which the other arms are compared."""
         return self.config.reference or self.arms[0].name
 
 
 def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after the changes of its entry; a comma makes a grid. Raises InputError if an
-    arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
+    `overrides` are applied to every arm after its own changes; values with commas give one arm each. Raises
+    InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()
