@@ -5,8 +5,8 @@
 >>> hypothesis.show().save("scene.html")
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
 
-Classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have the methods `plot` and `show`. The methods
-import the module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
+Classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods `plot`, `show` and `_repr_html_`,
+which import the module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
 """
 
 from __future__ import annotations

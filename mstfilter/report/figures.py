@@ -170,11 +170,11 @@ def time_figure(
 ) -> str:
     """Quality of all hypotheses, or another measure of the runs, over time, with one panel per family.
 
-    `values` is family -> arm -> pause -> values. There is one value for each scene and seed, or for each hypothesis.
-    `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are omitted. An arm
-    has the same colour in all figures with the same `every_arm`, if `every_arm` has at most twelve arms. A box
-    contains the middle half of the values, the bar is the median, and whiskers reach the 5th and 95th percentile.
-    Points are values, and lines join the means.
+    `values` is family -> arm -> pause -> values. A pause has one value for each scene and seed, or for each
+    hypothesis. `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are
+    omitted. An arm has the same colour in all figures with the same `every_arm`, if `every_arm` has at most twelve
+    arms. A box contains the middle half of the values, the bar is the median, and whiskers reach the 5th and 95th
+    percentile. Points are values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)

@@ -42,7 +42,7 @@ _MOST_BORDERS = 6  # with numbers, in the picture of a pause
 def write_report(
     run: RunFolder | str | Path, out: str | Path | None = None, numbers: RunNumbers | None = None
 ) -> Path:
-    """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
+    """Write the report of a run, finished or not, as HTML, by default to ``report.html`` in the run folder.
 
     `numbers` is the result of `read_numbers`, if known. Returns the path of the file. Raises InputError if the
     folder is not a run folder, or the file cannot be written.

@@ -59,7 +59,7 @@ _TABLES = {
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
     """Write the report of a study folder, finished or not, as HTML.
 
-    Default: ``report.html`` in the study folder.
+    The default path is ``report.html`` in the study folder.
 
     Returns the file path. Raises InputError if the folder is not a study folder, or the file cannot be written.
     """
