@@ -1,12 +1,12 @@
-"""Display of the package's objects in a notebook: facts and pictures, plots, a scene that can be rotated.
+"""Display of the package's objects in a notebook: text, pictures, plots, and a scene that can be rotated.
 
 >>> recording.plot()                        # images, depth and the time line of the pauses
 >>> hypothesis.show()                       # voxels that can be rotated with the mouse, also outside a notebook
 >>> hypothesis.show().save("scene.html")
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
 
-The classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods with these names. The methods
-import this module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
+Classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods `plot`, `show` and `_repr_html_`,
+which import the module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ class Drawing(Figure):
 
 
 def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
-    """A colour for each label, in ascending order of labels."""
+    """Colour of each label, in ascending order of labels."""
     return {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
 
 
 @matplotlib.style.context("mstfilter.report.figures")
 def plot_recording(recording: Recording) -> Drawing:
-    """Colour and depth at the pauses (at most six), and a time line of all frames with marked pauses."""
+    """Colour and depth images of at most six pauses, and a time line of all frames with marked pauses."""
     chosen = _evenly(range(len(recording.pauses)), _MOST_PICTURES)
     n = len(chosen)
     figure = Drawing(figsize=(max(4.5, 2.3 * n), 4.6), layout="constrained")
@@ -83,7 +83,7 @@ def plot_recording(recording: Recording) -> Drawing:
 
 @matplotlib.style.context("mstfilter.report.figures")
 def plot_population(population: Population) -> Drawing:
-    """Hypotheses: the six most probable with their weights. Numbers: weighted histograms of the first coordinates."""
+    """Draw the six most probable hypotheses, or for numbers, weighted histograms of the first six coordinates."""
     population = population.realised()
     if isinstance(population.best, Hypothesis):
         return _plot_hypotheses(population)
@@ -119,7 +119,7 @@ def _plot_hypotheses(population: Population) -> Drawing:
 
 
 def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
-    """Pictures of the most probable distinct hypotheses from one viewpoint, and texts with weight and objects."""
+    """Pictures of the most probable distinct hypotheses from one viewpoint, with captions."""
     particles, groups = population.particles, weigh_distinct(population.particles, population.weights.tolist())
     weights = [weight for _, weight in groups[:_MOST_PICTURES]]
     shown = [particles[members[0]] for members, _ in groups[:_MOST_PICTURES]]
@@ -131,7 +131,7 @@ def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
 
 
 def to_html(value: Any) -> str:
-    """What a notebook shows for an object of the package: its text, and pictures or a table of steps."""
+    """HTML of an object of the package for a notebook: its text, and pictures or a table of steps."""
     text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
     style = "display:inline-block;margin:4px 8px 4px 0"
     cells = [
@@ -200,5 +200,5 @@ def _(value: Belief | State) -> list[_Picture]:
 
 
 def _evenly(values: Sequence[int], n: int) -> list[int]:
-    """At most `n` of the values, evenly spaced, the first and the last among them."""
+    """At most `n` evenly spaced values, including the first and the last."""
     return [values[k] for k in np.linspace(0, len(values) - 1, min(n, len(values))).round().astype(int)]

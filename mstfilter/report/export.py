@@ -1,4 +1,4 @@
-"""Meshes of hypotheses for other programs. open3d writes them.
+"""Meshes of hypotheses for other programs, written with open3d.
 
 >>> export_mesh(hypothesis, "scene.ply")
 >>> export_mesh(hypothesis, "scene.obj", assign_identities(run).colours(t, k))      # the colours of the report
@@ -30,10 +30,10 @@ _CORNERS = {
 
 
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, which is not empty, and all other voxels.
+    """Triangles of the faces that separate the voxels of a mask (X, Y, Z) bool, not empty, from all other voxels.
 
-    Returns corners (v, 3) int in voxels from the lower corner of the grid, and triangles (f, 3) int,
-    counter-clockwise seen from outside.
+    Returns corners (v, 3) int, in voxels from the lower corner of the grid, and triangles (f, 3) int. Seen from
+    outside, the corners of a triangle are in counter-clockwise order.
     """
     padded = np.pad(mask, 1)
     quads = []
@@ -57,7 +57,7 @@ def object_mesh(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndar
 
 
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write the mesh of a hypothesis that has objects, in world metres; `path` ends in ply or obj.
+    """Write the mesh of a hypothesis with at least one object, in world metres, to a ply or obj file.
 
     The triangles are the faces of the voxels. The mesh of an object encloses exactly the volume of its voxels.
     `colours` is ``{label: (r, g, b)}``. The default is the palette in order of labels. Raises MissingLibraryError if

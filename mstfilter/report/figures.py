@@ -3,8 +3,8 @@
 >>> svg = quality_figure(times, qualities, weights, {"without past": [...]}, {"one blob": [...]})
 >>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
 
-Each function returns the text of an ``<svg>`` element. The figure uses the colours and fonts of its page, so it
-follows a light or a dark theme. The same values give the same text.
+Each function returns the text of an ``<svg>`` element. The figure uses the colours and fonts of its page, also in a
+dark theme. The same values give the same text.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _style(name: str) -> Iterator[None]:
 
 
 def _new_figure(width: float, height: float, n: int = 1, *, below: bool = False) -> tuple[Figure, list[Axes]]:
-    """A figure of a size in inches with `n` axes in a row, or `below` each other."""
+    """A figure, `width` by `height` inches, with `n` axes in a row, or in a column if `below`."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -93,7 +93,7 @@ def _svg_text(figure: Figure, title: str) -> str:
 
 
 def _merge_styles(match: re.Match[str]) -> str:
-    """Write the common style of a group's marks once, and their positions to a tenth of a point."""
+    """Write the common style of a group of marks once, and the positions of the marks to a tenth of a point."""
     styles = set(re.findall(r'style="([^"]*)"', match[2]))
     marks = re.sub(r'([xy]="-?\d+\.\d)\d+"', r'\1"', match[2])
     if len(styles) > 1 or "style=" in match[1]:
@@ -121,7 +121,7 @@ def quality_figure(
     compared: Mapping[str, Sequence[float]],
     baselines: Mapping[str, Sequence[float]],
 ) -> str:
-    """Quality of every hypothesis (points, area by weight), their mean (line), and other methods (dashed).
+    """Quality of every hypothesis (points, area by weight), mean and compared runs (lines), baselines (dashed).
 
     `times` are the pauses with ground truth. `qualities` and `weights` have one value per hypothesis for each pause.
     `compared` and `baselines` have one value per pause for each name. NaN means no value.
@@ -154,7 +154,7 @@ def _arm_colours(arms: Sequence[str]) -> dict[str, str]:
 
 
 def figure_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
-    """Arms of each figure: all in one figure up to twelve, otherwise the reference with seven others in each."""
+    """Arms of each figure: one figure for up to twelve arms, else figures of the reference and seven other arms."""
     if len(arms) <= _MOST:
         return [list(arms)]
     others, first = [arm for arm in arms if arm != reference], [reference] if reference in arms else []
@@ -170,11 +170,11 @@ def time_figure(
 ) -> str:
     """Quality of all hypotheses, or another measure of the runs, over time, with one panel per family.
 
-    `values` is family -> arm -> pause -> values. There is one value for each scene and seed, or for each hypothesis.
-    `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are omitted. An arm
-    of a study has the same colour in all figures with the same `every_arm`, for at most twelve arms. Boxes contain
-    the middle half of the values, the bar is their median, and whiskers reach the 5th and 95th percentile. Points are
-    values, and lines join the means.
+    `values` is family -> arm -> pause -> values. A pause has one value for each scene and seed, or for each
+    hypothesis. `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are
+    omitted. An arm has the same colour in all figures with the same `every_arm`, if `every_arm` has at most twelve
+    arms. A box contains the middle half of the values, the bar is the median, and whiskers reach the 5th and 95th
+    percentile. Points are values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)
@@ -247,7 +247,7 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
     tables : mapping
         Mapping from names of methods or families to their forecasts.
     arms : sequence of str
-        Determines the colours. The default is the names.
+        Names in the order of their colours. The default is the names of `tables`.
     """
     colours = _arm_colours(arms or list(tables))
     with _style("reliability"):
@@ -270,10 +270,10 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
 def differences_figure(
     differences: Sequence[tuple[str, str, Difference]], arms: Sequence[str], reference: str, measure: str, side: str
 ) -> str:
-    """Differences of arms from the reference in a measure with their t intervals, by family.
+    """Differences of a measure between arms and the reference, with t intervals, by family.
 
-    `differences` are (family, arm, arm minus reference). `arms` determines the colours. `side` states where the
-    reference is better, "left" or "right".
+    An entry of `differences` is (family, arm, arm minus reference). `arms` determines the colours. `side` is the side
+    of zero on which the reference is better, "left" or "right".
     """
     colours = _arm_colours(arms)
     rows = [(family, arm, (d.mean, d.low, d.high), colours[arm]) for family, arm, d in differences]
@@ -291,12 +291,12 @@ ForestRow = tuple[str, str, tuple[float, float, float], str]
 
 
 def forest_height(rows: Sequence[ForestRow]) -> float:
-    """Number of lines of a forest plot."""
+    """Height of a forest plot in lines of text."""
     return len(rows) + 1.8 * len({group for group, *_ in rows})
 
 
 def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
-    """Draw differences with their intervals below each other, under the names of their groups if these are given."""
+    """Draw differences with intervals below each other, under the names of the groups that have a name."""
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x")
     axes.axvline(0, color=_MUTED, lw=1.0)

@@ -6,8 +6,8 @@
 
 Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
 From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. An object without a
-known parent is matched by its overlap with the last pause. If there is a ground truth, it is matched first, and its
-labels persist. Identities are used only for colours and change no number.
+known parent is matched by its overlap with the last pause. Objects of the ground truth, if known, are matched first,
+and each label of the truth keeps its identity. Identities are used only for display and affect no score.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) ->
 
 
 class _Assignment:
-    """Identities of the pauses so far."""
+    """Identities of the objects of the pauses so far."""
 
     def __init__(self) -> None:
         self.table: dict[tuple[int, int], dict[int, int]] = {}
@@ -84,7 +84,7 @@ class _Assignment:
         parents: Sequence[int] | None,
         truth: np.ndarray | None,
     ) -> None:
-        """Add all hypotheses of a pause: the truth first, then by weight."""
+        """Add the truth of a pause, and then its hypotheses in order of weight."""
         self._before, self._now = self._now, []
         if truth is not None:
             labels = np.flatnonzero(np.bincount(truth.ravel(), minlength=1)[1:]) + 1
@@ -160,13 +160,13 @@ def order_by_weight(weights: Sequence[float]) -> list[int]:
 
 
 def names_of(indices: Sequence[int]) -> str:
-    """``#0`` or ``#0, #3`` for equal hypotheses. At most four are named."""
+    """Names of equal hypotheses, such as ``#0`` or ``#0, #3``. At most four hypotheses are named."""
     more = len(indices) - 4
     return ", ".join(f"#{k}" for k in indices[:4]) + (f" and {more} more" if more > 0 else "")
 
 
 def weigh_distinct(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[tuple[tuple[int, ...], float]]:
-    """Indices of equal hypotheses and their total weight, from heavy to light."""
+    """Indices and total weight of each group of equal hypotheses, from heavy to light."""
     groups: dict[bytes, list[int]] = {}
     for k, h in enumerate(hypotheses):
         groups.setdefault(h.key, []).append(k)

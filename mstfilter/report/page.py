@@ -1,4 +1,4 @@
-"""HTML pages: templates, and values of unknown structure as short text.
+"""HTML pages: templates, and short texts for values of unknown structure.
 
 >>> write_page(path, fill_template("study.html", filters, study=...))  # doctest: +SKIP
 >>> flatten({"sampler": {"acceptance": 0.25}, "sizes": [3, 3, 4]})
@@ -22,7 +22,7 @@ _LONGEST = 6  # lists up to this length are written in full
 
 
 def fill_template(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
-    """Text of a template of this package with the style sheet. A missing variable is an error."""
+    """Text of a filled template of this package, with the style sheet. A missing variable raises an error."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     folder = files("mstfilter.report") / "templates"
@@ -46,7 +46,7 @@ def write_page(path: Path, text: str) -> Path:
 
 
 def seconds_text(value: float) -> str:
-    """Seconds in a suitable unit."""
+    """A duration as text, in ms or s."""
     if 0 < value < 0.0005:
         return "< 1 ms"
     if value < 0.0995:
@@ -65,7 +65,7 @@ def flatten(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def short_text(value: Any) -> str:
-    """A value as short text: four digits, and long lists by their range."""
+    """A value as short text: numbers with four digits, long lists by median and range."""
     if value is None:
         return "–"
     if isinstance(value, bool):

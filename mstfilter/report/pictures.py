@@ -42,7 +42,7 @@ _RAYS = 2  # per pixel and axis of a voxel picture
 
 
 def colour(identity: int) -> Colour:
-    """Colour of an identity 0, 1, 2, ..., where the palette repeats after twenty. Negative identities are grey."""
+    """Colour of an identity 0, 1, 2, ... The palette repeats after twenty colours. Negative identities are grey."""
     return UNASSIGNED_COLOUR if identity < 0 else PALETTE[identity % len(PALETTE)]
 
 
@@ -83,7 +83,7 @@ def _label_colours(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndar
 def overlay_layer(
     labels: np.ndarray, colours: Mapping[int, Colour], *, scale: int = 1, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """The overlay of a label image without the image: translucent fill and opaque contours.
+    """Overlay of a label image for any photo: translucent fill and opaque contours.
 
     `fill` is the opacity inside, and `line` is the width of the contour in pixels of the result. The result is (scale
     H, scale W, 4) uint8, RGBA, not premultiplied. Label 0 is transparent.
@@ -105,7 +105,7 @@ def overlay_layer(
 
 
 def shade_layer(shares: np.ndarray, colour: Colour) -> np.ndarray:
-    """A colour with the opacity of shares (H, W) between 0 and 1, as (H, W, 4) uint8, not premultiplied."""
+    """A layer of one colour with opacity `shares` (H, W) in [0, 1], as (H, W, 4) uint8, not premultiplied."""
     opacity = np.rint(255 * shares[..., None])
     return np.concatenate([np.broadcast_to(colour, (*shares.shape, 3)) * (opacity > 0), opacity], -1).astype(np.uint8)
 
@@ -125,7 +125,7 @@ def overlay(
 
 
 def _occupied_points(volumes: Iterable[_Volume]) -> tuple[np.ndarray, VoxelGrid]:
-    """Centres (n, 3) of all occupied voxels in a volume, and the last grid."""
+    """Centres (n, 3) of the voxels that are occupied in any of the volumes, and the grid of the last volume."""
     occupied: dict[bytes, tuple[np.ndarray, VoxelGrid]] = {}
     for item in volumes:
         labels, grid = (item.labels, item.grid) if isinstance(item, Hypothesis) else item
@@ -160,7 +160,7 @@ def viewpoint(
     """A camera that looks down obliquely at the occupied voxels of all volumes and shows all of them.
 
     A volume is a hypothesis or (labels, grid). If no voxel is occupied, the view shows the middle of the workspace.
-    If `camera` is given, the view is from its side, turned by 35 degrees.
+    If `camera` is given, the view has the azimuth of `camera`, turned by 35 degrees.
     """
     points, grid = _occupied_points(volumes)
     if len(points) == 0:
@@ -217,7 +217,7 @@ def voxel_picture(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Ma
 
 
 def _view_axes(camera: Camera) -> np.ndarray:
-    """Rows: right, horizontal direction towards the eye, up."""
+    """Axes of the view as rows: right, horizontally towards the camera, up."""
     R = camera.pose.rotation.as_matrix()
     right = R[:, 0] * np.array([1, 1, 0])
     right /= np.linalg.norm(right)
@@ -226,7 +226,7 @@ def _view_axes(camera: Camera) -> np.ndarray:
 
 
 def _normals(points: np.ndarray, rays: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Signed axis (+-1, +-2, +-3) of the face that each ray hits, the axis with the nearest lattice plane."""
+    """Signed axis (+-1, +-2, +-3) of the face that each ray hits: the axis of the nearest plane between voxels."""
     u = (points - grid.origin) / grid.voxel_size
     axis = np.abs(u - np.rint(u)).argmin(axis=1)
     return np.where(rays[np.arange(len(rays)), axis] > 0, -1, 1) * (axis + 1)

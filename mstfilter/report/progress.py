@@ -3,7 +3,7 @@
 >>> with progress_bar("filter") as advance:
 ...     advance(3, 15)
 
-`ParticleFilter.run`, `run_many`, `filter_recording` and `run_study` show them with ``progress=True``.
+`ParticleFilter.run`, `run_many`, `filter_recording` and `run_study` show progress bars with ``progress=True``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _bars() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
-    """A progress bar. Yields ``advance(done, total)``, where `total` is None if it is unknown."""
+    """A progress bar. Yields ``advance(done, total)``, where an unknown `total` is None."""
     with _bars() as bars:
         task = bars.add_task(what, total=None)
 
@@ -49,7 +49,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Bars of the parts of a study; yields the function for its progress. Failures are printed above the bars."""
+    """Bars of the parts of a study; yields a function of `StudyProgress`. Failures are printed above the bars."""
     tasks: dict[str, Any] = {}
     with _bars() as bars:
 

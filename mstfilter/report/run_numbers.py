@@ -1,4 +1,4 @@
-"""The numbers of a run: for its report and the command line.
+"""Numbers of a run, for the report and the command line.
 
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
 >>> numbers.value_of_the_past, numbers.steps[-1].mean
@@ -97,7 +97,7 @@ class PauseNumbers:
 
     @property
     def mean(self) -> float | None:
-        """Mean quality over the hypotheses, each counted once; None without ground truth."""
+        """Unweighted mean quality of the hypotheses; None without ground truth."""
         return None if self.quality is None else float(np.mean(self.quality))
 
     @property
@@ -106,11 +106,11 @@ class PauseNumbers:
         return None if self.quality is None else max(self.quality)
 
     def parents(self, kind: str) -> list[int] | None:
-        """``"previous"`` or ``"proposed"`` parents; None if they were not recorded."""
+        """Parents of a `kind`, ``"previous"`` or ``"proposed"``; None if the run has not recorded parents."""
         return self.info["parents"].get(kind)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
-        """Notes of a component, without those that it only passed on from an earlier component."""
+        """Notes of a component, without notes that an earlier component has with the same value."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
         earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
         return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
@@ -157,7 +157,7 @@ class RunNumbers:
 
     @property
     def value_of_the_past(self) -> list[str]:
-        """The gain of the filter over the latest image alone, in a sentence; empty without such a run or truth."""
+        """A sentence that compares the filter with the latest image alone; empty if a score of either is unknown."""
         name = "single frame"
         known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
         if not known:
@@ -177,7 +177,7 @@ class RunNumbers:
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
-    """The numerical results of a run folder. Without `beliefs`, log losses are omitted, which take the most time."""
+    """The numerical results of a run folder. Without `beliefs` the log losses, which are slow, are omitted."""
     description = run.description
     times = description["recording"]["times"]
     steps = []

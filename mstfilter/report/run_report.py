@@ -42,9 +42,9 @@ _MOST_BORDERS = 6  # with numbers, in the picture of a pause
 def write_report(
     run: RunFolder | str | Path, out: str | Path | None = None, numbers: RunNumbers | None = None
 ) -> Path:
-    """Write the report of a run, finished or not, as HTML. Default: ``report.html`` in the run folder.
+    """Write the report of a run, finished or not, as HTML, by default to ``report.html`` in the run folder.
 
-    `numbers` are those of `read_numbers`, if they are already known. Returns the file. Raises InputError if the
+    `numbers` is the result of `read_numbers`, if known. Returns the path of the file. Raises InputError if the
     folder is not a run folder, or the file cannot be written.
     """
     from markupsafe import Markup
@@ -70,7 +70,7 @@ def write_report(
 
 
 def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
-    """Image and cards of each pause."""
+    """Image and hypotheses of each pause, for the template."""
     scenes = scenes_of_run(run) if numbers.steps else []
     volumes = [view.hypothesis for scene in scenes for view in scene.views]
     view = viewpoint(volumes, run.camera(0)) if scenes else None
@@ -113,7 +113,7 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
 
 
 def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
-    """Where the hypotheses of a pause disagree in the image, for the template. None if they agree everywhere."""
+    """Overlay of the disagreement of the hypotheses of a pause, for the template. None if all hypotheses agree."""
     disagreement = belief.disagreement(camera)
     if not disagreement.any():
         return None
@@ -127,7 +127,7 @@ def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
-    """Numbers at the widest place (in pixels) of each object that is large enough in the image, large ones first."""
+    """Number and widest place, in pixels, of each object that is large enough in the image; large objects first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
     min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
@@ -147,7 +147,7 @@ def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str
 
 
 def _figures(numbers: RunNumbers) -> dict[str, Any]:
-    """Inline SVG by name."""
+    """Inline SVG of each figure, by name."""
     from markupsafe import Markup
 
     steps = numbers.steps
@@ -165,7 +165,7 @@ def _figures(numbers: RunNumbers) -> dict[str, Any]:
 
 
 def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """Values by name, NaN where a row has none."""
+    """Values of all rows by name; NaN if a row lacks the name."""
     return {name: [row.get(name, np.nan) for row in rows] for name in dict.fromkeys(n for row in rows for n in row)}
 
 

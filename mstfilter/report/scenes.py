@@ -1,4 +1,4 @@
-"""What is shown at the pauses of a run or a recording: for the report and the page that can be rotated.
+"""Content of the pauses of a run or a recording, for the report and for pages that can be rotated.
 
 >>> scenes = scenes_of_run(RunFolder.open("runs/demo"))
 >>> view = scenes[-1].views[0]                        # the most probable hypothesis of the last pause
@@ -98,7 +98,7 @@ def scenes_of_run(run: RunFolder) -> list[ShownPause]:
 
 
 def scenes_of_recording(recording: Recording) -> list[ShownPause]:
-    """The pauses of a recording with the truth, or else with the surface that the camera sees."""
+    """The pauses of a recording, with the truth or, without truth, with the surface that the camera sees."""
     scenes = []
     for t, clip in enumerate(recording.clips()):
         truth, frame = recording.truth(t), clip.after
@@ -112,7 +112,7 @@ def scenes_of_recording(recording: Recording) -> list[ShownPause]:
 
 
 def _surface(frame: Frame, grid: VoxelGrid) -> ShownHypothesis:
-    """Voxels that contain a measured point, in the colour of this point, rounded to six levels per channel."""
+    """Voxels that contain a measured point, in the colour of the point, rounded to six levels per channel."""
     points, rgb = frame.points[frame.valid], frame.rgb[frame.valid]
     index = grid.index_of(points)
     inside = grid.contains(index)

@@ -2,7 +2,7 @@
 
 >>> write_study_report("studies/first")                     # studies/first/report.html
 
-The report is made from the folder of a finished or an unfinished study, and runs no user code. Conclusions are
+The report is made from the folder of a finished or an unfinished study, and loads no user code. Conclusions are
 sentences that state no more than the intervals show.
 """
 
@@ -59,9 +59,9 @@ _TABLES = {
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
     """Write the report of a study folder, finished or not, as HTML.
 
-    Default: ``report.html`` in the study folder.
+    The default path is ``report.html`` in the study folder.
 
-    Returns the file. Raises InputError if the folder is not a study folder, or the file cannot be written.
+    Returns the file path. Raises InputError if the folder is not a study folder, or the file cannot be written.
     """
     study = StudyFolder.open(study.path if isinstance(study, StudyFolder) else study)
     path = study.path / "report.html" if out is None else Path(out)
@@ -128,19 +128,19 @@ def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
 
 
 def _number(value: float | None, sign: str = "") -> str:
-    """Three digits; a dash for an unknown value."""
+    """A number with three decimals; a dash for an unknown value."""
     return "–" if value is None or value != value else f"{value:{sign}.3f}"
 
 
 def _range(ends: tuple[float, float], sign: str = "") -> str:
-    """An interval; a dash for an unknown one."""
+    """An interval as text; a dash for an unknown interval."""
     return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
 
 
 def _drawn(
     records: Sequence[Mapping[str, Any]], summary: Summary, reported_only: Sequence[str]
 ) -> dict[str, list[Any]]:
-    """Inline SVG by section of the page."""
+    """Inline SVG figures by section of the page."""
     from markupsafe import Markup
 
     drawn: dict[str, list[Any]] = defaultdict(list)

@@ -1,4 +1,4 @@
-"""Scenes in three dimensions: pages that any browser opens.
+"""Pages with scenes in three dimensions, for any browser.
 
 >>> run_page("runs/demo").save("run.html")             # one file: time line, image, voxels, weights, genealogy, truth
 >>> recording_page(recording).save("recording.html")   # images and truth, or the surface that the camera sees
@@ -40,7 +40,7 @@ class ScenePage:
         return self.frame(460)
 
     def frame(self, height: int) -> str:
-        """The page as a frame of another page, `height` pixels high, whose script cannot access the other page."""
+        """The page as a frame in another page, `height` pixels high. Scripts cannot access the other page."""
         style = f'width="100%" height="{height}" style="border:0" sandbox="allow-scripts"'
         return f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.text)}" {style}></iframe>'
 
@@ -60,7 +60,7 @@ def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
 
 
 def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
-    """All pauses of a run as a page; without `photos` only voxels, without `head` no title."""
+    """All pauses of a run as a page. `photos` adds the images to the voxels, and `head` adds the title."""
     run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
     description = run.description
     title = str(description["recording"]["name"])
@@ -100,7 +100,7 @@ def _page(
 
 
 def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
-    """A pause for the script of the page. Labels are runs (label, length) of the occupied box, with 16 bits each."""
+    """Data of a pause for the script of the page. The labels in the occupied box are encoded by `encode_runs`."""
     views = []
     for view in scene.views:
         hypothesis = view.hypothesis

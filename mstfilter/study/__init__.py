@@ -5,8 +5,8 @@
 >>> result = run_study(study, Path("studies/main"), Local(workers=2))
 >>> result.folder.summary().compared()[0].words
 
-`run_study` plans the runs (every arm on every scene with every seed). An executor (`Local`, or one of the user) makes
-the runs that are missing. Then `run_study` writes the tables of the study folder. Each run is a
+`run_study` plans the runs (every arm on every scene with every seed). An executor (`Local`, or an executor of the
+user) makes the missing runs. Then `run_study` writes the tables of the study folder. Each run is a
 `mstfilter.runs.RunFolder`.
 """
 

@@ -42,7 +42,7 @@ from mstfilter.reading import read_toml
 
 
 def _seeds(value: Any) -> Any:
-    """``"0-4, 7"``, one number or a list of numbers as a tuple of numbers."""
+    """A tuple of seeds from a text such as ``"0-4, 7"``, a number or a list of numbers."""
     if isinstance(value, int) and not isinstance(value, bool):
         return (value,)
     if not isinstance(value, str):
@@ -57,7 +57,7 @@ def _seeds(value: Any) -> Any:
 
 
 def _texts(value: Any) -> Any:
-    """A single text as a list."""
+    """A single text as a tuple of one text."""
     return (value,) if isinstance(value, str) else value
 
 
@@ -93,7 +93,7 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset and changes to it; commas make a grid."""
+    """A filter to compare: a preset with changes. Values with commas give one filter each."""
 
     preset: Texts = ("mst",)  #: names, or paths of TOML files
     set: Texts = ()  #: ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms
@@ -166,7 +166,7 @@ class ArmRequest:
     reported_only: bool  #: reported, but not part of the comparisons
 
     def config(self) -> dict[str, Any]:
-        """The configuration of this arm of the study. Unknown names of components raise InputError."""
+        """The configuration of the arm. Unknown names of components raise InputError."""
         return load_config(self.preset, self.overrides)
 
 
@@ -178,7 +178,7 @@ def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
-    """The arms of a study, with grids expanded. The `overrides` are applied to each; commas make a grid."""
+    """The arms of a study, with grids expanded. Values with commas in `overrides` give one arm each."""
     for entry in study.arms:
         yield from _expand(entry, study.folder, overrides)
 
@@ -200,7 +200,7 @@ def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator
 
 
 def _preset_path(folder: Path, name: str) -> str:
-    """The file of a preset in the study's folder if there is one, or else the name."""
+    """The path of a preset file in the study's folder if the file exists, or else the name."""
     return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
 
 
@@ -209,7 +209,7 @@ def _stem(preset: str) -> str:
 
 
 def split_grid(text: str) -> list[str]:
-    """``"path=a,b"`` as ``["path=a", "path=b"]``. Commas inside brackets and quotes do not separate."""
+    """``"path=a,b"`` as ``["path=a", "path=b"]``. Commas inside brackets and quotes do not separate values."""
     path, equals, values = text.partition("=")
     if not equals:
         return [text]

@@ -1,4 +1,4 @@
-"""Executors run the jobs of a study: `Local` in processes of this machine. For a cluster, write an `Executor`.
+"""Executors of the jobs of a study. `Local` uses processes of this machine. For a cluster, write an `Executor`.
 
 >>> outcomes = Local(workers=2).run(jobs, tell=print)
 
@@ -41,8 +41,8 @@ class Executor(Bounded, ABC):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
-        Jobs are started in this order when workers are free. Jobs of one ``share`` go to the same worker if possible.
-        `tell` is called in the calling thread. An exception that it raises stops all jobs.
+        Jobs start in the order of `jobs`, except that jobs with the same ``share`` go to the same worker if possible.
+        `tell` is called in the calling thread. An exception in `tell` stops all jobs.
         """
 
 
@@ -50,9 +50,9 @@ class Executor(Bounded, ABC):
 class Local(Executor):
     """Runs jobs in processes of this machine, one thread each.
 
-    Each worker is a `pebble.ProcessPool` of one process. The process is started with ``spawn`` and runs many jobs. If
-    a worker dies or exceeds the time limit of its job, it is replaced. As with `multiprocessing`, a script that uses
-    this class needs ``if __name__ == "__main__":``.
+    Each worker is a `pebble.ProcessPool` of one process. The process is started with ``spawn`` and runs many jobs. A
+    worker that dies or exceeds the time limit of its job is replaced. As with `multiprocessing`, a script that uses
+    `Local` needs ``if __name__ == "__main__":``.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Local(Executor):
 
 
 class _LocalRun:
-    """The jobs of one call: those that wait, those that run, and the outcomes of the others."""
+    """The jobs of one call: waiting jobs, running jobs, and the outcomes of ended jobs."""
 
     def __init__(self, jobs: Sequence[Job], tell: Tell) -> None:
         self._jobs, self._tell = jobs, tell
@@ -98,7 +98,7 @@ class _LocalRun:
         return [self._outcomes[k] for k in range(len(self._jobs))]
 
     def _next_job(self, worker: _Worker) -> int | None:
-        """The next job of a worker: of its last share, else of a share that no other worker has, else the first."""
+        """The next job of a worker: from its last share, else from a share of no other worker, else the first job."""
         other_shares = {share for other, share in self._share_of.items() if other is not worker}
 
         def rank(k: int) -> tuple[bool, bool]:
@@ -117,7 +117,7 @@ class _LocalRun:
             self._running[worker.submit(self._jobs[k])] = worker, k
 
     def _finish(self, future: Future[JobOutcome]) -> None:
-        """Record the outcome of a job and start the next one, or start the job again if its worker died."""
+        """Record the outcome of a job and start the next job, or start the job again if its worker died."""
         from pebble import ProcessExpired
 
         worker, k = self._running.pop(future)
@@ -137,7 +137,7 @@ class _LocalRun:
 
 
 class _Worker:
-    """One process, which is started for the first job and after it has died."""
+    """One process. The first job starts the process, and a job after its death starts the process again."""
 
     def __init__(self, number: int, logs: Path | None) -> None:
         self._log = None if logs is None else logs / f"worker-{number}.log"
@@ -156,7 +156,7 @@ class _Worker:
         return future
 
     def failure(self, error: Exception, job: Job, tries: int) -> JobOutcome:
-        """The outcome of a job whose process died at every try, the last time by `error`."""
+        """The outcome of a job if its worker died at every try; `error` is the error of the last try."""
         reason = "before it began"
         if isinstance(error, TimeoutError):
             reason = f"because it took longer than {job['timeout_s']:g} s"

@@ -1,11 +1,11 @@
-"""The jobs of a study, which simulate a recording or run a filter on one.
+"""The jobs of a study, which simulate a recording or run a filter on a recording.
 
 >>> perform({"kind": "run", "name": "mst on demo-0", ...})
 JobOutcome(status='done')
 
-A job is a mapping of plain values, so that a process on another machine can run it. A run is written under a
-temporary name and renamed when it is complete. So two workers with the same run do not disturb each other, and the
-remains of a killed worker are never used as a result.
+A job is a mapping of plain values, so that a process on another machine can run it. The folder of a run is written
+under a temporary name and renamed when the run is complete. So two workers with the same run do not disturb each
+other, and the remains of a killed worker are never used as a result.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from mstfilter.study.results import FORECASTS, Job, JobOutcome, write_result
 
 
 def perform(job: Job) -> JobOutcome:
-    """Run a job. An error in a job becomes its outcome.
+    """Run a job and return its outcome. An error in the job gives a failed outcome.
 
-    ``job["kind"]`` is "record" or "run". The other keys are those that `mstfilter.study.study` writes.
+    ``job["kind"]`` is "record" or "run". `mstfilter.study.study` writes the other keys.
     """
     try:
         if job["kind"] == "record":
@@ -58,7 +58,7 @@ def _failure(error: BaseException) -> JobOutcome:
 
 
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
-    """The recording of a scene. A missing simulated recording is made."""
+    """The recording of a scene. A simulated recording is made if it is missing."""
     if "path" in source:
         return open_recording(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation import cached_recording
@@ -132,7 +132,7 @@ def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]
 
 
 def reset_peak() -> bool:
-    """Reset the peak memory of this process; False if the system cannot (other than Linux)."""
+    """Reset the peak memory of this process. Returns False on systems other than Linux."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
         return True

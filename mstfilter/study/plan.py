@@ -4,8 +4,8 @@
 >>> [run.name for run in plan.runs]
 
 The identity of a run is a hash of its configuration, its recording, its seed, the files of mstfilter and of the user,
-and the versions of the libraries. A simulated recording is hashed as its recipe. Other recordings are hashed as their
-content with the ground truth. A run is not repeated if its identity has not changed. Equal runs have equal
+and the versions of the libraries. For a simulated recording, the recipe is hashed. For other recordings, the content
+and the ground truth are hashed. A run is not repeated if its identity has not changed. Equal runs have equal
 identities.
 """
 
@@ -58,7 +58,7 @@ class StudyScene:
 
 @dataclass(frozen=True)
 class StudyRun:
-    """An arm on a scene with a seed of the filter."""
+    """A run of an arm on a scene with a seed of the filter."""
 
     arm: Arm
     scene: StudyScene
@@ -67,12 +67,12 @@ class StudyRun:
 
     @property
     def name(self) -> str:
-        """Name in messages."""
+        """Name of the run in messages."""
         return f"{self.arm.name} on {self.scene.name}, seed {self.seed}"
 
     @property
     def folder(self) -> str:
-        """Name of its folder."""
+        """Name of the folder of the run."""
         words = re.sub(r"[^\w.=-]+", "-", f"{self.arm.name}_{self.scene.name}_{self.seed}").strip(".-")
         return f"{words[:100]}_{self.identity[:10]}"
 
@@ -89,15 +89,15 @@ class Plan:
 
     @property
     def reference(self) -> str:
-        """The arm with which the others are compared."""
+        """Name of the arm with which the other arms are compared."""
         return self.config.reference or self.arms[0].name
 
 
 def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after those of the arm; a comma makes a grid. Raises InputError if an arm is
-    invalid, two arms are the same, there are no runs, or a recording cannot be read.
+    `overrides` are applied to every arm after its own changes; values with commas give one arm each. Raises
+    InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()
@@ -159,7 +159,7 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
 
 
 def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
-    """Put the group before names that several scenes have."""
+    """Put the group before a name if several scenes have the name."""
     count = Counter(scene.name for scene in scenes)
     return tuple(replace(s, name=f"{s.group}-{s.name}") if count[s.name] > 1 else s for s in scenes)
 

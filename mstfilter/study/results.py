@@ -56,7 +56,7 @@ Job = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """How a job ended."""
+    """Outcome of a job."""
 
     status: str  #: {"done", "failed"}
     error: str = ""  #: what went wrong, in one line
@@ -130,7 +130,7 @@ class _Study(BaseModel):
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """The content of result.json in a run's folder; empty if it is missing or damaged."""
+    """The content of result.json in a run's folder; empty if the file is missing or damaged."""
     try:
         return read_model(folder / RESULT, _Result, "a result")[1]
     except InputError:
@@ -150,7 +150,7 @@ class StudyFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> StudyFolder:
-        """An existing study folder."""
+        """Open an existing study folder."""
         folder = cls(Path(path))
         if folder.description.get("format") != STUDY_FORMAT:
             raise InputError(f"{path}: study has format {folder.description.get('format')}, expected {STUDY_FORMAT}")
@@ -191,7 +191,7 @@ class StudyFolder:
         return found
 
     def records(self) -> list[dict[str, Any]]:
-        """As `rows`, but with lists: ``qualities`` has one value per hypothesis."""
+        """The same rows as `rows`, with lists added: ``qualities`` has one value per hypothesis."""
         rows = []
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
@@ -206,8 +206,8 @@ class StudyFolder:
     def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
         """Add the recalibrated log loss to rows, in place.
 
-        The forecasts of a scene are recalibrated on the other scenes of its family and arm. Filter seeds of one scene
-        are never on both sides.
+        The forecasts of a scene are recalibrated on the other scenes of its family and arm. All filter seeds of a
+        scene are left out together.
         """
         groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
@@ -221,7 +221,7 @@ class StudyFolder:
                     row[LOG_LOSS] = fits[scene].log_loss(of_run[row["pause"]])
 
     def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
-        """Counts (T, r, 1001, 2) of the forecasts of every run of an arm that has them, by scene and seed."""
+        """Counts (T, r, 1001, 2) of the forecasts of an arm by scene and seed, for runs that have forecasts."""
         found = {}
         for run in self.description["runs"]:
             path = self.run(run["folder"]) / FORECASTS
@@ -246,7 +246,7 @@ class StudyFolder:
         return _without_lists(self.records())
 
     def summary(self, records: Sequence[Mapping[str, Any]] | None = None) -> Summary:
-        """Means and differences of the runs that are done; `records` if they have been read already."""
+        """Means and differences of the finished runs. Without `records`, the records are read from the folder."""
         rows = _without_lists(self.records() if records is None else records)
         return summarise(rows, self.description["reference"], cost_columns(rows), self.reported_only)
 

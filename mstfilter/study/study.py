@@ -1,10 +1,10 @@
-"""Runs a study. `run_study` checks everything first, then makes every missing run, and then writes the tables.
+"""Running a study: `run_study` checks the study and the folder, makes every missing run, and writes the tables.
 
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
 
-The same call resumes an interrupted study and repeats failed runs. Runs with unchanged identity are not repeated. An
-uninterrupted study has the same tables.
+The same call resumes an interrupted study and repeats failed runs. Finished runs with unchanged identity are not
+repeated. An interruption does not change the metrics.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def run_study(
     executor : Executor, optional
         By default, one process for each core of this machine.
     overrides : sequence of str
-        Applied to every arm; a comma makes a grid.
+        Overrides for every arm. Values with commas give one arm each.
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. By default, the user's cache folder.
     progress : bool or callable
@@ -110,7 +110,7 @@ def _prepare(folder: StudyFolder, cache: Path, description: dict[str, Any]) -> N
 
 @dataclass(frozen=True)
 class _Call:
-    """One call of `run_study`, which gives jobs to the executor and records failures."""
+    """One call of `run_study`: gives jobs to the executor and records failures."""
 
     plan: Plan
     folder: StudyFolder
@@ -134,7 +134,7 @@ class _Call:
         return {run.name: why[run.scene.key] for run in failed}
 
     def filter_scenes(self, runs: Sequence[StudyRun], n_failed: int) -> dict[str, JobOutcome]:
-        """Make some runs. Returns the failed runs with reasons; `n_failed` is the number that failed before."""
+        """Make `runs`. Returns the failed runs with reasons. `n_failed` is the number of runs that failed before."""
         total = len(self.plan.runs)
         jobs = [self._run_job(run) for run in runs]
         count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
@@ -191,7 +191,7 @@ class _Call:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[StudyFolder]:
-    """The study folder, which need not exist, reserved for this process. Remains of killed processes are removed."""
+    """Lock the study folder, which need not exist, for this process. Remains of killed processes are removed."""
     with locked(path):
         try:
             sweep(path)

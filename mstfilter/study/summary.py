@@ -3,11 +3,11 @@
 >>> summary = summarise(folder.rows(), reference="mst")
 >>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
-There are two primary endpoints, both means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality
-of the hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of their forecasts in nats after
-recalibration on other scenes. Lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
-same pauses. Values are averaged over filter seeds first, then over scenes. A difference is arm minus reference. The p
-values of both endpoints are adjusted together.
+The two primary endpoints are means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality of the
+hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats, after recalibration
+on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the same pauses.
+Values are averaged over filter seeds first, then over scenes. A difference is arm minus reference. The p values of
+both endpoints are adjusted together.
 """
 
 from __future__ import annotations
@@ -72,15 +72,15 @@ class ArmMetric:
 
 @dataclass(frozen=True)
 class Compared:
-    """An arm minus the reference on a family.
+    """Difference of an arm minus the reference on a family.
 
     Parameters
     ----------
     family, arm, reference, metric : str
     difference : Difference
-        For the primary endpoints, `p_claim` is adjusted over both endpoints, all families and all arms.
+        For the primary endpoints, `p_holm` is `p_claim` adjusted over both endpoints, all families and all arms.
     reported_only : bool
-        The arm is not part of the adjustment, and no conclusion is drawn.
+        Whether the arm is left out of the adjustment and of the conclusions.
     """
 
     family: str
@@ -110,7 +110,7 @@ class Summary:
     Parameters
     ----------
     families, arms, names : tuple of str
-        In the order of the study. `names` are those of the metrics.
+        Families, arms and names of metrics, in the order of the study.
     reference : str
     metrics : tuple of ArmMetric
     differences : tuple of Compared
@@ -138,8 +138,8 @@ class Summary:
     def is_better(self, family: str, arm: str) -> bool:
         """Whether the reference is shown to be better than an arm on a family.
 
-        One endpoint must be better after adjustment, and the intervals of the other must exclude a loss of 0.005 or
-        more. Both need at least 20 scenes.
+        One endpoint must be better after adjustment, and the intervals of both endpoints must exclude a loss of 0.005
+        or more. Each endpoint needs at least 20 scenes.
         """
         found = []
         for one in self.differences:
@@ -178,16 +178,16 @@ class Summary:
 def summarise(
     rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = (), reported_only: Collection[str] = ()
 ) -> Summary:
-    """Summarise rows as `StudyFolder.rows` returns them.
+    """Summarise the rows that `StudyFolder.rows` returns.
 
     Parameters
     ----------
     rows : sequence of mapping
     reference : str
-        The arm with which others are compared.
+        The arm with which the other arms are compared.
     cost : sequence of str
-        Columns of time and memory. The columns are averaged over all pauses and not compared. A stage that a step
-        lacks took 0 seconds. If an arm has several filter seeds, the first is omitted, since it fills the cache.
+        Columns of time and memory. The columns are averaged over all pauses, and arms are not compared. A missing
+        stage counts as 0 seconds. The first of several filter seeds is omitted, because its run fills the cache.
     reported_only : collection of str
         Arms that are not part of the comparisons.
     """
@@ -237,7 +237,7 @@ def summarise(
 
 
 def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
-    """Adjust the p values of both endpoints together; those of arms that are only reported become NaN."""
+    """Adjust the p values of both endpoints together. Arms that are only reported get NaN."""
     p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
     return tuple(
         replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one
