@@ -6,8 +6,8 @@
 ...     stream.wait()
 ...     stream.hypotheses, stream.belief
 
-One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last complete
-clip. The results equal the results of a run on the recorded frames with the same pauses.
+One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last
+complete clip. The results equal the results of a run on the recorded frames with the same pauses.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class Stream:
     pauses : Settled or None
         The rule that finds the pauses. If None, only frames that are pushed with ``pause=True`` are pauses.
     grid : VoxelGrid, optional
-        Workspace. By default, the stream finds the workspace at the first pause, as for a recording. A camera without a
-        pose gets its pose from the support plane of the first pause.
+        Workspace. By default, the stream finds the workspace at the first pause, as for a recording. A camera without
+        a pose gets its pose from the support plane of the first pause.
     seed : int
         Seed of all random streams.
     on_pause : callable, optional
@@ -173,8 +173,8 @@ class Stream:
         Returns
         -------
         bool
-            Whether the frame was accepted. A frame is dropped and counted if it has no depth, if its time stamp is not
-            later than the previous time stamp, or if the queue is full.
+            Whether the frame was accepted. A frame is dropped and counted if it has no depth, if its time stamp is
+            not later than the previous time stamp, or if the queue is full.
 
         Raises
         ------
