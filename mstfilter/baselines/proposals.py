@@ -52,7 +52,7 @@ class Floor(Proposal):
     ----------
     completer : Completer
     objects : ObjectRule
-        Decides which pixels are above the table.
+        Rule that decides which pixels are above the table.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -72,7 +72,7 @@ class Floor(Proposal):
 
 @dataclass(frozen=True)
 class OneBlob(Floor):
-    """One object: everything above the table, completed. Parameters: `Floor`."""
+    """One object that fills the completed space above the table. Parameters: `Floor`."""
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         labels = one_blob(self.occupied(rng, observation))

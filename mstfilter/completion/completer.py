@@ -1,4 +1,4 @@
-"""Completion: from the visible part of an object to the space that it fills (paper, section IV-B).
+"""Completion: estimates the space that an object fills from its visible part (paper, section IV-B).
 
 A segment of a depth image shows only the front surface of an object. A `Completer` estimates the hidden part of the
 object, for one mask at a time. The completion depends only on the frame and the mask, not on other segments. So
@@ -7,10 +7,10 @@ hypotheses with a common segment use the same completion.
 >>> completions = Extrude().complete(rng, frame, [mask_a, mask_b], grid)
 >>> labels = arbitrate(completions, grid)            # (X, Y, Z), 1 for mask_a, 2 for mask_b
 
-To add a method, inherit `Completer` and override `fill`. The argument is an `ObservedBox`, a small box of the grid,
-and the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps the
-visible surface. If a method is faster for many boxes together, override `fill_many`. An array with a wrong shape, or
-with numbers that are not probabilities, is an error (`mstfilter.results`).
+To add a method, inherit `Completer` and override `fill`. The argument of `fill` is an `ObservedBox`, a small box of
+the grid; the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps
+the visible surface. If a method is faster for many boxes together, override `fill_many`. An array with a wrong shape,
+or with numbers that are not probabilities, is an error (`mstfilter.results`).
 
 `arbitrate` makes the label grid. If several completions contain a voxel, three rules decide:
 
@@ -68,7 +68,7 @@ class Completion:
         return a, b, c
 
     def shifted(self, log_odds: float) -> Completion:
-        """The completion with `log_odds` added where the probability is neither 0 nor 1."""
+        """The completion with `log_odds` added to the log odds of all voxels with probability between 0 and 1."""
         p = self.probability
         odds = np.exp(np.float32(np.clip(log_odds, -80, 80))) * p  # float32 overflows at 89
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
@@ -102,9 +102,9 @@ class Completer(Checked, ABC):
     ----------
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
-        less than `depth` voxels behind this surface, along the optical axis. If all voxels with readings were
-        surface, objects would be half a voxel larger on all sides. On rendered boxes, the volume is 1.13 instead of
-        1.41 times the truth, and the quality .82 instead of .71. The defaults were chosen on these boxes.
+        less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
+        would be half a voxel larger on all sides. On rendered boxes, this would give 1.41 instead of 1.13 times the
+        true volume, and the quality .71 instead of .82. The defaults were chosen on these boxes.
     free_margin, free_sigmas : float
         A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
         of the depth reading, in front of the measured surface.
@@ -132,7 +132,7 @@ class Completer(Checked, ABC):
 
     @returns(_check_filled)
     def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
-        """The probabilities of several boxes."""
+        """The probabilities of the voxels of several boxes."""
         return [self.fill(rng, one) for rng, one in zip(rngs, seen, strict=True)]
 
     def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
@@ -237,7 +237,7 @@ _FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing
 def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str | None:
     """Description of a fault if the probabilities of boxes ignore the input; None without a fault.
 
-    A fault is that all probabilities are equal, or that less than 2 % of the visible surface has 0.5 or more.
+    Faults are equal probabilities of all voxels, and probabilities below 0.5 for over 98 % of the visible surface.
     """
     shown = [(p, one.surface) for p, one in zip(filled, seen, strict=True) if one.surface.any()]
     if sum(np.count_nonzero(surface) for _, surface in shown) < _FEW_VOXELS:
@@ -256,7 +256,7 @@ def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str |
 
 
 def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
-    """A completion without free space. If no voxel has probability 0.5, the visible surface gets probability 1."""
+    """A completion without free space. If no voxel reaches probability 0.5, the visible surface gets 1."""
     p = np.array(filled, dtype=np.float32)
     p[seen.free] = 0
     if p.size and not (p >= 0.5).any():
@@ -274,7 +274,7 @@ class ClipCompleter(Completer):
 
 
 def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: float = 0.5) -> np.ndarray:
-    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis; 0 is free and k + 1 the k-th completion.
+    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis; 0 is free, and k + 1 is completion k.
 
     `threshold` is the least probability of an occupied voxel.
     """

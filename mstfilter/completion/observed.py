@@ -230,8 +230,8 @@ def _confirmed(
 ) -> tuple[ObjectView, ...]:
     """The views that the latest frame does not contradict.
 
-    A frame contradicts a view if too much of the view's surface is observed as free, if too much of the view's free
-    space is now surface, or if too little of the view's surface is near the current surface.
+    A frame contradicts a view if it observes much of the view's surface as free, or much of the view's free space as
+    surface. A view is also contradicted if little of its surface is near the current surface.
     """
     centres = grid.centre_of(np.indices(seen.surface.shape).reshape(3, -1).T + offset)
     now, near, n_now = seen.surface.ravel(), binary_dilation(seen.surface).ravel(), int(seen.surface.sum())

@@ -82,7 +82,7 @@ class CompletionNet(nn.Module):
     channels : int
         Number of input channels.
     width : int
-        Number of features at half the resolution, a multiple of 8. The coarser levels have 2 and 4 times as many.
+        Number of features at half the resolution, a multiple of 8. The coarser levels have 2 and 4 times this number.
     latent : int
         Dimension of z.
     """
@@ -142,7 +142,7 @@ class TrainedNetwork:
     Parameters
     ----------
     forward : callable
-        Maps the input (b, channels, X, Y, Z) to logits (b, X, Y, Z).
+        Function from the input (b, channels, X, Y, Z) to logits (b, X, Y, Z).
     key : str
         Key of the contents of the weights.
     scale, shift : float

@@ -2,12 +2,11 @@
 
 >>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
-In the folder, subfolders are numbered by pause (`Clip.index`), from 0::
+The subfolders are numbered by pause (`Clip.index`), from 0:
 
-    shapes/000001/cup/mask.png         the mask of the object in the image of the pause, not 0
-
-    shapes/000001/cup/a.ply  b.npz     its shape; several files are draws
-    shapes/000001/cup/weights.json     optional, beside the draws: {"a.ply": 2, "b.npz": 1}
+* ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, not 0 on the object.
+* ``shapes/000001/cup/a.ply``, ``b.npz``: shapes of this object. Each hypothesis draws one shape.
+* ``shapes/000001/cup/weights.json``: optional weights of the shapes, for example {"a.ply": 2, "b.npz": 1}.
 
 A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world:
 
@@ -118,7 +117,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks by their shapes. Views are not used.
+        """Complete several masks by the shapes in the folder. Views are not used.
 
         Raises InputError if `at` was not called before, or if a mask has no shapes.
         """

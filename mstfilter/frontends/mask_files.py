@@ -5,11 +5,11 @@
 >>> len(masks.trees), masks.weights
 (2, array([0.7, 0.3]))
 
-In the folder, files and subfolders are numbered by pause (`Clip.index`), from 0::
+The files and subfolders are numbered by pause (`Clip.index`), from 0:
 
-    masks/000000.png              one segmentation of the image at pause 0
-    masks/000001/a.png, b.npz     several alternatives of the whole image
-    masks/000001/weights.json     optional, beside the alternatives: {"a.png": 2, "b.npz": 1}
+* ``masks/000000.png``: one segmentation of the image at pause 0.
+* ``masks/000001/a.png``, ``b.npz``: alternative segmentations of the whole image at pause 1.
+* ``masks/000001/weights.json``: optional weights of the alternatives, for example {"a.png": 2, "b.npz": 1}.
 
 A file has one set of masks with the shape of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
 
@@ -138,7 +138,7 @@ def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
 def _parsed(
     content: Mapping[Path, bytes], weights: Sequence[float] | None, shape: tuple[int, int], key: bytes = b""
 ) -> PauseMasks:
-    """The alternatives in the content of files."""
+    """Parse the alternatives from the content of files."""
     trees, stops, means = [], [], []
     for path, data in content.items():
         with naming(str(path)):
@@ -182,7 +182,7 @@ def _read_png(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarr
 
 
 def read_label_image(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read a label image (H, W). Raises InputError if its shape is not `shape`."""
+    """Read a label image (H, W). Raises InputError if the shape of the image is not `shape`."""
     labels = read_labels(path)
     _check_shape(path, labels.shape, shape)
     return labels
@@ -225,7 +225,7 @@ def write_masks(
     ----------
     folder : str or Path
     pause : int
-        `Clip.index` of the clip whose last frame is segmented by the masks.
+        `Clip.index` of the clip. The masks segment the last frame of the clip.
     alternatives : sequence
         Each alternative is a label image (H, W), or disjoint or nested masks (n, H, W) bool, or a pair of such an
         array and its scores.

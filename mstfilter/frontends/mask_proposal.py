@@ -4,7 +4,7 @@
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
 
 `mstfilter.frontends.mask_files` describes the folder. For each sample, an alternative is drawn by weight, and the
-segmentation is a cut of its tree of masks. Each distinct mask is completed once.
+segmentation is a cut of the alternative's tree of masks. Each distinct mask is completed once.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class MaskProposal(Proposal, UsesFiles):
     folder : str
         The folder of masks.
     sampler : CutSampler
-        Draws cuts of the tree of nested masks. At temperature 1, the cuts have the distribution of
+        Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution of
         `mstfilter.frontends.mask_trees`.
     objects : ObjectRule
-        Decides which masks are objects. Other masks, such as the mask of the table, are background. A background mask
-        that contains masks is always split into its parts.
+        Rule that decides which masks are objects. Other masks, such as the mask of the table, are background. A
+        background mask that contains masks is always split into its parts.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.

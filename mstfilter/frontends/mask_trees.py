@@ -67,7 +67,7 @@ def label_tree(labels: np.ndarray, scores: np.ndarray | None = None) -> tuple[Tr
 
 
 def check_scores(scores: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
-    """Scores as float64 (n,). Raises InputError if their number is wrong, or if a score is negative or not finite."""
+    """Scores as float64 (n,). Raises InputError if their number is not n, or if a score is negative or not finite."""
     scores = np.asarray(scores, dtype=np.float64)
     if scores.shape != (n,):
         raise InputError(f"scores have shape {scores.shape}, expected one for each of {n} masks")

@@ -49,7 +49,7 @@ def filter_folder(
     seed : int
         Seed of all random streams.
     idle_s : float
-        The run ends if no image arrives for this time.
+        The run ends if no image arrives for `idle_s` seconds.
     replace, allow_files, n_threads
         Same as for `mstfilter.runs.filter_recording`.
     on_pause : callable

@@ -99,7 +99,7 @@ class Stream:
     max_frames : int
         Maximum number of queued frames, and maximum number of frames of a clip. See Notes.
     threads : int
-        Threads of one step. The results do not depend on this number.
+        Threads of one step. The results do not depend on the number of threads.
 
     Notes
     -----
