@@ -1,8 +1,8 @@
 """Completion: estimates the space that an object fills from its visible part (paper, section IV-B).
 
 A segment of a depth image shows only the front surface of an object. A `Completer` estimates the hidden part of the
-object, for one mask at a time. The completion depends only on the frame and the mask, not on other segments. So
-hypotheses with a common segment use the same completion.
+object, for one mask at a time. The completion depends only on the frame and the mask, not on other segments.
+Hypotheses with a common segment use the same completion.
 
 >>> completions = Extrude().complete(rng, frame, [mask_a, mask_b], grid)
 >>> labels = arbitrate(completions, grid)            # (X, Y, Z), 1 for mask_a, 2 for mask_b
@@ -103,8 +103,8 @@ class Completer(Checked, ABC):
     in_front, depth : float
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
         less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
-        would be half a voxel larger on all sides. On rendered boxes, this would give 1.41 instead of 1.13 times the
-        true volume, and the quality .71 instead of .82. The defaults were chosen on these boxes.
+        would be half a voxel larger on all sides. On rendered boxes, the volume would be 1.41 instead of 1.13 times
+        the true volume, and the quality .71 instead of .82. The defaults were chosen on these boxes.
     free_margin, free_sigmas : float
         A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
         of the depth reading, in front of the measured surface.
@@ -256,7 +256,7 @@ def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str |
 
 
 def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
-    """A completion without free space. If no voxel reaches probability 0.5, the visible surface gets 1."""
+    """A completion without free space. If no voxel reaches 0.5, the visible surface gets probability 1."""
     p = np.array(filled, dtype=np.float32)
     p[seen.free] = 0
     if p.size and not (p >= 0.5).any():

@@ -34,7 +34,7 @@ class Extrude(Completer):
     below : float
         Probability of an occluded voxel below the surface. The default is the precision on simulated scenes.
     floor : float
-        Voxels below this height in metres are free.
+        Voxels below `floor` metres are free.
     """
 
     below: float = 0.8

@@ -43,8 +43,8 @@ class NetworkCompleter(Completer, UsesFiles):
     weights : str
         Name of a trained model of the package, the folder of a model (`mstfilter.trained`), or an ONNX file.
     least_surface : float
-        If the network keeps less than this share of a large visible surface, the whole surface gets at least
-        probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
+        If the network keeps less than the share `least_surface` of a large visible surface, the whole surface gets at
+        least probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
         network removes much of their surface. With 0, the network's probabilities are used.
     architecture : Architecture, optional
         The architecture of the model in the folder. By default, the architecture is that of this package's network.

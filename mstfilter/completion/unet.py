@@ -58,7 +58,7 @@ def _to_voxels(x: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """Residual block of two convolutions. The latent vector z scales and shifts the features between them."""
+    """Residual block. The latent vector z scales and shifts the features between the two convolutions."""
 
     def __init__(self, width: int, latent: int = 0) -> None:
         super().__init__()

@@ -74,7 +74,8 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     """Completion by the shapes in a folder.
 
     A mask gets the shapes of the stored mask with the highest IoU, at least 0.5. If the object has several shapes,
-    each hypothesis draws one by weight. Voxels observed as free are cleared, and the visible surface is occupied.
+    each hypothesis draws one shape by weight. Voxels observed as free are cleared, and the visible surface is
+    occupied.
 
     Parameters
     ----------
@@ -263,7 +264,7 @@ def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: Vo
 
 
 def _cloud(points: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Occupancy of the voxels with points, and of the voxels that they enclose."""
+    """Occupancy of the voxels with points, and of the voxels that these voxels enclose."""
     from scipy.ndimage import binary_fill_holes
 
     index = grid.index_of(points)

@@ -118,7 +118,7 @@ class MaskGenerator(Protocol):
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
     """Run a mask generator on the last frame of each clip, and write the masks as nested sets.
 
-    `share` is the argument of `nested_masks`.
+    `share` is passed to `nested_masks`.
     """
     for clip in clips:
         found = generator.generate(clip.after.rgb.copy())

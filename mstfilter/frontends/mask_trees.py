@@ -12,7 +12,7 @@ a mask contains masks, its remaining pixels are also a leaf. The root is the who
 A walk from the largest masks down the tree defines the distribution of the cuts. If a mask with score s contains
 masks with mean score m, the walk stops at this mask with probability s / (s + m). Otherwise the walk visits the inner
 masks and the remaining pixels. `node_values` returns values w such that the Gibbs distribution exp(sum of w over the
-cut) is the distribution of the walk. So every `CutSampler` at temperature 1 draws from this distribution.
+cut) is the distribution of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def filter_folder(
     idle_s : float
         The run ends if no image arrives for `idle_s` seconds.
     replace, allow_files, n_threads
-        Same as for `mstfilter.runs.filter_recording`.
+        See `mstfilter.runs.filter_recording`.
     on_pause : callable
         Function that is called with each `Pause` after the files of the pause are written.
     """

@@ -99,13 +99,13 @@ class Stream:
     max_frames : int
         Maximum number of queued frames, and maximum number of frames of a clip. See Notes.
     threads : int
-        Threads of one step. The results do not depend on the number of threads.
+        Number of threads of one step. The results do not depend on this number.
 
     Notes
     -----
     If `max_frames` frames are queued because the filter is slower than the camera, new frames are dropped. If a clip
     reaches `max_frames`, frames with little motion are removed from the clip. `counts` has the number of dropped and
-    removed frames. So at most three times `max_frames` frames are in memory.
+    removed frames. At most three times `max_frames` frames are in memory.
 
     An error of a thread is raised by the next call of `push`, `wait` or `close`.
     """
