@@ -1,4 +1,4 @@
-"""Completion: estimates the space that an object fills from its visible part (paper, section IV-B).
+"""Completion estimates the space that an object fills from its visible part (paper, section IV-B).
 
 A segment of a depth image shows only the front surface of an object. A `Completer` estimates the hidden part of the
 object, for one mask at a time. The completion depends only on the frame and the mask, not on other segments.
@@ -104,7 +104,7 @@ class Completer(Checked, ABC):
         A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
         less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
         would be half a voxel larger on all sides. On rendered boxes, the volume would be 1.41 instead of 1.13 times
-        the true volume, and the quality .71 instead of .82. The defaults were chosen on these boxes.
+        the true volume, and the quality .71 instead of .82. The defaults were chosen on rendered boxes.
     free_margin, free_sigmas : float
         A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
         of the depth reading, in front of the measured surface.
@@ -352,7 +352,7 @@ def _distance_of_contender(
 ) -> np.ndarray:
     """Distance (n,) of voxels (n, 3) from an object's surface; infinite if the object does not tie for the voxel.
 
-    Tied objects have the number of readings `points` (n,) and the probability `p` (n,).
+    An object ties if its number of readings is `points` (n,) and its probability is `p` (n,).
     """
     local = voxels - one.offset
     contends = ((local >= 0) & (local < one.probability.shape)).all(axis=1)

@@ -47,7 +47,7 @@ class NetworkCompleter(Completer, UsesFiles):
         least probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
         network removes much of their surface. With 0, the network's probabilities are used.
     architecture : Architecture, optional
-        The architecture of the model in the folder. By default, the architecture is that of this package's network.
+        The architecture of the model in the folder. The default is the architecture of this package's network.
     """
 
     weights: str = "completion"

@@ -213,7 +213,7 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
 
 
 def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which centres (n, 3) lie in the box of a view (n,) bool, and the observation by the view at these centres.
+    """Whether centres (n, 3) lie in the box of a view (n,) bool, and the observation by the view at these centres.
 
     The observation consists of flags of `Seen` (k,), and signed distances (k,) in voxels, NaN if unknown.
     """

@@ -10,7 +10,7 @@ The subfolders are numbered by pause (`Clip.index`), from 0:
 
 A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world:
 
-* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a point cloud (ply without triangles). open3d reads the file.
+* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a point cloud (ply without triangles), read by open3d.
 * ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probabilities of voxels with edge ``voxel_size``.
   ``origin`` (3,) is the first corner, and the axes are the axes of the frame.
 
