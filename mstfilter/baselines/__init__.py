@@ -2,9 +2,9 @@
 
 >>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
 
-`updates` has fusion without crossover (samples alone, tracking alone, their union). `proposals` has the floors. A map
-of volumes in the style of MID-Fusion is in ``models/published/object_fusion.py``. ``docs/baselines.md`` lists all
-presets.
+`updates` has updates without crossover (samples alone, predictions alone, their union). `proposals` has trivial
+segmentations (floors). ``models/published/object_fusion.py`` has a baseline in the style of MID-Fusion.
+``docs/baselines.md`` lists all presets.
 """
 
 from mstfilter.lazy import attach

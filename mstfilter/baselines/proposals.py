@@ -1,12 +1,12 @@
-"""Proposals of the baselines: three floors, and a proposal for the first pause only.
+"""Proposals of the baselines: three trivial methods (floors), and a proposal for the first pause only.
 
 >>> FirstPause(TreeCutProposal())      # samples at the first pause, no objects afterwards
 >>> OneBlob()                          # everything above the table is one object
 >>> OccupiedComponents()               # connected components of the occupied space
 >>> ImageComponents()                  # connected components of the image above the table
 
-The floors use the pixels above the table and the completer, but no segmentation. A useful method is better than the
-floors.
+The floors use the pixels above the table and the completer, but no segmentation. A useful method must be better than
+the floors.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _MAX_STEP = 0.02  # metres between the depths of connected pixels
 
 @dataclass(frozen=True)
 class FirstPause(Proposal):
-    """The samples of another proposal at the first pause, and later hypotheses without objects.
+    """Samples of another proposal at the first pause, and hypotheses without objects at later pauses.
 
-    The inner proposal keeps the random stream that it has without this wrapper.
+    The inner proposal draws the same random numbers with and without this wrapper.
     """
 
     proposal: Proposal = field(default_factory=TreeCutProposal)
@@ -46,13 +46,13 @@ class FirstPause(Proposal):
 
 @dataclass(frozen=True)
 class Floor(Proposal):
-    """A floor.
+    """Base class of the floors (trivial baselines).
 
     Parameters
     ----------
     completer : Completer
     objects : ObjectRule
-        Decides which pixels are above the table.
+        Rule that decides which pixels are above the table.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -72,7 +72,7 @@ class Floor(Proposal):
 
 @dataclass(frozen=True)
 class OneBlob(Floor):
-    """One object: everything above the table, completed. Parameters: `Floor`."""
+    """One object that fills the completed space above the table. Parameters: `Floor`."""
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         labels = one_blob(self.occupied(rng, observation))
@@ -90,7 +90,7 @@ class OccupiedComponents(Floor):
 
 @dataclass(frozen=True)
 class ImageComponents(Floor):
-    """Connected components of the image above the support plane, each completed.
+    """Connected components of the image above the table. Each component is completed.
 
     ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
     than 2 cm are not connected. Parameters: `Floor`.
@@ -120,7 +120,7 @@ class ImageComponents(Floor):
 
 
 def _largest(labels: np.ndarray, least: float) -> np.ndarray:
-    """Labels that have at least `least` places, numbered from 1 in the same order; 0 elsewhere."""
+    """Labels with at least `least` elements, numbered from 1 in the same order; 0 elsewhere."""
     kept = np.bincount(labels.ravel()) >= max(1.0, least)
     kept[0] = False
     return np.where(kept, np.cumsum(kept), 0)[labels]

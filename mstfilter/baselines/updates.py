@@ -1,10 +1,10 @@
-"""Updates without crossover: samples alone, predictions alone, or the union of both.
+"""Updates without crossover: samples alone, predictions alone, or the union of samples and predictions.
 
-The updates replace the update of `mst`, and leave all other parts of the filter and their random streams unchanged:
+Each class replaces the update of `mst`. All other components of the filter and their random streams are unchanged:
 
 >>> mstfilter.preset("samples_only"), mstfilter.preset("tracking_only"), mstfilter.preset("union")
 
-At the first pause there is no prediction, and all of them return the proposed samples, as `mst` does.
+At the first pause there is no prediction, so all updates return the proposed samples, as the update of `mst` does.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mstfilter.smc import Population, Update, union
 
 @dataclass(frozen=True)
 class SamplesOnly(Update):
-    """The result is the proposed samples."""
+    """Returns the proposed samples."""
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
@@ -29,15 +29,15 @@ class SamplesOnly(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The proposed population, or the predicted population without a proposal."""
+        """Return the proposed population, or the predicted population if the filter has no proposal."""
         return union(predicted if proposed is None else None, proposed)
 
 
 @dataclass(frozen=True)
 class TrackingOnly(Update):
-    """The result is the predicted hypotheses.
+    """Returns the predicted hypotheses.
 
-    `free_space` clears voxels that the latest image observes as free. ``none`` leaves predictions unchanged.
+    `free_space` clears voxels that the latest image observes as free. With ``none``, predictions are unchanged.
     """
 
     free_space: Projection = field(default_factory=FreeSpace)
@@ -48,7 +48,7 @@ class TrackingOnly(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The projected predictions with their weights; the proposed samples at the first pause."""
+        """Return the projected predictions with their weights; at the first pause, the proposed samples."""
         if predicted is None:
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)
@@ -57,7 +57,7 @@ class TrackingOnly(Update):
 
 @dataclass(frozen=True)
 class Union(Update):
-    """Predicted and proposed hypotheses together, with the weights of the crossover but without crossing them.
+    """Returns predicted and proposed hypotheses together, with the weights of the crossover but without crossover.
 
     A prediction has log weight ``log w + lambda log Q``, and a sample ``log w``. Both populations are first scaled to
     mean weight 1. `free_space` projects the predictions and returns Q. `quality_exponent` is lambda.
@@ -72,7 +72,7 @@ class Union(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Both populations; at the first pause the proposed samples with their weights."""
+        """Return predictions and samples together; at the first pause, the proposed samples with their weights."""
         if predicted is None:
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)

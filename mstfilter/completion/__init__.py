@@ -1,4 +1,4 @@
-"""Completion: from the visible part of an object to the space that it fills (paper, section IV-B).
+"""Completion estimates the space that an object fills from its visible part (paper, section IV-B).
 
 >>> completions = Extrude().complete(rng, frame, masks, grid)      # one for each mask
 >>> labels = arbitrate(completions, grid)                          # (X, Y, Z) uint16

@@ -1,24 +1,24 @@
-"""Completion: from the visible part of an object to the space that it fills (paper, section IV-B).
+"""Completion estimates the space that an object fills from its visible part (paper, section IV-B).
 
 A segment of a depth image shows only the front surface of an object. A `Completer` estimates the hidden part of the
-object, for one mask at a time. The result depends only on the frame and the mask, not on the rest of the
-segmentation. So hypotheses that share a segment share its completion.
+object, for one mask at a time. The completion depends only on the frame and the mask, not on other segments.
+Hypotheses with a common segment use the same completion.
 
 >>> completions = Extrude().complete(rng, frame, [mask_a, mask_b], grid)
 >>> labels = arbitrate(completions, grid)            # (X, Y, Z), 1 for mask_a, 2 for mask_b
 
-To add a method, inherit `Completer` and override `fill`. The argument is an `ObservedBox`, a small box of the grid,
-and the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps the
-visible surface. A method that is faster for many boxes together overrides `fill_many`. Results are checked
-(`mstfilter.results`). An array of another shape, or of numbers that are not probabilities, is an error.
+To add a method, inherit `Completer` and override `fill`. The argument of `fill` is an `ObservedBox`, a small box of
+the grid; the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps
+the visible surface. If a method is faster for many boxes together, override `fill_many`. An array with a wrong shape,
+or with numbers that are not probabilities, is an error (`mstfilter.results`).
 
-`arbitrate` makes the label grid. If several completions contain a voxel, these rules apply:
+`arbitrate` makes the label grid. If several completions contain a voxel, three rules decide:
 
-1. A voxel with readings belongs to the object with most readings in it.
-2. A voxel without readings belongs to the object with the largest probability, if this reaches the threshold.
-3. Ties go to the object with the nearest visible surface.
+1. A voxel with depth readings belongs to the object with most readings in the voxel.
+2. A voxel without readings belongs to the object of largest probability, if this probability reaches the threshold.
+3. A tied voxel belongs to the object with the nearest visible surface.
 
-The result does not depend on the order of the objects: renumbered completions give renumbered labels.
+The labels do not depend on the order of the objects: renumbered completions give renumbered labels.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Completion:
         return a, b, c
 
     def shifted(self, log_odds: float) -> Completion:
-        """The completion with `log_odds` added where the probability is neither 0 nor 1."""
+        """The completion with `log_odds` added to the log odds of all voxels with probability between 0 and 1."""
         p = self.probability
         odds = np.exp(np.float32(np.clip(log_odds, -80, 80))) * p  # float32 overflows at 89
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
@@ -101,14 +101,13 @@ class Completer(Checked, ABC):
     Parameters
     ----------
     in_front, depth : float
-        A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface and
-        less than `depth` behind it, along the optical axis. The test uses the centre of the voxel, since a test of
-        any reading in the voxel enlarges objects by half a voxel on all sides. On rendered boxes the volume is 1.13
-        instead of 1.41 times the truth, and the quality .82 instead of .71. Both values were chosen on these boxes.
-    free_margin : float
-        A voxel is free if its centre is this far in front of the measured surface, in voxels ...
-    free_sigmas : float
-        ... and also this far, in standard deviations of the depth reading.
+        A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
+        less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
+        would be half a voxel larger on all sides. On rendered boxes, the volume would be 1.41 instead of 1.13 times
+        the true volume, and the quality .71 instead of .82. The defaults were chosen on rendered boxes.
+    free_margin, free_sigmas : float
+        A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
+        of the depth reading, in front of the measured surface.
     """
 
     in_front: float = 0.2
@@ -129,17 +128,17 @@ class Completer(Checked, ABC):
     @returns(lambda self, found, rng, seen: check_probabilities(found, seen.surface.shape))
     @abstractmethod
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probability (a, b, c) of being occupied."""
+        """Probability (a, b, c) that the object occupies each voxel."""
 
     @returns(_check_filled)
     def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
-        """The probabilities of several boxes."""
+        """The probabilities of the voxels of several boxes."""
         return [self.fill(rng, one) for rng, one in zip(rngs, seen, strict=True)]
 
     def estimate(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
-        """`fill_many`, with a warning if the result ignores the input.
+        """Call `fill_many`, and warn if the result ignores the input.
 
-        Raises InputError if a completer draws random numbers although `stochastic` is False (results are reused).
+        Raises InputError if random numbers are drawn although `stochastic` is False, because results are reused.
         """
         before = _states(rngs)
         filled = self.fill_many(rngs, seen)
@@ -153,7 +152,7 @@ class Completer(Checked, ABC):
         return filled
 
     def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the voxel after its last."""
+        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the voxel after the box."""
         # The surface may reach `depth` voxels behind the readings.
         return enclosing_box(voxels, grid, max(self.padding, int(np.ceil(self.depth))))
 
@@ -165,15 +164,15 @@ class Completer(Checked, ABC):
         Parameters
         ----------
         rng : Generator
-            Only stochastic completers draw random numbers. Each mask has a separate stream.
+            Only stochastic completers draw random numbers. Each mask has a separate random stream.
         masks : sequence of (H, W) bool
             Each mask is one segment. Pixels without a reading, on the robot, or outside the grid are ignored.
 
         Returns
         -------
         list of Completion
-            One for each mask. Voxels observed as free have probability 0. A mask with a reading in the grid has at
-            least one voxel of probability 0.5 or more, so every visible object exists.
+            One completion for each mask. Voxels observed as free have probability 0. The completion of a mask with a
+            reading in the grid has at least one voxel of probability 0.5 or more, so no visible object is lost.
         """
         streams = [child(rng, "mask", k) if self.stochastic else rng for k in range(len(masks))]
         return self.complete_each(streams, frame, masks, grid)
@@ -187,11 +186,11 @@ class Completer(Checked, ABC):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """`complete` with a given stream for each mask, and with earlier views of each object.
+        """Complete masks with a given random stream for each mask, and with earlier views of each object.
 
-        The result of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views
-        show the object, moved to its current pose. `Completion.views` has the views that were used. A completer
-        that does not use views returns completions without views.
+        The completion of a mask does not depend on the other masks. With views, a mask (H, W) may be empty. The views
+        of an object are moved to its current pose. `Completion.views` has the views that were used. A completer that
+        does not use views returns completions without views.
         """
         masks = [np.asarray(mask, dtype=bool) for mask in masks]
         for mask in masks:
@@ -236,10 +235,9 @@ _FEW_VOXELS = 20  # of visible surface, in all boxes together; fewer say nothing
 
 
 def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str | None:
-    """How the probabilities of boxes ignore the input; None if they do not.
+    """Description of a fault if the probabilities of boxes ignore the input; None without a fault.
 
-    The faults are: all probabilities are one number, or less than 2 % of the visible surface is occupied (0.5 or
-    more).
+    Faults are equal probabilities of all voxels, and probabilities below 0.5 for over 98 % of the visible surface.
     """
     shown = [(p, one.surface) for p, one in zip(filled, seen, strict=True) if one.surface.any()]
     if sum(np.count_nonzero(surface) for _, surface in shown) < _FEW_VOXELS:
@@ -258,7 +256,7 @@ def fault_of(seen: Sequence[ObservedBox], filled: Sequence[np.ndarray]) -> str |
 
 
 def finish(offset: np.ndarray, seen: ObservedBox, filled: np.ndarray, key: str) -> Completion:
-    """A completion after the removal of free space. A visible object keeps its surface if nothing else is left."""
+    """A completion without free space. If no voxel reaches 0.5, the visible surface gets probability 1."""
     p = np.array(filled, dtype=np.float32)
     p[seen.free] = 0
     if p.size and not (p >= 0.5).any():
@@ -276,7 +274,7 @@ class ClipCompleter(Completer):
 
 
 def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: float = 0.5) -> np.ndarray:
-    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis; 0 is free and k + 1 the k-th completion.
+    """Label grid (X, Y, Z) uint16 of the completions of one hypothesis; 0 is free, and k + 1 is completion k.
 
     `threshold` is the least probability of an occupied voxel.
     """
@@ -303,11 +301,12 @@ def arbitrate(completions: Sequence[Completion], grid: VoxelGrid, threshold: flo
 def occupancy_of(
     completions: Sequence[Completion], labels: np.ndarray, grid: VoxelGrid, least: float = 0.02
 ) -> Occupancy | None:
-    """The probabilities of the completions of one hypothesis; None if all are 0 or 1.
+    """The occupancy probabilities of one hypothesis from its completions; None if all probabilities are 0 or 1.
 
     A voxel is free or belongs to one of its candidate objects. The odds of an object against free space are the odds
-    of its completion. `labels` (X, Y, Z) are those of `arbitrate`. An object is not a candidate for a voxel if it has
-    fewer readings there than the labelled object, or if it has no label. Probabilities below `least` count as 0.
+    of its completion. `labels` (X, Y, Z) is the result of `arbitrate`. An object is not a candidate for a voxel if
+    the labelled object has more readings in the voxel, or if no voxel has the object's label. Probabilities below
+    `least` count as 0.
     """
     if all(((one.probability == 0) | (one.probability == 1)).all() for one in completions):
         return None
@@ -341,7 +340,7 @@ def _break_ties(
     completions: Sequence[Completion],
     threshold: float,
 ) -> None:
-    """Assign tied voxels to the object with the nearest visible surface; at equal distance, to the smaller key."""
+    """Assign tied voxels to the object with the nearest visible surface, or the smaller key at equal distance."""
     order = sorted(range(len(completions)), key=lambda k: completions[k].key)
     voxels, points, p = np.argwhere(tied), most[tied], best[tied]
     distances = [_distance_of_contender(completions[k], voxels, points, p, threshold) for k in order]
@@ -351,9 +350,9 @@ def _break_ties(
 def _distance_of_contender(
     one: Completion, voxels: np.ndarray, points: np.ndarray, p: np.ndarray, threshold: float
 ) -> np.ndarray:
-    """Distance (n,) of voxels (n, 3) from the surface of an object; infinite where the object is not one of the best.
+    """Distance (n,) of voxels (n, 3) from an object's surface; infinite if the object does not tie for the voxel.
 
-    The best objects have as many readings as `points` (n,) and the probability `p` (n,).
+    An object ties if its number of readings is `points` (n,) and its probability is `p` (n,).
     """
     local = voxels - one.offset
     contends = ((local >= 0) & (local < one.probability.shape)).all(axis=1)

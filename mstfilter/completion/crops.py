@@ -1,4 +1,4 @@
-"""The input of the completion network: a crop of the voxel lattice around the visible part of an object.
+"""The input of the completion network: a crop of the voxel grid around the visible part of an object.
 
 >>> low, high = crop_box(voxels, grid)                     # the limits of the crop
 >>> x = channels(bits, signed, height)                     # the input of the network
@@ -41,27 +41,27 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class Architecture(ABC):
-    """Builds a completion network that the user trained.
+    """Builds a completion network for weights that the user trained.
 
-    The weights of the network are in the folder of a model (`mstfilter.trained`).
-
-    The file ``model.toml`` of the folder has the name of the class as `architecture`.
+    The weights are in the folder of a model (`mstfilter.trained`). In ``model.toml`` of this folder, the entry
+    `architecture` is the name of the class.
     """
 
     @abstractmethod
     def build(self) -> nn.Module:
-        """The network with arbitrary weights.
+        """Build the network with arbitrary weights.
 
-        The input of the network is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. The outputs of the
-        network are logits, (b, X, Y, Z) or (b, 1, X, Y, Z).
+        The input of the network is (b, 8, X, Y, Z) float32, with the channels of `CHANNELS`. The output is an array
+        of logits, (b, X, Y, Z) or (b, 1, X, Y, Z).
         """
 
 
 def crop_box(voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """First voxel (3,) of the crop of an object with readings in `voxels` (k, 3), and the voxel after its last.
+    """First voxel (3,) of the crop of an object with readings in `voxels` (k, 3), and the voxel after the crop.
 
-    The crop is centred on the range of the readings (2 % to 98 %), and its bottom is on the table. The crop ends at
-    the border of the grid. If the object is larger than all crops of the network, the crop contains the whole object.
+    The crop is centred on the range of the readings (percentiles 2 to 98), and the bottom of the crop is on the
+    table. The crop ends at the border of the grid. If the object is larger than all crops of the network, the crop
+    contains the whole object.
     """
     low, high = np.percentile(voxels, (2, 98), axis=0)
     table = max(0, int(np.floor(-grid.origin[2] / grid.voxel_size + 1e-6)))

@@ -17,7 +17,7 @@ from mstfilter.completion.observed import ObservedBox
 
 @dataclass(frozen=True)
 class SurfaceOnly(Completer):
-    """No completion: the result is the visible surface."""
+    """A completer that returns the visible surface alone."""
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
         return seen.surface.astype(np.float32)
@@ -32,16 +32,16 @@ class Extrude(Completer):
     Parameters
     ----------
     below : float
-        Probability of a hidden voxel under the surface (precision measured on procedural scenes: .8).
+        Probability of an occluded voxel below the surface. The default is the precision on simulated scenes.
     floor : float
-        Voxels below this height in metres are free.
+        Voxels below `floor` metres are free.
     """
 
     below: float = 0.8
     floor: float = 0.0
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probability 1 on the visible surface and `below` under it."""
+        """Probability 1 on the visible surface, and `below` for the voxels below the surface."""
         filled = extruded_down(seen.surface, seen.other_surface)
         p = np.where(seen.surface, 1.0, np.where(filled, self.below, 0.0)).astype(np.float32)
         p[:, :, seen.height < self.floor] = 0
@@ -49,7 +49,7 @@ class Extrude(Completer):
 
 
 def extruded_down(surface: Any, other_surface: Any) -> Any:
-    """A surface (..., Z) bool and the voxels below it, down to another surface; an array or a torch tensor."""
+    """A surface (..., Z) bool and the voxels below, down to another surface; an array or a torch tensor."""
     filled = surface | False  # a copy
     for k in range(surface.shape[-1] - 2, -1, -1):
         filled[..., k] |= filled[..., k + 1] & ~other_surface[..., k]

@@ -1,12 +1,12 @@
-"""Completion by a trained network, either that of this package (`mstfilter.completion.unet`) or one of the user.
+"""Completion by a trained network: the network of this package (`mstfilter.completion.unet`), or a user's network.
 
 >>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the weights of the package
 >>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
 >>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
-The network works on a lattice of 1 cm. If the voxels of the workspace have another size, the object is completed on
-this lattice and the result is interpolated. Objects larger than 64 cm are extruded as by `Extrude`, since the network
-was trained on smaller objects.
+The network uses a grid with voxels of 1 cm (the lattice). If the voxels of the workspace have another size, the
+object is completed on the lattice, and the result is interpolated. `Extrude` completes objects larger than 64 cm,
+because the network was trained on smaller objects.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class NetworkCompleter(Completer, UsesFiles):
     weights : str
         Name of a trained model of the package, the folder of a model (`mstfilter.trained`), or an ONNX file.
     least_surface : float
-        If the network leaves out a large visible surface but for less than this share, the surface is kept with
-        probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
+        If the network keeps less than the share `least_surface` of a large visible surface, the whole surface gets at
+        least probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
         network removes much of their surface. With 0, the network's probabilities are used.
     architecture : Architecture, optional
-        The architecture of the model in the folder. By default the architecture is the architecture of this package.
+        The architecture of the model in the folder. The default is the architecture of this package's network.
     """
 
     weights: str = "completion"
@@ -56,7 +56,7 @@ class NetworkCompleter(Completer, UsesFiles):
 
     @property
     def network(self) -> TrainedNetwork:
-        """The network with its weights. Raises InputError if weights are missing or cannot be used."""
+        """The network with its weights. Raises InputError if weights are missing or invalid."""
         try:
             from mstfilter.completion.unet import load_network
         except ImportError as error:
@@ -131,7 +131,7 @@ class NetworkCompleter(Completer, UsesFiles):
         return results
 
     def _with_surface(self, p: np.ndarray, seen: ObservedBox) -> np.ndarray:
-        """Probabilities (a, b, c), of at least .5 at the surface of the latest frame if most of it is left out."""
+        """Probabilities (a, b, c), at least .5 on the visible surface if the network removes much of this surface."""
         with np.errstate(invalid="ignore"):
             layer = seen.surface & (seen.signed < _LAYER) & binary_dilation(seen.points > 0, np.ones((3, 3, 3)))
         n = np.count_nonzero(layer)

@@ -1,13 +1,13 @@
-"""The input of completion: what frames show of an object, in a box of the grid around it.
+"""The input of completion: the observations of an object, in a box of the grid around the object.
 
 >>> offset, seen = observed_box(frame, mask, grid, completer)     # of one frame
 >>> bits, signed = encode_box(seen)                               # packed: the contents of an `ObjectView`
 >>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
 
-**Earlier frames.** When an object moves, its views move with it. Values of a view are read at the nearest voxel. The
-surface of an object, the space behind the surface and the free space around it remain evidence about its shape. Other
-objects, and the space that they hide, are not evidence, since they may have moved. The latest frame takes precedence
-where it measures the object's surface.
+**Earlier frames.** When an object moves, the views of the object move with it. Values of a view are read at the
+nearest voxel. A view contributes the surface of the object, the space behind this surface and the free space around
+it. Surfaces of other objects, and the space that they occlude, are ignored, because the other objects may have moved.
+If the latest frame and a view differ about the object's surface, the latest frame takes precedence.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in 
 
 @dataclass(frozen=True, eq=False)
 class ObservedBox:
-    """What a frame shows of a box of the grid around one mask."""
+    """The observation of a box of the grid around one mask by a frame."""
 
     points: np.ndarray  #: (a, b, c) int32: readings of the mask in each voxel
     #: (a, b, c) bool, visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
@@ -67,7 +67,7 @@ class ObservedBox:
 
 
 def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
-    """The box of a mask: its offset (3,) in the grid, and what the frame shows of it.
+    """The box of a mask: its offset (3,) in the grid, and the observation of the box by the frame.
 
     `rule` defines the size of the box, and which voxels are visible surface and free space.
     """
@@ -84,7 +84,7 @@ def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 def observed_in(
     frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer, low: np.ndarray, high: np.ndarray
 ) -> ObservedBox:
-    """What a frame shows of a mask in the box from voxel `low` to `high`. The mask may be empty."""
+    """The observation of a mask in the box from voxel `low` to `high`. The mask may be empty."""
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     shape = tuple(int(n) for n in high - low)
     mine = mask_voxels(frame, mask, grid)
@@ -110,7 +110,7 @@ def observed_in(
 
 
 def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Flat pixels with a reading inside the grid (k,), and their voxels (k, 3)."""
+    """Flat indices (k,) of the pixels with a reading inside the grid, and the voxels (k, 3) of these readings."""
 
     def compute() -> tuple[np.ndarray, np.ndarray]:
         index = grid.index_of(frame.points)
@@ -121,7 +121,7 @@ def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]
 
 
 def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
-    """Voxels (X, Y, Z) bool in front of the measured surface by `margin` voxels and by `sigmas` of its noise."""
+    """Voxels (X, Y, Z) bool at least `margin` voxels and `sigmas` standard deviations in front of the surface."""
 
     def compute() -> np.ndarray:
         geometry = frame_geometry(frame, grid)
@@ -132,7 +132,7 @@ def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.nda
 
 
 def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
-    """Packed box: flags of `Seen` (a, b, c) uint8, and signed distances (a, b, c) int8 in `_REACH` / 127."""
+    """Packed box: flags of `Seen` (a, b, c) uint8, and signed distances (a, b, c) int8 in units of `_REACH` / 127."""
     bits = np.zeros(seen.surface.shape, np.uint8)
     shown = (seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)
     for flag, one in zip(Seen, shown, strict=True):
@@ -149,10 +149,10 @@ def decode_signed(signed: np.ndarray) -> np.ndarray:
 def observed_again(
     frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid, rule: Completer, refute: bool = True
 ) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:
-    """The box of a mask, which may be empty, and of earlier views of the object.
+    """The box of a mask and of earlier views of the object. The mask may be empty.
 
-    Returns the offset (3,) of the box, the evidence of the frame, the evidence of the frame and the views together
-    (`recall`), and the views. Views that the frame contradicts are omitted, unless `refute` is false. The box is
+    Returns the offset (3,) of the box, the observation by the frame, the observation by the frame and the views
+    together (`recall`), and the views. If `refute` is true, views that contradict the frame are omitted. The box is
     empty if no part of the object lies inside the grid.
     """
     if views and refute:
@@ -166,7 +166,7 @@ def observed_again(
 
 
 def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """First voxel (3,) of a box around `voxels` (k, 3) down to the grid's floor, and the voxel after its last."""
+    """First voxel (3,) of a box around `voxels` (k, 3) down to the grid's floor, and the voxel after the box."""
     if not len(voxels):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)
@@ -177,8 +177,8 @@ def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.
 def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid) -> np.ndarray:
     """Voxels (k, 3) of the readings of a mask, and of the surfaces of views.
 
-    Each reading has the weight that it has in an image of 640 x 480 pixels, so that crops do not depend on the image
-    size. The crops are centred on the latest frame, as in the training.
+    Readings are repeated or omitted to give the number in an image of 640 x 480 pixels, so crops do not depend on the
+    image size. The crops are centred on the latest frame, as in the training.
     """
     readings = mask_voxels(frame, mask, grid)
     if not views:
@@ -190,7 +190,7 @@ def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView],
 
 
 def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]) -> ObservedBox:
-    """What a frame shows of a box at `offset` (3,), together with earlier views of the object."""
+    """The observation of a box at `offset` (3,) by a frame and by earlier views of the object."""
     if not views:
         return seen
     shape = seen.surface.shape
@@ -213,9 +213,9 @@ def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequen
 
 
 def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which centres (n, 3) lie in the box of a view (n,) bool, and what the view shows of the object there.
+    """Whether centres (n, 3) lie in the box of a view (n,) bool, and the observation by the view at these centres.
 
-    The evidence consists of flags of `Seen` (k,) and signed distances (k,) in voxels, NaN where nothing is shown.
+    The observation consists of flags of `Seen` (k,), and signed distances (k,) in voxels, NaN if unknown.
     """
     index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
     inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
@@ -230,8 +230,8 @@ def _confirmed(
 ) -> tuple[ObjectView, ...]:
     """The views that the latest frame does not contradict.
 
-    A view is contradicted if its surface is observed as free, its free space is now surface, or none of its surface
-    is near the current surface.
+    A frame contradicts a view if it observes much of the view's surface as free, or much of the view's free space as
+    surface. A view is also contradicted if little of its surface is near the current surface.
     """
     centres = grid.centre_of(np.indices(seen.surface.shape).reshape(3, -1).T + offset)
     now, near, n_now = seen.surface.ravel(), binary_dilation(seen.surface).ravel(), int(seen.surface.sum())
@@ -248,6 +248,6 @@ def _confirmed(
 
 
 def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:
-    """Voxels (k, 3), also outside the grid, to which the surface of a view has moved."""
+    """Voxels (k, 3) of the moved surface of a view, inside and outside the grid."""
     centres = grid.centre_of(np.argwhere(Seen.SURFACE.among(view.bits)) + view.offset)
     return grid.index_of(view.motion.apply(centres)) if len(centres) else np.zeros((0, 3), np.int64)

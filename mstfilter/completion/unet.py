@@ -1,17 +1,17 @@
-"""The completion network: a small 3-D U-Net with a latent variable for the hidden extent. This module imports torch.
+"""The completion network: a small 3-D U-Net with a latent variable for the occluded shape. The module needs torch.
 
 >>> network = load_network("completion")
 >>> p = network.probabilities([seen], edge=32)      # (1, 32, 32, 32)
 
-The input is a crop of the workspace's voxel lattice (`mstfilter.completion.crops`). The output is a logit for each
-voxel. The blocks have a half, a quarter and an eighth of the resolution. At the input and the output, 2 x 2 x 2
-voxels are packed as channels. A latent vector z scales and shifts the features at the two coarse levels (FiLM; Perez
-et al., "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). The vector z is the mode of a prior
-that depends on the input. In training, z is drawn from a posterior that also depends on the true shape. The network
-is a conditional variational autoencoder (Sohn, Lee and Yan, "Learning structured output representation using deep
-conditional generative models", NeurIPS 2015).
+The input is a crop of the workspace's voxel grid (`mstfilter.completion.crops`). The output is a logit for each
+voxel. The residual blocks work at a half, a quarter and an eighth of the resolution. At the input and the output, 2 x
+2 x 2 voxels are packed as channels. A latent vector z scales and shifts the features at the two coarse levels (FiLM;
+Perez et al., "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). The vector z is the mode of a
+prior that depends on the input. In training, z is drawn from a posterior that also depends on the true shape. The
+network is a conditional variational autoencoder (Sohn, Lee and Yan, "Learning structured output representation using
+deep conditional generative models", NeurIPS 2015).
 
-`load_network` also loads networks of users: an `Architecture` with weights in a folder, or an ONNX file.
+`load_network` also loads a user's network: an `Architecture` with weights in a folder, or an ONNX file.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _to_voxels(x: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """Residual block of two convolutions. The features between the convolutions are scaled and shifted by z."""
+    """Residual block. The latent vector z scales and shifts the features between the two convolutions."""
 
     def __init__(self, width: int, latent: int = 0) -> None:
         super().__init__()
@@ -75,14 +75,14 @@ class _Block(nn.Module):
 
 
 class CompletionNet(nn.Module):
-    """The network that the module describes.
+    """The conditional variational autoencoder for completion (see the module).
 
     Parameters
     ----------
     channels : int
         Number of input channels.
     width : int
-        Number of features at half the resolution, a multiple of 8. The lower levels have two and four times as many.
+        Number of features at half the resolution, a multiple of 8. The coarser levels have 2 and 4 times this number.
     latent : int
         Dimension of z.
     """
@@ -109,7 +109,7 @@ class CompletionNet(nn.Module):
         self.rule = nn.Parameter(torch.tensor([-3.0, 4.4]))
 
     def encode(self, x: Tensor) -> tuple[list[Tensor], LatentLaw]:
-        """Features of an input (b, channels, X, Y, Z) with edges that are multiples of 8, and the prior of z."""
+        """Features of an input (b, channels, X, Y, Z), and the prior of z. X, Y and Z are multiples of 8."""
         fine = self.fine(self.stem(to_channels(x)))
         middle = self.middle(self.down1(fine))
         coarse = self.down2(middle)
@@ -142,7 +142,7 @@ class TrainedNetwork:
     Parameters
     ----------
     forward : callable
-        Maps the input (b, channels, X, Y, Z) to logits (b, X, Y, Z).
+        Function from the input (b, channels, X, Y, Z) to logits (b, X, Y, Z).
     key : str
         Key of the contents of the weights.
     scale, shift : float
@@ -170,7 +170,7 @@ class TrainedNetwork:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Use one thread of torch in the block, since sums of convolutions depend on the number of threads."""
+    """Use one thread of torch in the block, because sums of convolutions depend on the number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -181,9 +181,9 @@ def _one_thread() -> Iterator[None]:
 
 @functools.lru_cache(maxsize=4)
 def load_network(name: str, architecture: Architecture | None = None) -> TrainedNetwork:
-    """The network of a model's name or folder (see `mstfilter.trained.open_model`), or of an ONNX file.
+    """Load a network by the name or folder of its model (see `mstfilter.trained.open_model`), or from an ONNX file.
 
-    A network of the user is tested on each size of crops. Raises InputError if the network cannot be used.
+    A user's network is tested on each crop size. Raises InputError if the network fails or returns invalid output.
     """
     if architecture is None and not name.endswith(".onnx"):
         model = open_model(name, ARCHITECTURE)
@@ -213,7 +213,7 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
 
 
 def _checked(name: str, forward: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """The logits (b, X, Y, Z) of a user's network. Raises InputError if the network or its output cannot be used."""
+    """The logits (b, X, Y, Z) of a user's network. Raises InputError if the network fails or a logit is invalid."""
     try:
         out = forward(x)
     except Exception as error:  # of the user's code or of the runtime: any

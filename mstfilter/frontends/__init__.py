@@ -1,17 +1,17 @@
-"""Front ends from other programs: segmentations and networks that users supply by path.
+"""Front ends from other programs: segmentations and shapes in folders, and networks in files.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
 
 ==================  ===================================================================
 `mask_files`        folders of instance masks with alternatives: layout, reader, writer
-`mask_trees`        nested masks as a tree whose cuts are levels
+`mask_trees`        nested masks as a tree whose cuts are segmentations
 `mask_proposal`     the proposal, and the recipe for SAM
-`completions`       meshes, point clouds and voxels of others as completions
+`completions`       meshes, point clouds and voxels of other programs as completions
 ==================  ===================================================================
 
 The networks of the published system, COB and SiamMask, and the tracker SAM 2 are files in ``models/published``. The
-registry loads these files like components of users. No weights are part of the package, and none are downloaded.
+registry loads these files like components of users. The package has no weights of these networks.
 """
 
 from mstfilter.lazy import attach

@@ -2,22 +2,21 @@
 
 >>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
-In the layout, the numbers count the pauses (`Clip.index`), from 0::
+The subfolders are numbered by pause (`Clip.index`), from 0:
 
-    shapes/000001/cup/mask.png         the mask of the object in the image of the pause, not 0
-
-    shapes/000001/cup/a.ply  b.npz     its shape; several files are draws
-    shapes/000001/cup/weights.json     optional, beside the draws: {"a.ply": 2, "b.npz": 1}
+* ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, not 0 on the object.
+* ``shapes/000001/cup/a.ply``, ``b.npz``: shapes of this object. Each hypothesis draws one shape.
+* ``shapes/000001/cup/weights.json``: optional weights of the shapes, for example {"a.ply": 2, "b.npz": 1}.
 
 A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world:
 
-* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a cloud (ply) if there are no triangles. open3d reads it.
-* ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probability of voxels with edge ``voxel_size`` along
-  the axes of the frame. The first corner is ``origin`` (3,).
+* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a point cloud (ply without triangles), read by open3d.
+* ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probabilities of voxels with edge ``voxel_size``.
+  ``origin`` (3,) is the first corner, and the axes are the axes of the frame.
 
-A voxel is inside a mesh if its centre is inside. Inside is decided by the parity of crossings along three axes, of
-which two must agree. So small holes have no effect. A voxel is occupied by a cloud if it contains a point. Spaces
-enclosed by occupied voxels are filled.
+A mesh occupies a voxel if the voxel's centre is inside the mesh. The centre is inside if rays in at least two of
+three directions cross the mesh an odd number of times, so small holes have no effect. A point cloud occupies the
+voxels that contain a point, and the space that these voxels enclose.
 """
 
 from __future__ import annotations
@@ -72,17 +71,18 @@ class ObjectShapes:
 
 @dataclass(frozen=True)
 class ExternalCompletion(ClipCompleter, UsesFiles):
-    """Shapes from a folder instead of an estimate.
+    """Completion by the shapes in a folder.
 
-    The shapes of a mask are those of the stored mask with the highest IoU, at least 0.5. Of several, one is drawn for
-    each hypothesis by its weight. Voxels observed as free are cleared, and the visible surface is occupied.
+    A mask gets the shapes of the stored mask with the highest IoU, at least 0.5. If the object has several shapes,
+    each hypothesis draws one shape by weight. Voxels observed as free are cleared, and the visible surface is
+    occupied.
 
     Parameters
     ----------
     folder : str
         The folder of shapes.
     axes : {"camera", "world"}
-        The frame of the shapes.
+        The coordinate frame of the shapes.
     other : Completer, optional
         Completer of masks without a stored mask. By default, a mask without a stored mask is an error.
     """
@@ -101,7 +101,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
                     self._volume(path, clip.after.camera, clip.grid)
 
     def at(self, clip: Clip) -> ExternalCompletion:
-        """The completer with the shapes of the pause that the clip ends at."""
+        """The completer with the shapes of the pause at the end of the clip."""
         found = read_shapes(self.folder, clip.index, clip.after.depth.shape)
         other = self.other.at(clip) if isinstance(self.other, ClipCompleter) else self.other
         return bound_to(self, _shapes=found, other=other)
@@ -118,9 +118,9 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Place the shapes of several masks; views are not used.
+        """Complete several masks by the shapes in the folder. Views are not used.
 
-        Raises InputError before `at`, or if a mask has no shapes.
+        Raises InputError if `at` was not called before, or if a mask has no shapes.
         """
         if "_shapes" not in self.__dict__:
             raise InputError("ExternalCompletion does not know the pause of a frame", "call at(clip) first")
@@ -153,14 +153,14 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return Completion(offset, p, seen.points, key.hex()[:16])
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
-        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once and stored."""
+        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once."""
         data = read_bytes(path, "a shape")
         T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
         key = (content_key(path.suffix, data, T), grid.key)
         return memo("external_shape", key, lambda: place_shape(path, data, T, grid))
 
     def _reaching(self, shape: np.ndarray, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> ExternalCompletion:
-        """This completer with a padding such that the box of the mask contains a shape (X, Y, Z)."""
+        """This completer with enough padding that the box of the mask contains a shape (X, Y, Z)."""
         occupied = occupied_box(shape > 0)
         readings = grid.index_of(frame.points[mask & frame.valid])
         readings = readings[grid.contains(readings)]
@@ -172,9 +172,9 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
 
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
-    """The objects of a pause. `shape` is the shape of the image, (H, W). Shapes are read when they are placed.
+    """The objects of a pause. `shape` is the shape (H, W) of the image. Files of shapes are not opened.
 
-    Raises InputError if the folder, a mask or a shape is missing, or a mask or weights.json cannot be used.
+    Raises InputError if the folder, a mask or a shape is missing, or if a mask or weights.json is invalid.
     """
     if not str(folder):
         raise InputError(
@@ -205,7 +205,7 @@ def _read_object(folder: Path, shape: tuple[int, int]) -> ObjectShapes:
 def place_shape(path: Path, data: bytes, T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """Occupancy (X, Y, Z) float32 of the shape of a file, moved by `T` (4, 4) into the world.
 
-    Raises InputError if the file cannot be used, or the shape is outside the grid or larger than twice its diagonal.
+    Raises InputError if the file is invalid, or the shape is outside the grid or larger than two grid diagonals.
     """
     if path.suffix == ".npz":
         arrays = _arrays(path, data)
@@ -226,7 +226,7 @@ def place_shape(path: Path, data: bytes, T: np.ndarray, grid: VoxelGrid) -> np.n
 
 
 def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Points (n, 3) in the world."""
+    """Points (n, 3) moved by `T` into the world, after checks of shape, values and size."""
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"{path} has points of shape {points.shape}, expected (n, 3)")
     if points.dtype.kind not in "fiu" or not np.isfinite(points).all():
@@ -247,7 +247,7 @@ def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
 
 
 def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """The value of the array's voxel that contains the centre of each voxel of the grid; 0 outside."""
+    """The array's values at the centres of the grid's voxels, read from the nearest voxel; 0 outside the array."""
     values = arrays["occupancy"]
     if values.ndim != 3 or values.dtype.kind not in "bfiu" or not values.size:
         raise InputError(f"{path}: occupancy has shape {values.shape} and type {values.dtype}, expected (A, B, C)")
@@ -264,7 +264,7 @@ def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: Vo
 
 
 def _cloud(points: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Voxels with points, and the voxels that they enclose."""
+    """Occupancy of the voxels with points, and of the voxels that these voxels enclose."""
     from scipy.ndimage import binary_fill_holes
 
     index = grid.index_of(points)
@@ -277,7 +277,7 @@ def _cloud(points: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3); no triangles for a cloud."""
+    """Vertices (n, 3) and triangles (m, 3) of a file; a point cloud has no triangles."""
     o3d = import_open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh: Any = o3d.io.read_triangle_mesh(str(path))
@@ -290,7 +290,7 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh(points: np.ndarray, triangles: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Voxels whose centres are inside a mesh: odd numbers of crossings along at least two of three directions."""
+    """Occupancy (X, Y, Z) of a mesh: 1 for voxels with odd numbers of crossings in two of three directions."""
     o3d = import_open3d()
     low = np.clip(grid.index_of(points.min(axis=0)) - 1, 0, grid.shape)
     high = np.clip(grid.index_of(points.max(axis=0)) + 2, 0, grid.shape)

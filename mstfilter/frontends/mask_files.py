@@ -5,20 +5,20 @@
 >>> len(masks.trees), masks.weights
 (2, array([0.7, 0.3]))
 
-In the layout, the numbers count the pauses (`Clip.index`), from 0::
+The files and subfolders are numbered by pause (`Clip.index`), from 0:
 
-    masks/000000.png              one segmentation of the image at pause 0
-    masks/000001/a.png, b.npz     several alternatives of the whole image
-    masks/000001/weights.json     optional, beside the alternatives: {"a.png": 2, "b.npz": 1}
+* ``masks/000000.png``: one segmentation of the image at pause 0.
+* ``masks/000001/a.png``, ``b.npz``: alternative segmentations of the whole image at pause 1.
+* ``masks/000001/weights.json``: optional weights of the alternatives, for example {"a.png": 2, "b.npz": 1}.
 
-A file is one set of masks of the size of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
+A file has one set of masks with the shape of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
 
 * ``.png``: label image, 8 or 16 bits, in which 0 means no mask.
-* ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), for labels in ascending
-  order.
+* ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), in ascending order of
+  the labels.
 
 Scores are at least 0. Missing scores are 1. Without weights.json, the weight of an alternative is the mean score of
-its largest masks. Weights need not sum to 1. For objects that are uncertain independently of each other, use nested
+its largest masks. Weights need not sum to 1. If several objects are uncertain independently of each other, use nested
 masks in one alternative.
 """
 
@@ -49,7 +49,7 @@ _KINDS = {"labels": (2, "iu", "integers (H, W)"), "masks": (3, "b", "bool (n, H,
 
 @dataclass(frozen=True, eq=False)
 class PauseMasks:
-    """The alternatives of a pause, one of which is true."""
+    """The alternative segmentations of a pause."""
 
     weights: np.ndarray  #: (k,) probabilities, their sum is 1
     trees: tuple[Tree, ...]  #: the masks of each alternative; leaf 0 is the rest of the image
@@ -58,10 +58,10 @@ class PauseMasks:
 
 
 def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
-    """Read the masks of a pause. `shape` is the shape of the image, (H, W).
+    """Read the masks of a pause. `shape` is the shape (H, W) of the image.
 
     Files are read at each call, but their content is parsed once. Raises InputError if the folder has no masks for
-    the pause, or a file cannot be used.
+    the pause, or if a file is invalid.
     """
     if not str(folder):
         raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")
@@ -75,7 +75,7 @@ def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseM
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Entries of a folder by name, without hidden ones."""
+    """Entries of a folder in order of their names, without hidden entries."""
     return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
 
 
@@ -118,7 +118,7 @@ def _alternatives(folder: Path) -> list[Path]:
 
 
 def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
-    """The weight of each file from weights.json, if there is one."""
+    """The weight of each file from weights.json; None if this file does not exist."""
     path = folder / _WEIGHTS
     if not path.is_file():
         return None
@@ -138,7 +138,7 @@ def read_weights(folder: Path, files: list[Path]) -> list[float] | None:
 def _parsed(
     content: Mapping[Path, bytes], weights: Sequence[float] | None, shape: tuple[int, int], key: bytes = b""
 ) -> PauseMasks:
-    """The alternatives in the content of files."""
+    """Parse the alternatives from the content of files."""
     trees, stops, means = [], [], []
     for path, data in content.items():
         with naming(str(path)):
@@ -182,7 +182,7 @@ def _read_png(path: Path, data: bytes, shape: tuple[int, int]) -> tuple[np.ndarr
 
 
 def read_label_image(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """A label image (H, W) of the size of the image; raises InputError if it has another."""
+    """Read a label image (H, W). Raises InputError if the shape of the image is not `shape`."""
     labels = read_labels(path)
     _check_shape(path, labels.shape, shape)
     return labels
@@ -219,18 +219,18 @@ def write_masks(
 ) -> None:
     """Write the alternatives of a pause as npz files. Earlier masks are replaced.
 
-    Nothing is written if the masks cannot be read; see `mstfilter.frontends.mask_files`.
+    No file is written if the masks do not pass the checks of `read_masks`.
 
     Parameters
     ----------
     folder : str or Path
     pause : int
-        `Clip.index` of the clip whose last frame is segmented by the masks.
+        `Clip.index` of the clip. The masks segment the last frame of the clip.
     alternatives : sequence
-        Each alternative is a label image (H, W), masks (n, H, W) bool that are disjoint or nested, or one of these
-        with its scores.
+        Each alternative is a label image (H, W), or disjoint or nested masks (n, H, W) bool, or a pair of such an
+        array and its scores.
     weights : sequence of float, optional
-        One weight for each alternative. By default, computed from the scores.
+        One weight for each alternative. By default, the weights are computed from the scores.
     """
     path = Path(folder) / f"{pause:06d}"
     if not len(alternatives) or (weights is not None and len(weights) != len(alternatives)):

@@ -3,8 +3,8 @@
 >>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
 
-`mstfilter.frontends.mask_files` describes the folder. A sampled segmentation is a cut of the tree of masks of one
-alternative, which is drawn by its weight. Each distinct mask is completed once.
+`mstfilter.frontends.mask_files` describes the folder. For each sample, an alternative is drawn by weight, and the
+segmentation is a cut of the alternative's tree of masks. Each distinct mask is completed once.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class MaskProposal(Proposal, UsesFiles):
     folder : str
         The folder of masks.
     sampler : CutSampler
-        Draws the level of nested masks. At temperature 1 the sampler has the distribution of
+        Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution of
         `mstfilter.frontends.mask_trees`.
     objects : ObjectRule
-        Decides which masks are objects. Other masks, such as that of the table, are background. If background masks
-        contain masks, their parts are always used.
+        Rule that decides which masks are objects. Other masks, such as the mask of the table, are background. A
+        background mask that contains masks is always split into its parts.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.
@@ -63,7 +63,7 @@ class MaskProposal(Proposal, UsesFiles):
             read_masks(self.folder, clip.index, clip.after.depth.shape)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """`n` hypotheses about the scene at the end of the clip, with equal weights."""
+        """Sample `n` hypotheses for the scene at the end of the clip, with equal weights."""
         frame, grid = observation.after, observation.grid
         masks = read_masks(self.folder, observation.index, frame.depth.shape)
         chosen: list[list[int]] = [[] for _ in range(n)]
@@ -98,27 +98,27 @@ class MaskProposal(Proposal, UsesFiles):
 
 
 def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np.ndarray:
-    """Probabilities (N,) to stop, which are 0 at masks that contain masks and are not objects, such as the table."""
+    """Stop probabilities (N,), set to 0 at masks that contain masks and are not objects, such as the table."""
     inner = np.arange(tree.n_nodes) >= tree.n_leaves
     return np.where(inner & ~is_object, 0.0, stop)
 
 
 def _number(content: bytes) -> int:
-    """A number of 62 bits that identifies a content in random streams."""
+    """An integer of 62 bits that identifies the random streams of a mask by the content of the mask."""
     return int.from_bytes(content_key(content)[:8], "big") >> 2
 
 
 class MaskGenerator(Protocol):
-    """A mask generator as in SAM (`SamAutomaticMaskGenerator`) and SAM 2 (`SAM2AutomaticMaskGenerator`)."""
+    """Interface of `SamAutomaticMaskGenerator` (SAM) and `SAM2AutomaticMaskGenerator` (SAM 2)."""
 
     def generate(self, image: np.ndarray) -> list[dict[str, Any]]:
-        """Masks of an image (H, W, 3) uint8 RGB; each has `segmentation` (H, W) bool and `predicted_iou`."""
+        """Masks of an image (H, W, 3) uint8 RGB: mappings with `segmentation` (H, W) bool and `predicted_iou`."""
 
 
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
-    """Run a mask generator on the last frame of each clip, and write its masks as nested sets.
+    """Run a mask generator on the last frame of each clip, and write the masks as nested sets.
 
-    `share` is the argument of `nested_masks`.
+    `share` is passed to `nested_masks`.
     """
     for clip in clips:
         found = generator.generate(clip.after.rgb.copy())

@@ -1,4 +1,4 @@
-"""Instance masks as a tree. Nested masks are the nodes of the tree, so levels of detail are cuts.
+"""Instance masks as a tree. Nested masks are nodes of the tree, so a segmentation is a cut.
 
 >>> masks = np.zeros((3, 4, 6), bool)
 >>> masks[0, :, :4], masks[1, :, :2], masks[2, :, 2:4] = True, True, True     # an object, and its two parts
@@ -6,13 +6,13 @@
 >>> w = node_values(tree, stop)
 >>> ExactCuts(temperature=1).sample(rng, tree, w, 10)                        # the object in 60 % of the cuts
 
-Two masks of a set are disjoint, or one contains the other. Leaf 0 of the tree is the part of the image without masks.
-The remaining part of a mask that contains masks is also a leaf. The root joins everything and is never in a cut.
+Two masks of a set are disjoint, or one mask contains the other. Leaf 0 of the tree has the pixels without a mask. If
+a mask contains masks, its remaining pixels are also a leaf. The root is the whole image and is never in a cut.
 
-The distribution of the cuts is defined by a walk that starts at the largest masks. Consider a mask with score s that
-contains masks with mean score m. The walk stops there with probability s / (s + m). If it does not stop, the walk
-visits these masks and the remaining part. `node_values` returns values w for which this is the Gibbs distribution
-exp(sum of w over the cut). So every `CutSampler` at temperature 1 draws from it.
+A walk from the largest masks down the tree defines the distribution of the cuts. If a mask with score s contains
+masks with mean score m, the walk stops at this mask with probability s / (s + m). Otherwise the walk visits the inner
+masks and the remaining pixels. `node_values` returns values w such that the Gibbs distribution exp(sum of w over the
+cut) is the distribution of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _CLIP = 1e-9  # other probabilities are at least this far from 0 and 1
 
 
 def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[Tree, np.ndarray]:
-    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and the probabilities (N,) to stop at its nodes.
+    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and the stop probabilities (N,) of its nodes.
 
-    Raises InputError if a mask is empty, equals another mask, or overlaps one without containing it.
+    Raises InputError if a mask is empty, if two masks are equal, or if two masks overlap and are not nested.
     """
     masks = np.asarray(masks, dtype=bool)
     n = len(masks)
@@ -58,7 +58,7 @@ def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[
 
 
 def label_tree(labels: np.ndarray, scores: np.ndarray | None = None) -> tuple[Tree, np.ndarray]:
-    """The tree of a label image (H, W) of disjoint masks, 0 without mask; `scores` (n,) are by ascending label."""
+    """The tree of a label image (H, W), 0 without mask. `scores` (n,) are in ascending order of the labels."""
     present, image = np.unique(labels, return_inverse=True)
     image = image.reshape(labels.shape) - 1 if (present == 0).any() else image.reshape(labels.shape)
     n = int((present != 0).sum())
@@ -67,7 +67,7 @@ def label_tree(labels: np.ndarray, scores: np.ndarray | None = None) -> tuple[Tr
 
 
 def check_scores(scores: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
-    """Scores as float64 (n,); raises InputError if their number is wrong, or one is negative or not finite."""
+    """Scores as float64 (n,). Raises InputError if their number is not n, or if a score is negative or not finite."""
     scores = np.asarray(scores, dtype=np.float64)
     if scores.shape != (n,):
         raise InputError(f"scores have shape {scores.shape}, expected one for each of {n} masks")
@@ -79,10 +79,10 @@ def check_scores(scores: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
 def _tree_of(
     innermost: np.ndarray, container: np.ndarray, ascending: list[int], scores: np.ndarray
 ) -> tuple[Tree, np.ndarray]:
-    """The tree of nested masks, and the probabilities (N,) to stop at its nodes.
+    """The tree of nested masks, and the stop probabilities (N,) of its nodes.
 
     `innermost` (H, W) is the smallest mask of each pixel, or -1 without a mask. `container` (n,) is the smallest mask
-    that contains a mask, or -1 if none does. `ascending` lists the masks in order of their area.
+    that contains each mask, or -1 for outer masks. `ascending` lists the masks in ascending order of area.
     """
     n = len(scores)
     inner = np.zeros(n, dtype=bool)
@@ -115,7 +115,7 @@ def _tree_of(
 
 
 def node_values(tree: Tree, stop: np.ndarray) -> np.ndarray:
-    """Values (N,) for which the Gibbs distribution at temperature 1 has the probabilities `stop` (N,) to stop."""
+    """Values (N,) for which the Gibbs distribution at temperature 1 has the stop probabilities `stop` (N,)."""
     # exp(w) / (exp(w) + Z of the children) = stop, with log Z = 0 for leaves.
     w, log_z = np.zeros(tree.n_nodes), np.zeros(tree.n_nodes)
     for node in range(tree.n_leaves, tree.n_nodes):
@@ -129,13 +129,13 @@ def node_values(tree: Tree, stop: np.ndarray) -> np.ndarray:
 def nested_masks(
     masks: np.ndarray, scores: Sequence[float] | np.ndarray, share: float = 0.9
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The masks of a set with arbitrary overlaps, made disjoint or nested. Returns masks and scores.
+    """Make masks with arbitrary overlaps disjoint or nested, and return masks and scores.
 
-    Use this function for the output of automatic mask generators. Masks are processed in order of falling score. A
-    mask is compared with every mask kept before. A pair must share at most ``1 - share`` of the smaller mask. If the
-    area of one mask is less than `share` of the other, it may also share at least `share` of the smaller mask. In all
-    other cases the mask is dropped. The smaller mask then loses the pixels outside the mask that contains it. Common
-    pixels of two neighbours go to the mask with the higher score.
+    Use this function for the output of automatic mask generators. Masks are processed in order of decreasing score,
+    and each mask is compared with all kept masks. Two masks are neighbours if they share at most ``1 - share`` of the
+    smaller mask. Two masks are nested if they share at least `share` of the smaller mask, and the smaller area is
+    less than `share` of the larger area. In all other cases the mask is removed. In nested pairs, the smaller mask
+    loses the pixels outside the larger mask. Common pixels of neighbours belong to the mask with the higher score.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

@@ -1,10 +1,10 @@
-"""Live use: frames of a camera in, hypotheses out at every pause.
+"""Live use: a stream takes frames of a camera and returns hypotheses at every pause.
 
 >>> with mstfilter.Stream(K, on_pause=lambda pause: print(pause.hypotheses[0])) as stream:
 ...     for rgb, depth in camera:
 ...         stream.push(rgb, depth)
 
-Modules: `stream` has the `Stream`, and `folder` a folder that a recorder fills.
+Modules: `stream` defines `Stream`, and `folder` filters a folder while another program adds images.
 """
 
 from mstfilter.lazy import attach

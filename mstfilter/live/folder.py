@@ -1,4 +1,4 @@
-"""A folder that a recorder fills, filtered while the images arrive.
+"""Filter a folder of images while another program adds images.
 
 >>> filter_folder(Path("session"), Redwood(pauses=Settled()), load_config("mst"), Path("runs/session"))
 """
@@ -33,13 +33,13 @@ def filter_folder(
 ) -> RunFolder:
     """Filter the images of a folder while they arrive, and return the run folder.
 
-    The files of the pauses are those of a run on the complete folder with the same rule. An interrupted live run
-    cannot be resumed.
+    The files of each pause equal the files of a run on the complete folder with the same pause rule. An interrupted
+    live run cannot be resumed.
 
     Parameters
     ----------
     source : Path
-        Folder with color/ and depth/, to which a recorder adds images.
+        Folder with color/ and depth/, to which another program adds images.
     reader : RecordingFormat
         The reader of the folder: a `Redwood` whose field `pauses` is a `Settled`.
     config : mapping
@@ -49,11 +49,11 @@ def filter_folder(
     seed : int
         Seed of all random streams.
     idle_s : float
-        The run ends if no image arrives for this time.
+        The run ends if no image arrives for `idle_s` seconds.
     replace, allow_files, n_threads
-        As for `mstfilter.runs.filter_recording`.
+        See `mstfilter.runs.filter_recording`.
     on_pause : callable
-        Called with a `Pause` when its files are written.
+        Function that is called with each `Pause` after the files of the pause are written.
     """
     if not isinstance(reader, Redwood):
         name = type(reader).__name__

@@ -1,4 +1,4 @@
-"""A filter of frames that arrive one by one.
+"""Filter the frames of a camera one by one.
 
 >>> with mstfilter.Stream(K) as stream:
 ...     for rgb, depth in camera:
@@ -7,7 +7,7 @@
 ...     stream.hypotheses, stream.belief
 
 One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last
-complete clip. The results are those of a run on the recorded frames with the same pauses.
+complete clip. The results equal the results of a run on the recorded frames with the same pauses.
 """
 
 from __future__ import annotations
@@ -88,24 +88,24 @@ class Stream:
     filter : ParticleFilter or str
         The filter, or the name of a preset.
     pauses : Settled or None
-        The rule that finds the pauses. None: only frames that are pushed with ``pause=True`` are pauses.
+        The rule that finds the pauses. If None, only frames that are pushed with ``pause=True`` are pauses.
     grid : VoxelGrid, optional
-        Workspace. The default is found at the first pause, as for a recording. A camera without a pose gets the pose
-        of the support plane of the first pause.
+        Workspace. By default, the stream finds the workspace at the first pause, as for a recording. A camera without
+        a pose gets its pose from the support plane of the first pause.
     seed : int
         Seed of all random streams.
     on_pause : callable, optional
-        Called with a `Pause` after each step, in the thread of the filter.
+        Function that is called with a `Pause` after each step, in the thread of the filter.
     max_frames : int
-        Largest number of frames that wait, and largest number of frames of a clip. See Notes.
+        Maximum number of queued frames, and maximum number of frames of a clip. See Notes.
     threads : int
-        Threads of one step. The results are the same.
+        Number of threads of one step. The results do not depend on this number.
 
     Notes
     -----
-    If `max_frames` frames wait because the filter is slower than the camera, new frames are dropped. If a clip
-    reaches `max_frames`, the frames with little motion are removed from it. Both are counted in `counts`. So at most
-    three times `max_frames` frames are in memory.
+    If `max_frames` frames are queued because the filter is slower than the camera, new frames are dropped. If a clip
+    reaches `max_frames`, frames with little motion are removed from the clip. `counts` has the number of dropped and
+    removed frames. At most three times `max_frames` frames are in memory.
 
     An error of a thread is raised by the next call of `push`, `wait` or `close`.
     """
@@ -168,18 +168,18 @@ class Stream:
         robot_mask : (H, W) bool, optional
             Pixels that show the robot.
         pause : bool, optional
-            Whether nothing moves at this frame, so that a clip ends. The default is decided by the rule `pauses`.
+            Whether the frame is a pause, which ends a clip. By default, the rule `pauses` decides.
 
         Returns
         -------
         bool
-            Whether the frame was accepted. A frame without depth, with a time stamp that is not later than that of
-            the frame before, or with no place in the queue is dropped and counted.
+            Whether the frame was accepted. A frame is dropped and counted if it has no depth, if its time stamp is
+            not later than the previous time stamp, or if the queue is full.
 
         Raises
         ------
         InputError
-            If the images cannot be used, or a thread of the stream has failed.
+            If the images are invalid, or a thread of the stream has failed.
         """
         arrived = clock.perf_counter()
         self._check()
@@ -218,7 +218,7 @@ class Stream:
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The hypotheses at the last pause; empty before the first one."""
+        """The hypotheses at the last pause; empty before the first pause."""
         return () if self.last is None else self.last.hypotheses
 
     @property
@@ -237,7 +237,7 @@ class Stream:
         self._check()
 
     def close(self) -> None:
-        """Process the frames that wait, and end the threads."""
+        """Process the queued frames, and end the threads."""
         if self._watcher.is_alive():
             self._queue.put(None)
             self._watcher.join()
@@ -293,7 +293,7 @@ class Stream:
             self._thin()
 
     def _thin(self) -> None:
-        """Remove the frames with little motion from the clip, and more if that does not suffice."""
+        """Remove the frames with little motion from the clip, then every second frame while the clip is too long."""
         used = self._trackers[0].used if self._trackers else range(0, len(self._clip), 2)
         kept = [self._clip[k] for k in used]
         while len(kept) > self._max // 2:
@@ -304,7 +304,7 @@ class Stream:
         self._track()
 
     def _track(self) -> None:
-        """Track the frames of the clip from its first frame."""
+        """Start the trackers again at the first frame of the clip."""
         self._trackers = [flow.begin(self._clip[0].frame) for flow in self._flows]
         for tracker in self._trackers:
             for item in self._clip[1:]:
@@ -324,13 +324,13 @@ class Stream:
 
     # --- thread of the filter -----------------------------------------------------------------------------------
     def _load(self, frame: Frame, state: State) -> None:
-        """Filter a frame before the first pause, and discard the result. So libraries and networks are loaded."""
+        """Filter a frame before the first pause to load libraries and networks, and discard the result."""
         with contextlib.suppress(InputError):  # the frame need not show the scene at rest
             camera, grid = find_world(frame, self._grid)
             self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
 
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
-        """Filter a clip. The references to `trackers` keep their work until the filter uses it."""
+        """Filter a clip. The argument `trackers` keeps the tracked flow in memory until the filter uses the flow."""
         try:
             with parallel(self._threads):
                 self._state, info = self._filter.step(self._state, clip)
