@@ -20,7 +20,7 @@ import numpy as np
 
 
 def canonical(labels: np.ndarray) -> np.ndarray:
-    """The same segmentation with labels numbered 1, 2, ... by their first voxel; 0 is free."""
+    """The same segmentation with labels 1, 2, ... in the order of their first voxels. Label 0 is free and stays 0."""
     flat = np.asarray(labels).ravel()
     present, first = np.unique(flat, return_index=True)
     order = np.argsort(np.where(present == 0, -1, first), kind="stable")
@@ -47,14 +47,14 @@ class CommonRefinement:
         return int(self.first[-1])
 
     def objects_in(self, cells: np.ndarray) -> np.ndarray:
-        """Whether each object (n_objects + 1,) contains one of these cells; False for 0, free."""
+        """Whether each object contains at least one of the `cells`, (n_objects + 1,). Label 0 (free) has False."""
         present = np.zeros(self.n_objects + 1, bool)
         present[self.objects[:, cells]] = True
         present[0] = False
         return present
 
     def overlaps(self) -> np.ndarray:
-        """Number (n_objects + 1, n_objects + 1) of positions that two objects share; row and column 0 are 0."""
+        """Number of positions that two objects share, (n_objects + 1, n_objects + 1). Row and column 0 are zero."""
         total = self.n_objects + 1
         shared = np.zeros((total, total))
         sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
@@ -89,6 +89,6 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
 
 
 def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
-    """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays 0."""
+    """The number of distinct nonzero codes, and the codes renumbered 1, 2, ... in ascending order. Code 0 stays 0."""
     present, index = np.unique(np.append(codes, 0), return_inverse=True)
     return len(present) - 1, index[:-1]
