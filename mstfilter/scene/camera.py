@@ -191,7 +191,7 @@ def scaled_area(pixels: float, n_pixels: int) -> float:
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
-    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m). `up` points to the image top."""
+    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m). `up` is at the image top."""
     position = np.asarray(position, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - position
     forward /= np.linalg.norm(forward)

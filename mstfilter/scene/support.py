@@ -68,7 +68,7 @@ def above_table(frame: Frame) -> np.ndarray:
 
 
 def filled_above_table(frame: Frame) -> np.ndarray:
-    """`above_table`. For a sparse sensor, each pixel without a reading has the value of the nearest reading."""
+    """Disparity as in `above_table`. For a sparse sensor, holes have the value of the nearest reading."""
     height = above_table(frame)
     beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
     return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
