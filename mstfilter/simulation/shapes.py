@@ -12,10 +12,10 @@ upright pose.
 
 Sizes and masses are rounded values of objects in the YCB set. The YCB set is described by Calli et al., "Benchmarking
 in manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3), 2015, table of
-objects. These objects are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl, banana,
-ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not in the
-set and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm thick, more than real
-walls. A thinner wall could lie between the centres of 1 cm voxels and be missing in the true volume.
+objects. The objects from the set are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl,
+banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not
+in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm thick, more
+than real walls. A thinner wall could lie between the centres of 1 cm voxels and be missing in the true volume.
 
 `label_voxels` returns the true volume: all voxels of each object, visible or not.
 

@@ -229,7 +229,7 @@ class PhysicsWorld:
         return float(-contact.dist[objects].min(initial=0.0))
 
     def save(self) -> np.ndarray:
-        """The full state of the simulation. After `restore`, the simulation continues with identical bits."""
+        """The full state of the simulation. After `restore`, the simulation gives bit-identical results."""
         kind = self._mj.mjtState.mjSTATE_INTEGRATION
         state = np.empty(self._mj.mj_stateSize(self.model, kind))
         self._mj.mj_getState(self.model, self.data, state, kind)
