@@ -143,7 +143,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def image_encoding(message: Any, compressed: bool) -> str:
-    """The encoding of an image message. For compressed images: ``16UC1``, ``32FC1`` or ``compressed colour``."""
+    """The encoding of an image message. A compressed image has ``16UC1``, ``32FC1`` or ``compressed colour``."""
     if not compressed:
         return str(message.encoding)
     named = str(message.format)
@@ -258,9 +258,9 @@ class Bag(VideoFormat):
     Parameters
     ----------
     colour : str
-        Colour topic. By default, the only colour topic.
+        Colour topic. By default, the only colour topic is used.
     depth : str
-        Depth topic. By default, the only depth topic that is registered to colour.
+        Depth topic. By default, the only depth topic that is registered to colour is used.
     registered : bool
         Treat depth as registered to colour even if its frame_id or camera matrix differs.
     """

@@ -38,7 +38,7 @@ class PairedImages(RecordingFormat):
     Parameters
     ----------
     frames : tuple of str
-        Names of the frames in order. By default, all frames, sorted by name with numbers in numerical order.
+        Names of the frames in order. By default, all frames are read, sorted by name with numbers in numerical order.
     """
 
     frames: tuple[str | int, ...] = ()
@@ -98,7 +98,7 @@ _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "ca
 
 @dataclass(frozen=True)
 class Redwood(VideoFormat):
-    """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics: Redwood, Open3D, many recorders.
+    """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics, as in Redwood and Open3D.
 
     Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
@@ -111,9 +111,9 @@ class Redwood(VideoFormat):
     Parameters
     ----------
     depth_scale : float
-        Metres per unit of integer depth. By default, the scale in the file of intrinsics, else 0.001.
+        Metres per unit of integer depth. The default is the scale in the file of intrinsics, else 0.001.
     fps : float
-        Frames per second, if names are no time stamps. By default, the rate in the file of intrinsics, else 30.
+        Frames per second, if names are no time stamps. The default is the rate in the file of intrinsics, else 30.
     """
 
     depth_scale: float = 0.0
@@ -129,9 +129,9 @@ class Redwood(VideoFormat):
     def arriving(self, path: Path, idle_s: float = 10.0) -> Iterator[tuple[float, Frame]]:
         """Yield time in seconds and frame, without a pose, of each image pair that a recorder adds to a folder.
 
-        A pair is read when a later pair exists, or when the files of the pair do not change any more. A colour image
-        without a depth image of the same number is left out. The iteration ends if no pair arrives for `idle_s`
-        seconds.
+        A pair is read when a later pair exists, or when the files of the pair no longer change. A colour image
+        without a depth image of the same number is left out. The iteration ends after `idle_s` seconds without a
+        pair.
         """
         last, since, failed = Decimal(-2), time.monotonic(), None
         while time.monotonic() - since < idle_s:
@@ -185,7 +185,7 @@ class Redwood(VideoFormat):
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a folder is a recording folder. Its camera.json contains more than intrinsics."""
+    """Whether a folder is a recording folder. The camera.json of a recording folder has a workspace."""
     camera = path / "camera.json"
     ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
     return ours or (path / "manifest.json").is_file()

@@ -102,14 +102,14 @@ class Still(PauseRule):
     be at rest for a quarter of the time.
 
     An interval in which a robot waits in the image, or changes it by less than a grey level, also gives a pause.
-    Check the found pauses. Wrong pauses can be replaced by explicit pauses.
+    Check the pauses, and replace wrong pauses by explicit pauses.
 
     Parameters
     ----------
     hold_s : float
         Shortest interval, in seconds.
     levels : float
-        Smallest change of the grey level (of 255) at which a block differs. For noisy blocks, six times the noise.
+        Smallest change of the grey level (of 255) at which a block differs, and at least six times the block's noise.
     region : tuple of 4 float
         Part of the image that is used: left, top, right, bottom as shares of width and height. The selected part can
         exclude people behind the table.
@@ -184,7 +184,7 @@ class Settled(Still):
     """
 
     def watch(self) -> Callable[[float, np.ndarray], bool]:
-        """A function of the time and the colour image of the next frame. Returns whether the frame is a pause."""
+        """A function that takes time and colour image of the next frame and returns whether the frame is a pause."""
         changes = deque[np.ndarray](maxlen=_RECENT)
         first = last = None  # images of the first frame of the interval and of the last frame
         began, found = 0.0, False

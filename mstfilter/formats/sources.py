@@ -40,7 +40,7 @@ def open_recording(
     options : sequence of str
         Settings ``FIELD=VALUE`` of the format.
     pauses : str
-        Rule for the pauses (`mstfilter.formats.pauses.pauses_from_text`). By default, the rule of the format.
+        Rule for the pauses (`mstfilter.formats.pauses.pauses_from_text`). The default is the rule of the format.
     allow_files : bool
         Whether ``./file.py:Class`` may be loaded.
     """

@@ -14,8 +14,8 @@ checks every frame on access. For arrays in memory use `Recording.from_arrays`.
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
 The default camera pose is computed from the support plane of the first pause. A stored motion of the camera is used
-only relative to the first pause, because the table is seldom at z = 0 of a stored trajectory. A `Camera` has no
-distortion, so distorted images are undistorted on access.
+only relative to the first pause, because the table is seldom at z = 0 in the world of a stored trajectory. A `Camera`
+has no distortion, so distorted images are undistorted on access.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ class VideoFormat(RecordingFormat):
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3 of both images. By default, the coefficients in the files, else none.
+        OpenCV's k1, k2, p1, p2, k3 of both images. The default is the coefficients in the files, else none.
     tolerance_s : float
         Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float

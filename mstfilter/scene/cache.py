@@ -139,7 +139,7 @@ class Cache:
 
     @contextlib.contextmanager
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
-        """Also store values that have `stored_as` in a folder that several processes can share (see `DiskCache`).
+        """Also store the values with `stored_as` on disk, in a folder that several processes can share (`DiskCache`).
 
         `limit_bytes` is the largest size of the folder. Values of another `version` of the code are not used.
         """

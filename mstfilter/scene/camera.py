@@ -155,7 +155,7 @@ class Camera:
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Column, row and z-depth (...) of world points (..., 3), and whether each pixel is in the image.
 
-        Column and row are int64. Both are 0 for points outside the image.
+        Column and row are int64, and 0 for points outside the image.
         """
         uv, z = self.project(points)
         pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
@@ -191,7 +191,7 @@ def scaled_area(pixels: float, n_pixels: int) -> float:
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
-    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m). `up` is at the image top."""
+    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), with `up` at the image top."""
     position = np.asarray(position, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - position
     forward /= np.linalg.norm(forward)

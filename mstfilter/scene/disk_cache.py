@@ -59,7 +59,7 @@ class _BytesDisk(diskcache.Disk):
             super().remove(file_path)
 
     def _check_file(self, name: Any) -> None:
-        """Raise ValueError unless a file name from the data base has the form of diskcache and is in the folder."""
+        """Raise ValueError unless a file name from the data base has diskcache's form and is in the folder."""
         inside = Path(self._directory).resolve() / str(name)
         if not _FILE.fullmatch(str(name)) or inside.parent.resolve() != inside.parent:
             raise ValueError(f"entry has the file {name!r}")
@@ -72,8 +72,8 @@ class DiskCache:
     is stored, and no error is raised, if the folder cannot be written, the disk is full, or another process locks the
     folder. A locked folder is reported by an InputWarning.
 
-    Only the current user can access a new folder. Entries are used as results. So InputError is raised if the folder
-    belongs to another user or if other users can write to the folder.
+    Only the current user can access a new folder. InputError is raised if the folder belongs to another user or if
+    other users can write to the folder.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int, version: str) -> None:
@@ -114,7 +114,7 @@ class DiskCache:
         return True
 
     def _give_up(self) -> None:
-        """Stop using the locked folder. Otherwise every further access would wait for the lock."""
+        """Stop using the locked folder, because every further access would wait for the lock."""
         self._entries = None
         message = f"the cache {self.folder} is locked by another process for more than {_LOCK_S} s"
         warnings.warn(InputWarning(message, "this process continues without it"), stacklevel=4)
@@ -161,7 +161,7 @@ class DiskCache:
 
 
 def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
-    """Arrays of a value by path. The path ``0.labels`` is the field `labels` of the first item of a tuple."""
+    """Arrays of a value by path inside the value. The path ``0.labels`` is field `labels` of tuple item 0."""
     if value is None:
         return {}
     if isinstance(value, np.ndarray):

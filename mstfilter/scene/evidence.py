@@ -147,7 +147,7 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
 
     The test renders the hypothesis and uses the pixels inside the outlines of objects. Pixels without a reading are
     not used. A pixel with a reading in front of the surface is not used, because another object may hide the surface.
-    At each other pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is not far
+    At each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is not far
     behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth noise.
 
     Returns
@@ -189,10 +189,10 @@ def _interior(rendered: Rendering, size: float) -> np.ndarray:
 class Evidence(Checked, ABC):
     """One term of the score of a candidate.
 
-    The documentation of each term states the data that the term uses. So users can see which data are counted twice.
+    The documentation of each term states the data that the term uses, so that users see which data count twice.
     """
 
     @returns(lambda self, found, hypotheses, clip: check_array(found, (len(hypotheses),)).astype(np.float64))
     @abstractmethod
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """Log score (n,) of hypotheses about the end of a clip, in nats, finite, up to a common constant."""
+        """Finite log scores (n,), in nats and up to a common constant, of hypotheses about the end of a clip."""

@@ -39,8 +39,8 @@ def depth_sigma(z: ArrayLike) -> np.ndarray:
     """Standard deviation (m) of a depth reading at z-depth `z` (m), in the shape of `z`.
 
     The sensor measures disparity, so the standard deviation grows with the square of depth: sigma = 0.00185 m (z /
-    m)^2. The factor was fitted to image patches of tables in 45 Kinect v1 and Xtion frames (0.6 to 1.5 m). Up to 1.2
-    m, the formula agrees with the patches within 10 %.
+    m)^2. The factor 0.00185 m was fitted to image patches of tables in 45 Kinect v1 and Xtion frames (0.6 to 1.5 m).
+    Up to 1.2 m, the formula is within 10 % of the measured values.
     """
     z = np.asarray(z)
     return _SIGMA_AT_ONE_METRE * z * z
@@ -64,8 +64,8 @@ def _decode(path: Path, flags: int) -> np.ndarray:
 def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarray:
     """The image in the bytes of a PNG, JPEG or TIFF file, decoded with the `flags` of ``cv2.imdecode``.
 
-    Raises InputError with the message `problem` if the bytes are not an image, or if the image has more than
-    `MAX_PIXELS` pixels. An image with more pixels is not decoded.
+    Raises InputError with the message `problem` if the bytes are not an image. An image of more than `MAX_PIXELS`
+    pixels is not decoded and also raises InputError.
     """
     import cv2
 
@@ -202,7 +202,7 @@ class Frame:
     robot_mask : (H, W) bool, optional
         Pixels that show the robot. The depth at robot pixels is treated as unknown.
     views : tuple of Frame
-        Simultaneous frames of other cameras, without views. With `views`, all cameras need a pose in one world.
+        Simultaneous frames of other cameras, with empty `views`. All cameras need a pose in the same world.
     """
 
     rgb: np.ndarray
@@ -288,7 +288,7 @@ class Clip:
     """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
     `before` is the frame at the previous pause, and `after` is the frame at the pause that ends the clip. The frames
-    in between show the action. The first clip of a recording has one frame.
+    between both pauses show the action. The first clip of a recording has one frame.
 
     Parameters
     ----------

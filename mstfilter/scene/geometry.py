@@ -6,9 +6,8 @@
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
-The noise of D does not depend on depth. So the support plane is a least-squares fit of D by an affine function. For
-every image size, D is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m). So a threshold has the same meaning at
-every image size.
+The noise of disparity does not depend on depth. So the support plane is a least-squares fit of disparity by an affine
+function. Disparity is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
 """
 
 from __future__ import annotations
@@ -148,7 +147,7 @@ def _fit(frame: Frame) -> SupportPlane:
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """Camera pose in a world with z up and the plane at z = 0. Disparity on the plane is a u + b v + c."""
+    """Camera pose in a world with z up and the plane at z = 0. The plane has the disparity a u + b v + c."""
     scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K

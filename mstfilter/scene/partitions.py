@@ -47,7 +47,7 @@ class CommonRefinement:
         return int(self.first[-1])
 
     def objects_in(self, cells: np.ndarray) -> np.ndarray:
-        """Whether each object contains at least one of the `cells`, (n_objects + 1,). Label 0 (free) has False."""
+        """Whether each object contains at least one of the `cells`, (n_objects + 1,). Label 0 (free) gives False."""
         present = np.zeros(self.n_objects + 1, bool)
         present[self.objects[:, cells]] = True
         present[0] = False

@@ -5,8 +5,8 @@
 
 Some faults of the input give confident wrong hypotheses and no error: wrong units, a camera matrix of another image
 size, a moved camera, or unregistered depth. `examine` tests whether a camera over a table can have taken the frames
-at the pauses. A finding stops the run if the hypotheses cannot be correct. Other findings are warnings. The limits
-were chosen on the recordings of ``experiments/plausibility``.
+at the pauses. A finding stops the run if the hypotheses cannot be correct. Other findings are warnings. The limits of
+the checks were chosen in ``experiments/plausibility``.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ _Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
-    """A finding if a value is outside the `usual` limits. The finding stops the run outside the `possible` limits."""
+    """A finding for a value outside the `usual` limits. Outside the `possible` limits, the finding stops the run."""
     if not usual[0] <= value <= usual[1]:
         yield Finding(not possible[0] <= value <= possible[1], text, hints)
 
@@ -414,9 +414,9 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """Agreement of depth edges and colour edges at all pauses.
 
-    The first value is the best agreement minus the median over shifts. The second value is the share of the first
-    value that is lost without a shift. The third value is the best shift (rows, columns) of colour in pixels of 320
-    columns. The fourth value is the increase of the agreement if depth belongs to other pauses.
+    The first value is the best agreement minus the median over shifts. The second value is the relative loss of
+    agreement without a shift. The third value is the best shift (rows, columns) of colour in pixels of 320 columns.
+    The fourth value is the increase of the agreement if depth belongs to other pauses.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)

@@ -165,17 +165,17 @@ class Recording:
             Intrinsics in pixels.
         pauses : sequence of int, str or PauseRule, optional
             Frames at which nothing moves. The filter estimates hypotheses at each pause. A `PauseRule`, or a text
-            such as "still", "ends", "every" or "0s,4.2s", selects the pauses. The default is "still" if `times` are
-            given for more than two frames, else "ends".
+            such as "still", "ends", "every" or "0s,4.2s", selects the pauses. The default rule is "still" if `times`
+            are given for more than two frames, else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
-            Pose of the camera, or one pose per frame if the camera moves. The table must be at z = 0. The default is
-            computed from the support plane of the first pause.
+            Pose of the camera, or one pose per frame if the camera moves. The table must be at z = 0. The default
+            pose is computed from the support plane of the first pause.
         grid : VoxelGrid, optional
-            Workspace. The default covers the visible table: sides of 1 to 2 m, height 0.5 m, voxels of 1 cm.
+            Workspace. The default grid covers the visible table: sides of 1 to 2 m, height 0.5 m, voxels of 1 cm.
         robot_masks : (T, H, W) bool, optional
             Pixels that show the robot.
         times : sequence of float, optional
-            Times in seconds. The default is 0, 1, 2, ...
+            Times in seconds. The default times are 0, 1, 2, ...
         name : str
             Name for messages and reports.
 

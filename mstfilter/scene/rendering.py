@@ -6,8 +6,8 @@
 
 The ray of each pixel is followed from voxel to voxel, with jumps over free space. If the nearest occupied voxel has
 the chessboard distance D, the cube of half-width D - 1 around the current voxel is empty. The ray continues at the
-face where the ray leaves the empty cube. With D = 1, the method is the voxel traversal of Amanatides and Woo (1987).
-The jumps do not change the result. Hypotheses with the same object share the cached image of the object.
+face where the ray leaves the empty cube. Without jumps, the method is the voxel traversal of Amanatides and Woo
+(1987). The jumps do not change the result. Hypotheses with the same object share the cached image of the object.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _Box = tuple[slice, ...]
 
 
 class Rendering(NamedTuple):
-    """Label image (H, W) uint16, and z-depth (H, W) float32 in metres. Pixels without a hit are 0 and NaN."""
+    """Label image (H, W) uint16, and z-depth (H, W) float32 in metres. Without a hit: label 0, depth NaN."""
 
     labels: np.ndarray
     depth: np.ndarray
@@ -119,7 +119,7 @@ def _window(shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: 
 def _traverse(
     box: np.ndarray, start: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Follow rays (n, 3) from `start`. Returns ray number, flat voxel index and t of rays that hit a voxel."""
+    """Follow rays (n, 3) from `start`. Returns the ray number, flat voxel index and ray parameter t of each hit."""
     distance = distance_transform_cdt(box == 0, metric="chessboard").astype(np.int32).ravel()
     shape = np.array(box.shape)
     strides = np.array([shape[1] * shape[2], shape[2], 1])

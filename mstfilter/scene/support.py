@@ -61,8 +61,8 @@ class Foreground:
 def above_table(frame: Frame) -> np.ndarray:
     """Disparity minus table disparity, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
 
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
-    most readings.
+    One sensor unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that
+    contains the most readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
 
@@ -273,7 +273,7 @@ def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: 
 
 
 def _ring(regions: np.ndarray, k: int, box: tuple[slice, slice]) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """The pixels (h, w) bool around region `k` of a label image, and the image window of this array."""
+    """The pixels (h, w) bool around region `k` of a label image, and the image window of the pixels."""
     reach = _reach(regions.shape[1])
     rows, columns = (slice(max(0, side.start - reach), side.stop + reach) for side in box)
     inside = regions[rows, columns] == k

@@ -364,7 +364,7 @@ class Hypothesis:
         return cls(labels, grid, records)
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
-        """The same objects with other voxels.
+        """A hypothesis with the same objects and other voxels.
 
         Objects with changed voxels lose `source` and `motion`. Records of objects without voxels are removed. Raises
         InputError if a label has no record.
@@ -385,7 +385,7 @@ class Hypothesis:
         return Hypothesis(labels, self.grid, objects, occupancy)
 
     def without(self, voxels: np.ndarray) -> Hypothesis:
-        """The same objects without the given voxels (X, Y, Z) bool, which are then free. See `with_labels`."""
+        """The hypothesis with some `voxels` (X, Y, Z) bool set to free. See `with_labels`."""
         found = self.with_labels(np.where(voxels, 0, self.labels).astype(np.uint16))
         occupancy = found.occupancy
         return found if occupancy is None else replace(found, occupancy=occupancy.without(voxels))

@@ -49,7 +49,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model for the clip's last frame. The `component_key` of the model includes the used content."""
+        """The model for the clip's last frame. The `component_key` of the model includes the file content."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ColourDepthBoundary(BoundaryModel):
         Weight of the colour edges. The weight 0 disables colour.
     quiet_table : float
         Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther than this distance from
-        surfaces above the table. So print, grain and shadows on the table are ignored. A negative value disables the
+        surfaces above the table. So print, grain and shadows on the table are ignored. Negative values disable the
         rule.
     """
 
@@ -124,8 +124,8 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
 
-    Concave curvature is the largest eigenvalue of the Hessian. Convex curvature is minus the smallest. `resize` is
-    the image width / 640.
+    Concave curvature is the largest eigenvalue of the Hessian. Convex curvature is minus the smallest eigenvalue.
+    `resize` is the image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

@@ -53,14 +53,14 @@ class SceneCutObjectness(CutValue):
 
     ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)`` and ``w = ln(s) area^0.95``. A region smaller than
     1000 or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of
-    planes with the size of furniture, is omitted. Instead, the support plane is removed as background.
+    planes with the size of furniture, is omitted. The support plane is removed as background.
 
     Parameters
     ----------
     background_weight : float
-        Area of a pixel that is not above the table. In SceneCut, the area is 1. Then the table contributes most of
-        the optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives more
-        random samples. With weight 0, cuts of the table have no cost, and chains spend their steps on these cuts.
+        Area of a pixel that is not above the table. In SceneCut, the area is 1. With area 1, the table contributes
+        most of the optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives
+        more random cuts. With area 0, cuts of the table have no cost, and chains spend steps on these cuts.
     """
 
     background_weight: float = 0.003
@@ -87,7 +87,7 @@ class MergeLogOdds(CutValue):
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. So exp(v(c)) is proportional to the probability
     that exactly the merges above the cut join different objects. The values are log probabilities, so cuts are
     sampled at a temperature, without a scale sigma. If the tree has `odds` (`LearnedTree`), the logits are the
-    `odds`. Otherwise P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
+    `odds`. Without `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
@@ -186,7 +186,7 @@ class Gibbs:
     stop: list[float]  #: probability that a cut without an ancestor of the node contains the node
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
-        """Draw a cut of the subtree of `node`. Nodes are unordered. `random` returns uniform numbers in [0, 1)."""
+        """Draw a cut of the subtree of `node`, with unordered nodes. `random` returns uniform numbers in [0, 1)."""
         children, stop = self.tree.children, self.stop
         cut, stack = [], [node]
         while stack:

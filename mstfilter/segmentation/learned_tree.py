@@ -379,8 +379,7 @@ class BorderTree(MergedTree):
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
     """The tree of a list of merges. Merge k creates node n_regions + k. A root joins the remaining regions.
 
-    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge consists of two nodes and the log
-    odds.
+    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is (node, node, log odds).
     """
     if n_regions == 1:
         return Tree(np.zeros(1, np.int64), image, np.zeros(1), np.zeros(1))

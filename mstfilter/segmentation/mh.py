@@ -1,8 +1,8 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
 The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with ``s2 =
-sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The second form is for
-values that are log odds (`MergeLogOdds`). Log odds need no scale.
+sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The form with a
+`temperature` is for values that are log odds (`MergeLogOdds`) and need no scale.
 
 - ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain with MoveNode and subtree redraws.
 - ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
@@ -161,13 +161,13 @@ class AuthorsMoves(MoveRule):
     """
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:
-        """A node of the cut, and True for up; None if no move is possible."""
+        """A node of the cut, and True for a move up; None if no move is possible."""
         moves = self.possible(state)
         return moves[int(random() * len(moves))] if moves else None
 
     @staticmethod
     def possible(state: CutState) -> list[tuple[int, bool]]:
-        """All moves (node, True for up)."""
+        """All moves (node, True for a move up)."""
         moves = []
         for node in state.nodes:
             if node != state.root:
@@ -293,8 +293,8 @@ class MetropolisHastingsCuts(CutSampler):
     moves : {"node", "authors"}
         Rule of the local moves: the exact rule of the paper, or the rule of the authors' program.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move. Without a temperature, the fraction is
-        0.
+        Fraction of steps that redraw a random subtree instead of a local move. The fraction is 0 without a
+        temperature.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -302,7 +302,7 @@ class MetropolisHastingsCuts(CutSampler):
     redraw_repeated : bool
         If True and a cut was drawn before, draw once more and keep the second cut in any case.
     temperature : float
-        With 0, the target is the distribution of the paper. Otherwise the target is exp(v / temperature).
+        Temperature of the target exp(v / temperature), in units of value. With 0, the target is the paper's.
     """
 
     sigma2: PositiveFloat = 1e-3
@@ -378,7 +378,7 @@ def _uniforms(rng: np.random.Generator) -> Iterator[float]:
 def _autocorrelation(trace: np.ndarray) -> float | None:
     """Integrated autocorrelation time of a trace in steps; None for a constant trace or fewer than 100 steps.
 
-    The estimate is too low for a chain shorter than about 50 autocorrelation times. So a low value does not prove
+    The estimate is too low for a chain shorter than about 50 autocorrelation times. A low value does not prove
     convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:

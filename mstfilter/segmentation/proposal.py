@@ -74,7 +74,7 @@ class ObjectRule:
     min_points : int
         Readings of the smallest object.
     mend : bool
-        Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). With
+        Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If
         False, every reading above the table can belong to an object, as published.
     """
 
@@ -134,12 +134,12 @@ class TreeCutProposal(Proposal):
     Parameters
     ----------
     sampler : CutSampler
-        Draws the cuts. The sampler must match `value`: `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
+        Draws the cuts. The sampler needs a `temperature` for log odds, or `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is ``log
-        p(c) - log p(c*)`` as in the paper and the authors' program. Then p counts twice.
+        p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability counts twice.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -247,8 +247,8 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from completed segments of a frame, at the pause `birth`.
 
-    Labels are 1, 2, ... in order. Segments without voxels get no record. `threshold` is the smallest probability of
-    an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
+    Segments get the labels 1, 2, ... in order. Segments without voxels get no record. `threshold` is the smallest
+    probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

@@ -16,8 +16,8 @@ array([[1, 1],
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
 in order of the mean strength of their common border. The height of a merge is the mean strength of the common border.
 A logistic curve maps the height to P(boundary), the probability that the merge joins different objects. `start` is
-P(boundary) of the merge that makes a node. `start` is near 0 for a node inside one object, and near 1 for a node with
-several objects.
+P(boundary) of the merge that makes a node. `start` is near 0 for a node inside one object, and near 1 for several
+objects.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ class UcmTree(TreeBuilder):
     """Watershed and average linkage by mean boundary strength. Only the strongest merges are kept.
 
     The logistic curve and the colour weight of `ColourDepthBoundary` were fitted together on the 45 `learn` frames of
-    mOSD. experiments/osd_frames reports results on other camera set-ups.
+    mOSD. Results with other cameras are in experiments/osd_frames.
 
     Parameters
     ----------

@@ -17,8 +17,7 @@ With a `PushLoop`, a filter chooses the pushes.
 
 The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
 (MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),
-`lighting` and `renderer` (images by ray casting), `sensor` (noise), `recorder` (recordings and their cache) and
-`push_loop`.
+`lighting` and `renderer` (ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
 
 The simulation has no camera motion, no glossy or transparent surfaces, no light reflected between objects, no
 articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges are

@@ -1,7 +1,7 @@
 """Placement of objects on the table: clusters, touching pairs of equal objects (twins), stacks and hidden objects.
 
 Each object is moved towards the cluster until it nearly touches another object. Bisection on MuJoCo's contacts finds
-this position. After placement, the physics runs until all objects are at rest.
+the position. After placement, the physics runs until all objects are at rest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SceneObjects:
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw the shapes and textures of a scene. A family of shapes repeats only after all other families."""
+    """Draw the shapes and textures of a scene. A shape family repeats only after all other families were drawn."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []

@@ -1,8 +1,8 @@
 """Drawing of flat texture images (charts): printed cartons and labels, wood, cloth, speckle, glaze, peel.
 
 Each function takes a random generator and the size of the chart in metres. The function returns an RGB uint8 image
-with 0.4 mm per pixel. `textures` scales the image to the camera. Colours have low saturation, as in images of real
-packaging under office light.
+with 0.4 mm per pixel. The module `textures` scales the image to the resolution of the camera. Colours have low
+saturation, as in images of real packaging under office light.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.printing import wood

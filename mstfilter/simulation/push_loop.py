@@ -95,8 +95,7 @@ class PushLoop:
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
         """`n` random pushes towards objects. The start of each push is free of objects. The scene does not change.
 
-        Pushes are drawn towards true objects, so most pushes move an object. Some pushes move nothing or drop an
-        object.
+        Pushes are drawn towards true objects, so most pushes move an object. Some pushes miss or drop an object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)
@@ -127,7 +126,7 @@ class PushLoop:
         return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 
     def restore(self, state: LoopState) -> None:
-        """Return to a saved state of this loop. The same pushes then give the same images."""
+        """Return to a saved state of this loop. After `restore`, the same pushes give the same images."""
         self._scene.world.restore(state.world)
         self._scene.stage.restore(state.stage)
         self._recorded, self.effects, self.clip = list(state.recorded), list(state.effects), state.clip

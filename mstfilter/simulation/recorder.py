@@ -100,7 +100,7 @@ class SimulatedScene:
         return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
     def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
-        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame in between."""
+        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame between both."""
         family, world = self.family, self.world
         before, began = world.poses(), world.time
         for step in range(1, family.frames_per_clip - 1):

@@ -48,8 +48,8 @@ class DepthSensor(Bounded):
     lateral : float
         Standard deviation of the sideways shift on depth edges, in pixels of the sensor's raster.
     edge_dropout : float
-        Probability that a patch of pixels within two pixels of a depth edge has no reading. This value and `fill`
-        were fitted to the frequencies of missing readings 1 .. 10 pixels to each side of objects in 45 real frames.
+        Probability that a patch of pixels within two pixels of a depth edge has no reading. `edge_dropout` and `fill`
+        were fitted to the frequencies of missing readings 1 .. 10 pixels beside objects in 45 real frames.
     fill : float
         Largest width of a projector shadow that the sensor fills, in pixels of the sensor's raster.
     """

@@ -1,8 +1,8 @@
 """Household objects made of convex pieces: shapes, sizes and voxels.
 
 `draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body, the poses in which it rests, its mass
-and the layout of its texture. The origin of the frame is the middle of the bounding box. The z axis points up in the
-upright pose.
+and the layout of its texture. The origin of the frame is the middle of the bounding box. In the upright pose, z
+points up.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape

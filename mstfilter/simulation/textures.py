@@ -36,8 +36,7 @@ _SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 class Skin:
     """Texture of a body: uint8 charts (h, w, 3), and the strength of the highlight, 0 .. 1.
 
-    The charts are six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart is the plain
-    colour.
+    The charts are six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart is plain.
     """
 
     charts: tuple[np.ndarray, ...]

@@ -13,8 +13,8 @@ pieces with torsional and rolling friction. The finger is a capsule on three sli
 arm above the finger is visible but has no contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates candidate pushes from one state. The function takes the first push that moves enough objects and drops none.
-Physics is faster than rendering, so dozens of candidates are tried.
+simulates candidate pushes from one state. `choose_push` takes the first push that moves enough objects and drops
+none. Physics is faster than rendering, so dozens of candidates are tried.
 """
 
 from __future__ import annotations
@@ -380,9 +380,9 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. Without such a candidate, the
-    best compromise of many moved and few toppled objects is taken. Candidates that drop an object or leave an object
-    in motion are discarded. Raises InputError if no candidate moves any object.
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate moves
+    fewer objects or topples an object, the best compromise is taken. Candidates that drop an object or leave an
+    object in motion are discarded. Raises InputError if no candidate moves any object.
     """
     saved = world.save()
     best: tuple[float, FingerPush] | None = None
