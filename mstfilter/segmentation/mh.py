@@ -293,8 +293,7 @@ class MetropolisHastingsCuts(CutSampler):
     moves : {"node", "authors"}
         Rule of the local moves: the exact rule of the paper, or the rule of the authors' program.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move. The fraction is 0 without a
-        temperature.
+        Fraction of steps that redraw a random subtree instead of a local move; 0 without a temperature.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -302,7 +301,8 @@ class MetropolisHastingsCuts(CutSampler):
     redraw_repeated : bool
         If True and a cut was drawn before, draw once more and keep the second cut in any case.
     temperature : float
-        Temperature of the target exp(v / temperature), in units of value. With 0, the target is the paper's.
+        Temperature of the target exp(v / temperature), in units of value. With 0, the chain has the target of the
+        paper.
     """
 
     sigma2: PositiveFloat = 1e-3

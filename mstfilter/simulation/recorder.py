@@ -15,9 +15,9 @@ simulation has a separate random stream, with a name and an index.
 >>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
-The name of a cached folder has a hash of the inputs that determine the recording: the fields of the family, the seed,
-and the versions of the simulator and of MuJoCo. A folder is written under a temporary name and renamed when it is
-complete. Several processes can ask for the same recording.
+The name of a cached folder has a hash of the fields of the family, the seed, and the versions of the simulator and of
+MuJoCo. A folder is written under a temporary name and renamed when it is complete. Several processes can ask for the
+same recording.
 """
 
 from __future__ import annotations
