@@ -189,7 +189,7 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
 
 
 def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.ndarray:
-    """Pixels (H, W, channels) of an uncompressed image, whose rows may be padded."""
+    """Pixels (H, W, channels) of an uncompressed image. The rows of the image may be padded."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     if min(height, width) < 1 or step < width * channels * kind.itemsize or data.size < height * step:

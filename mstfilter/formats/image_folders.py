@@ -207,7 +207,7 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def _both(colour: list[Path], depth: list[Path]) -> tuple[list[Path], list[Path]]:
-    """The images whose numbers are in both lists."""
+    """The colour images and depth images with numbers in both lists."""
     common = {_number(file) for file in colour} & {_number(file) for file in depth}
     if not common:
         raise InputError("no colour image has a depth image of the same number")

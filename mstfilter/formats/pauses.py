@@ -96,10 +96,10 @@ class Still(PauseRule):
     """Middle frames of the intervals in which the image does not change, for a camera that does not move.
 
     Images are reduced to blocks of grey levels. Two images differ if more than 0.1 % of the blocks change by more
-    than their noise. A still interval is a run of frames that do not differ from its first frame. So slow motion also
+    than their noise. A still interval is a run of frames that do not differ from its first frame, so slow motion also
     ends an interval. Each interval of at least `hold_s` seconds gives one pause at its middle frame. Changes that all
-    blocks share (exposure, flicker) are ignored. The noise of each block is measured in the video. So the scene must
-    be at rest for a quarter of the time.
+    blocks share (exposure, flicker) are ignored. The noise of each block is measured in the video, so the scene must
+    be at rest for a quarter of the video.
 
     An interval in which a robot waits in the image, or changes it by less than a grey level, also gives a pause.
     Check the pauses, and replace wrong pauses by explicit pauses.
@@ -178,9 +178,9 @@ class Still(PauseRule):
 class Settled(Still):
     """The frames at which the image has been still for `hold_s` seconds, found while the frames arrive.
 
-    The parameters are those of `Still`. Each pause is the frame at which a still interval becomes `hold_s` long. The
-    noise is measured in the last hundred frames. So a pause depends on earlier frames only, and a stream and its
-    recording have the same pauses.
+    The parameters are the same as in `Still`. Each pause is the frame at which a still interval becomes `hold_s`
+    long. The noise is measured in the last hundred frames. A pause depends on earlier frames only, so a stream and
+    its recording have the same pauses.
     """
 
     def watch(self) -> Callable[[float, np.ndarray], bool]:

@@ -266,7 +266,8 @@ class VideoFormat(RecordingFormat):
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3 of both images. The default is the coefficients in the files, else none.
+        OpenCV's k1, k2, p1, p2, k3 of colour and depth images. The default is the coefficients in the files, else
+        none.
     tolerance_s : float
         Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float

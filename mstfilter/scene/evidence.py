@@ -6,8 +6,8 @@
 
 Free-space projection is the first step of the measurement update (paper, section IV-D). The quality of a prediction
 is Q = 1 - (cleared voxels) / (occupied voxels). An update adds lambda log Q to the log weight of the prediction. The
-factor lambda is the parameter `quality_exponent` of the update. So a prediction with objects in free space loses
-voxels and weight.
+factor lambda is the parameter `quality_exponent` of the update. A prediction with objects in free space loses voxels
+and weight.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def _interior(rendered: Rendering, size: float) -> np.ndarray:
 
 
 class Evidence(Checked, ABC):
-    """One term of the score of a candidate.
+    """A term in the score of candidate hypotheses.
 
     The documentation of each term states the data that the term uses, so that users see which data count twice.
     """

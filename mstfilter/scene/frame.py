@@ -266,7 +266,7 @@ class Frame:
 
     @property
     def all_views(self) -> tuple[Frame, ...]:
-        """This frame and its views."""
+        """The frame itself and its views."""
         return (self, *self.views)
 
     @cached_property
@@ -288,7 +288,7 @@ class Clip:
     """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
     `before` is the frame at the previous pause, and `after` is the frame at the pause that ends the clip. The frames
-    between both pauses show the action. The first clip of a recording has one frame.
+    between the two pauses show the action. The first clip of a recording has one frame.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
-The noise of disparity does not depend on depth. So the support plane is a least-squares fit of disparity by an affine
+The noise of disparity does not depend on depth, so the support plane is a least-squares fit of disparity by an affine
 function. Disparity is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
 """
 

@@ -89,7 +89,7 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
 
 
 def report_findings(findings: Iterable[Finding], where: str) -> None:
-    """Raise InputError for a finding that stops a run, or warn of each finding. `where` begins the messages."""
+    """Raise InputError for a finding that stops a run, or warn of each finding. Messages begin with `where`."""
     for finding in findings:
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)
@@ -177,7 +177,7 @@ def _sampled(frame: Frame, width: int) -> Frame:
 
 
 def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """(...) bool: points (..., 3) whose x and y are in the grid."""
+    """(...) bool: points (..., 3) with x and y inside the grid."""
     index = grid.index_of(points)[..., :2]
     return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
 

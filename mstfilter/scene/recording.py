@@ -277,7 +277,7 @@ class Recording:
     def in_world_of(self, other: Recording) -> Recording:
         """This recording with the workspace and the first camera pose of another recording, without true volumes.
 
-        Use this method for two recordings of a session if the camera has the same pose at the first pauses:
+        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pauses:
         ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can then
         update hypotheses of the other recording.
         """

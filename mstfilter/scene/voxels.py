@@ -440,7 +440,7 @@ class Hypothesis:
     mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
-        """Rigid motion of an object in world metres since it was first seen or last changed (`ObjectRecord`)."""
+        """Rigid motion of an object in world metres since its first observation or last change (`ObjectRecord`)."""
         return self.record(label).motion
 
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:

@@ -1,6 +1,6 @@
 """The border network, a small 2-D U-Net that estimates the borders and the centres of objects.
 
-This module imports torch.
+The module `border_network` imports torch.
 
 >>> network = load_border_network("border")
 >>> seen = network.look(frame)                     # maps of the frame's size

@@ -2,9 +2,9 @@
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 
-Most objects are convex. So depth has a concave crease or a step where two objects touch, and where an object touches
+Most objects are convex, so depth has a concave crease or a step between objects that touch, and between an object and
 the table. A convex crease, such as the edge of a box, lies inside one object. On a plane, disparity D = 8 f b / z (f
-focal length, b baseline, z depth) is affine in the pixel coordinates. The noise of D does not depend on depth. So the
+focal length, b baseline, z depth) is affine in the pixel coordinates. The noise of D does not depend on depth. The
 largest eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not
 visible in depth. Colour has a lower weight than depth, because print on a box is not a boundary.
 """
@@ -61,9 +61,8 @@ class ColourDepthBoundary(BoundaryModel):
     colour_weight : float
         Weight of the colour edges. The weight 0 disables colour.
     quiet_table : float
-        Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther than this distance from
-        surfaces above the table. So print, grain and shadows on the table are ignored. Negative values disable the
-        rule.
+        Distance in pixels of a 640 px wide image. At pixels farther from all surfaces above the table, the boundary
+        is 0, so print, grain and shadows on the table are ignored. Negative values disable the rule.
     """
 
     colour_weight: float = 0.4

@@ -84,10 +84,10 @@ class SceneCutObjectness(CutValue):
 class MergeLogOdds(CutValue):
     """Log likelihood of independent merge decisions.
 
-    ``w(n) = -sum of logit P(boundary) over the merges inside n``. So exp(v(c)) is proportional to the probability
-    that exactly the merges above the cut join different objects. The values are log probabilities, so cuts are
-    sampled at a temperature, without a scale sigma. If the tree has `odds` (`LearnedTree`), the logits are the
-    `odds`. Without `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
+    ``w(n) = -sum of logit P(boundary) over the merges inside n``. The probability that exactly the merges above the
+    cut join different objects is proportional to exp(v(c)). The values are log probabilities, so cuts are sampled at
+    a temperature, without a scale sigma. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
+    `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:

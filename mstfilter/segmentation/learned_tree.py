@@ -89,7 +89,7 @@ class _RegionMeans:
 
 
 class _PairMeasures:
-    """Measurements of k pairs of regions. The parameters are those of `pair_features`."""
+    """Measurements of k pairs of regions. The parameters are the same as in `pair_features`."""
 
     def __init__(
         self, a: np.ndarray, b: np.ndarray, border: np.ndarray, table_a: np.ndarray, table_b: np.ndarray, scale: float

@@ -111,7 +111,7 @@ class ObjectRule:
 def _core(tree: Tree, pixels: np.ndarray, radius: int) -> np.ndarray:
     """Number (N,) of pixels of each node with a square neighbourhood inside the node and inside `pixels`.
 
-    A neighbourhood lies in the lowest node that contains all its leaves, and in the ancestors of this node. So one
+    A neighbourhood lies in the lowest node that contains all its leaves, and in the ancestors of this node, so one
     pass over the pixels is sufficient. The lowest node is found from the first and the last leaf of the neighbourhood
     in depth-first order.
     """
@@ -214,9 +214,9 @@ def complete_segments(
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts for the notes.
 
     Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
-    segment is completed once, with the random stream ``"completion", segment``. So the result does not depend on the
-    other segments. A stochastic completer completes a segment again for each further sample, with the random stream
-    ``"completion", segment, k``.
+    segment is completed once, with the random stream ``"completion", segment``. The result for a segment does not
+    depend on the other segments. A stochastic completer completes a segment again for each further sample, with the
+    random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()

@@ -1,6 +1,6 @@
 """Measurements of image regions and of their common borders.
 
-Each measurement is a sum over pixels. So the row of a merged region is the sum of two rows. Disparity is in sensor
+Each measurement is a sum over pixels, so the row of a merged region is the sum of two rows. Disparity is in sensor
 units (1/8 px at f = 525 px), and lengths are in metres.
 
 >>> leaves = object_leaves(watershed, pixels)                 # objects do not share a leaf with the table

@@ -2,7 +2,7 @@
 
 A tree is stored as a parent array. Leaves come first (0 .. n_leaves - 1), and the root is last. Every parent has a
 larger index than its children, so a loop over ascending indices visits children first. A *cut* is an ascending array
-of nodes that covers every leaf exactly once. So a cut is a segmentation of the image.
+of nodes that covers every leaf exactly once, so a cut is a segmentation of the image.
 
 >>> import numpy as np
 >>> from mstfilter.segmentation import Tree
@@ -294,7 +294,7 @@ def prune(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that the kept merges join become leaves.
 
-    Heights do not decrease towards the root, and parents come after children. So the kept merges contain the root and
+    Heights do not decrease towards the root, and parents come after children, so the kept merges contain the root and
     are connected.
     """
     n = len(parent)

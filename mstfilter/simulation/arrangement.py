@@ -1,7 +1,7 @@
 """Placement of objects on the table: clusters, touching pairs of equal objects (twins), stacks and hidden objects.
 
-Each object is moved towards the cluster until it nearly touches another object. Bisection on MuJoCo's contacts finds
-the position. After placement, the physics runs until all objects are at rest.
+Each object is moved towards the cluster until the object nearly touches another object. Bisection on MuJoCo's
+contacts finds the position. After placement, the physics runs until all objects are at rest.
 """
 
 from __future__ import annotations

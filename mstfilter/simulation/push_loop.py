@@ -126,7 +126,7 @@ class PushLoop:
         return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 
     def restore(self, state: LoopState) -> None:
-        """Return to a saved state of this loop. After `restore`, the same pushes give the same images."""
+        """Return to a saved state of the same `PushLoop`. After `restore`, the same pushes give the same images."""
         self._scene.world.restore(state.world)
         self._scene.stage.restore(state.stage)
         self._recorded, self.effects, self.clip = list(state.recorded), list(state.effects), state.clip

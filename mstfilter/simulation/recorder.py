@@ -1,4 +1,4 @@
-"""Recording of simulated scenes. One call with an integer seed writes one folder.
+"""Recording of simulated scenes. A call with an integer seed writes a recording folder.
 
 >>> from mstfilter.simulation import scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
@@ -16,8 +16,8 @@ simulation has a separate random stream, with a name and an index.
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
 The name of a cached folder has a hash of the fields of the family, the seed, and the versions of the simulator and of
-MuJoCo. A folder is written under a temporary name and renamed when it is complete. Several processes can ask for the
-same recording.
+MuJoCo. A folder is written under a temporary name and renamed when the recording is complete. Several processes can
+ask for the same recording.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class SimulatedScene:
         return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
     def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
-        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame between both."""
+        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame in between."""
         family, world = self.family, self.world
         before, began = world.poses(), world.time
         for step in range(1, family.frames_per_clip - 1):

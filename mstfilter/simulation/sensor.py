@@ -100,7 +100,7 @@ class DepthSensor(Bounded):
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool on both sides of each step in depth."""
+    """Pixels (H, W) bool on either side of a step in depth."""
     edge = np.zeros(depth.shape, bool)
     for here, there in NEIGHBOURS:
         first, second = depth[here], depth[there]

@@ -57,7 +57,7 @@ class Pool:
     """A set of sizes, hues and names from which the objects of scenes are drawn.
 
     Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range in alternate bands,
-    so that both pools are equally difficult.
+    so that the pools are equally difficult.
     """
 
     half: int | None = None  #: {0, 1, None}: which of the two disjoint pools; None for all sizes, hues and names

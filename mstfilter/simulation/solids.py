@@ -1,7 +1,7 @@
 """Convex pieces of objects.
 
 A rigid object is a union of convex pieces. MuJoCo uses the pieces for collisions and ray casting. `Piece.inside`
-tests points against the same pieces. So images and true volumes agree.
+tests points against the same pieces, so images and true volumes agree.
 
 >>> from mstfilter.simulation.solids import box
 >>> box((0.02, 0.03, 0.04)).inside([[0.0, 0.0, 0.039], [0.0, 0.0, 0.041]]).tolist()
