@@ -202,7 +202,7 @@ class Frame:
     robot_mask : (H, W) bool, optional
         Pixels that show the robot. The depth at robot pixels is treated as unknown.
     views : tuple of Frame
-        Simultaneous frames of other cameras, with empty `views`. All cameras need a pose in the same world.
+        Simultaneous frames, without views, of other cameras. With views, all cameras need a pose in one world.
     """
 
     rgb: np.ndarray

@@ -179,8 +179,8 @@ def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.n
     """The pixels (H, W) bool without a reading that belong to objects, by colour or by outline.
 
     A pixel near the table must differ in colour from the table nearby. A pixel far from the table must differ from
-    the whole table, and its region must be enclosed by readings of objects (`measured`). A large gap in the table
-    that is no glare also belongs to an object, for example to a glass.
+    the whole table, and its region must be enclosed by readings of objects (`measured`). A large gap in the readings
+    of the table, without glare, also belongs to an object, for example a glass.
     """
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
