@@ -2,15 +2,15 @@
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
-A topic must be named only if several topics are suitable. The camera matrix is read from the ``camera_info`` topic of
-the colour topic (for rectified images, its P). A frame consists of a colour and a depth image. By the time stamps of
-their headers, the two images are nearest to each other. The stamps differ by at most `tolerance_s`. Depth must be
-registered to colour, with the same size and the same ``frame_id``. Transforms (tf) are not read. The camera is
-assumed not to move, and its pose is computed from the table.
+A topic must be named only if several topics are suitable. The camera matrix is K of the ``camera_info`` topic of the
+colour topic (P for rectified images). A frame consists of a colour and a depth image with mutually nearest header
+time stamps. The two stamps differ by at most `tolerance_s`. Depth must be registered to colour, with the same size
+and the same ``frame_id``. Transforms (tf) are not read. The camera is assumed not to move, and its pose is computed
+from the table.
 
-In depth images, 16UC1 and mono16 are units of the depth scale (millimetres by convention, REP 118), and 32FC1 is
-metres. Compressed depth is a PNG, or the ``compressedDepth`` transport: a header of 12 bytes (quantisation A, B of
-32FC1), then a PNG. The files are read with rosbags (extra ``bags``), without ROS.
+Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
+encoding 32FC1 is in metres. Compressed depth is a PNG, or a header of 12 bytes (quantisation A, B of 32FC1) and a PNG
+(transport ``compressedDepth``). The library rosbags (extra ``bags``) reads the files without ROS.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mstfilter.scene import decode_image
 
 @dataclass(frozen=True)
 class Entry:
-    """A message: stamp of its header (s), time when it was logged (ns), and index among those logged at that time."""
+    """A message: header stamp (s), log time (ns), and index among the messages with the same log time."""
 
     stamp: float
     logged: int
@@ -43,7 +43,7 @@ class Entry:
 
 
 class BagFile:
-    """An open bag (.bag, .mcap or .db3 file, or the folder of a ROS 2 bag), closed when it is garbage collected.
+    """An open bag (.bag, .mcap or .db3 file, or the folder of a ROS 2 bag). Garbage collection closes the bag.
 
     >>> bag = BagFile(Path("session.mcap"))
     >>> entries = bag.index("/camera/color/image_raw")
@@ -71,7 +71,7 @@ class BagFile:
         self.is_ros2: bool = self._reader.is2
 
     def topics(self, *kinds: str) -> dict[str, int]:
-        """Number of messages of each topic of some message types. Topics without messages are omitted."""
+        """Number of messages of each topic with one of the message types. Topics without messages are omitted."""
         counts: Counter[str] = Counter()
         for connection in self._reader.connections:
             if connection.msgtype in kinds:
@@ -104,7 +104,7 @@ class BagFile:
         raise InputError(f"bag {self.path} lists messages of {topic} but holds none", "copy it again")
 
     def index(self, topic: str) -> list[Entry]:
-        """Every message of a topic with a header, in the order of the file. All messages are read once."""
+        """Entries of all messages of a topic, in the order of the file. Every message is read once."""
         entries: list[Entry] = []
         for logged, message in self._messages(topic):
             stamp = message.header.stamp
@@ -143,7 +143,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def image_encoding(message: Any, compressed: bool) -> str:
-    """The encoding of an image message; for a compressed one ``16UC1``, ``32FC1`` or ``compressed colour``."""
+    """The encoding of an image message. A compressed image has ``16UC1``, ``32FC1`` or ``compressed colour``."""
     if not compressed:
         return str(message.encoding)
     named = str(message.format)
@@ -189,7 +189,7 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
 
 
 def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.ndarray:
-    """Pixels (H, W, channels) of an uncompressed image, whose rows may be padded."""
+    """Pixels (H, W, channels) of an uncompressed image. The rows of the image may be padded."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, dtype=np.uint8)
     if min(height, width) < 1 or step < width * channels * kind.itemsize or data.size < height * step:
@@ -242,7 +242,7 @@ class _Stream:
 
     @property
     def info(self) -> str:
-        """The CameraInfo topic, as image_transport names it."""
+        """The name of the CameraInfo topic by the convention of image_transport."""
         parts = self.name.split("/")
         if parts[-1] in ("compressed", "compressedDepth"):
             parts = parts[:-1]
@@ -258,9 +258,9 @@ class Bag(VideoFormat):
     Parameters
     ----------
     colour : str
-        Colour topic. By default, the only colour topic.
+        Colour topic. By default, the only colour topic is used.
     depth : str
-        Depth topic. Default: the only one that is registered to colour.
+        Depth topic. By default, the only depth topic that is registered to colour is used.
     registered : bool
         Treat depth as registered to colour even if its frame_id or camera matrix differs.
     """

@@ -17,8 +17,8 @@ The layout::
     poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
     SHA256SUMS           hashes of these files
 
-Frames with role ``static`` are the pauses. If camera.json has no pose, the world is computed from the support plane
-of the first pause. If it has no workspace, a grid is placed around the objects on the table. A recording is written
+Frames with role ``static`` are the pauses. If camera.json has no pose, the support plane at the first pause defines
+the world axes. If camera.json has no workspace, a grid is placed around the visible table. A recording is written
 under a temporary name and renamed when it is complete. If writing fails, no file remains.
 """
 
@@ -86,9 +86,9 @@ class _Workspace(BaseModel):
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or must be empty. No other process may write the folder. The camera has a pose if
-    it is known, and `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Other
-    entries of manifest.json, such as generator and seed, are given by name.
+    The new folder must not exist, or must be empty. No other process may write the folder. The camera can have a
+    pose, and `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Keyword
+    arguments are other entries of manifest.json, such as generator and seed.
     """
 
     def __init__(
@@ -127,10 +127,10 @@ class RecordingWriter:
     ) -> int:
         """Add a frame and return its index.
 
-        `rgb` is (H, W, 3) uint8, `depth` (H, W) float in metres with NaN for no reading, and `time_s` is in seconds.
-        The role is "static" at a pause and else "action". `instance` (H, W) uint8 or uint16 is the true object of
-        each pixel. `robot_mask` (H, W) bool marks the pixels of the robot. `poses` has the true 4x4 T_world_object by
-        object number. Other entries of the frame in the manifest are given by name.
+        `rgb` is (H, W, 3) uint8. `depth` is (H, W) float in metres, with NaN for no reading. `time_s` is in seconds.
+        The role is "static" at a pause and "action" at other frames. `instance` (H, W) uint8 or uint16 has the true
+        object number of each pixel. `robot_mask` (H, W) bool marks the robot. `poses` has the true 4x4 T_world_object
+        by object number. Keyword arguments are other entries of the frame in the manifest.
         """
         index = len(self._frames)
         units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
@@ -214,7 +214,7 @@ def save_recording(
     """Write a recording as a new recording folder. If the camera moves, every frame stores its pose.
 
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
-    and the number of all frames. Other entries of manifest.json, such as the generator, are given by name.
+    and the number of all frames. Keyword arguments are other entries of manifest.json, such as the generator.
     """
     report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
@@ -256,7 +256,7 @@ def save_recording(
 
 
 class CameraFile(BaseModel):
-    """A camera in JSON, in recordings and runs."""
+    """The entries of a camera in the JSON files of recordings and runs."""
 
     K: Any  # checked by Camera, as the pose is by rigid_from_matrix
     width: int
@@ -315,8 +315,8 @@ def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
 class RecordingFolder(RecordingFormat):
     """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/.
 
-    Images are read on access. Everything else is checked when the folder is opened. A rule `pauses` replaces the
-    pauses in the manifest. True volumes are known only at the pauses in the manifest.
+    Images and true poses are read on access. All other files are checked when the folder is opened. A rule `pauses`
+    replaces the pauses in the manifest. True volumes are known only at the pauses in the manifest.
     """
 
     pauses: PauseRule | None = None
@@ -396,7 +396,7 @@ class RecordingFolder(RecordingFormat):
 
 
 def _read_poses(path: Path) -> Any:
-    """The function `Recording.poses`, which reads the file at its first call."""
+    """The function `Recording.poses`. The first call reads the file."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:

@@ -32,14 +32,14 @@ class PairedImages(RecordingFormat):
     """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json. Every frame is a pause.
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
-    depth images. There is no pose: the world is found from the support plane. Label images NAME_label.png (8 or 16
-    bits, one number for each object) become the true instances. Labels with most of their readings on the support
-    plane, and 0, are no objects.
+    depth images. The format has no pose: the support plane defines the world axes. Label images NAME_label.png (8 or
+    16 bits, one number for each object) become the true instances. Label 0 and labels with most of their readings on
+    the support plane are no objects.
 
     Parameters
     ----------
     frames : tuple of str
-        Names of the frames in order. Default: all, by name; numbers in names count as numbers.
+        Names of the frames in order. By default, all frames are read, sorted by name with numbers in numerical order.
     """
 
     frames: tuple[str | int, ...] = ()
@@ -75,7 +75,7 @@ class PairedImages(RecordingFormat):
 
 
 def _instance(frame: Frame, file: Path) -> np.ndarray | None:
-    """The true objects (H, W) of a frame; None if there is no label image."""
+    """The true label image (H, W) of a frame, or None without a label file."""
     if not file.is_file():
         return None
     labels = read_labels(file)
@@ -99,23 +99,22 @@ _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "ca
 
 @dataclass(frozen=True)
 class Redwood(VideoFormat):
-    """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics: Redwood, Open3D, many recorders.
+    """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics, as in Redwood and Open3D.
 
     Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix``, column by column. Images are paired by the last number in their names, or by time
-    if these are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera
-    stands still.
-    Format of Redwood: http://redwood-data.org/indoor/fileformat.html.
+    if the numbers are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera does
+    not move. The format of Redwood is described at http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
     Parameters
     ----------
     depth_scale : float
-        Metres per unit of integer depth. Default: from the file of intrinsics, else 0.001.
+        Metres per unit of integer depth. The default is the scale in the file of intrinsics, else 0.001.
     fps : float
-        Frames per second, if names are no time stamps. Default: from the file of intrinsics, else 30.
+        Frames per second, if names are no time stamps. The default is the rate in the file of intrinsics, else 30.
     """
 
     depth_scale: float = 0.0
@@ -129,10 +128,11 @@ class Redwood(VideoFormat):
         return any((path / name).is_dir() for name in folders)
 
     def arriving(self, path: Path, idle_s: float = 10.0) -> Iterator[tuple[float, Frame]]:
-        """Time in seconds and frame without a pose of each pair of images of a folder that a recorder fills.
+        """Yield time in seconds and frame, without a pose, of each image pair that a recorder adds to a folder.
 
-        A pair is read when a later one exists, or when its files do not change any more. A colour image without a
-        depth image of the same number is left out. The iteration ends if no pair arrives for `idle_s` seconds.
+        A pair is read when a later pair exists, or when the files of the pair no longer change. A colour image
+        without a depth image of the same number is left out. The iteration ends after `idle_s` seconds without a
+        pair.
         """
         known: set[str] = set()  # names of the images that were read
         pairs: list[tuple[Path, Path]] = []  # the first and the latest one
@@ -192,7 +192,7 @@ class Redwood(VideoFormat):
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a folder has the files of a recording folder, whose camera.json holds more than intrinsics."""
+    """Whether a folder is a recording folder. The camera.json of a recording folder has a workspace."""
     camera = path / "camera.json"
     ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
     return ours or (path / "manifest.json").is_file()
@@ -227,7 +227,7 @@ def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Pat
 
 
 def _number(file: Path) -> Decimal:
-    """The last number in a name; -1 if there is none."""
+    """The last number in a file name, or -1 for a name without numbers."""
     found = re.findall(r"\d+(?:\.\d+)?", file.stem)
     return Decimal(found[-1] if found else -1)
 
@@ -235,7 +235,7 @@ def _number(file: Path) -> Decimal:
 def _paired(
     path: Path, colour: list[Path], depth: list[Path], tolerance_s: float
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
-    """Pairs of files, and the time of each in seconds; no times if names are frame numbers."""
+    """Pairs of files, and the times of the pairs in seconds. If names are frame numbers, the times are empty."""
     numbers = [[_number(file) for file in files] for files in (colour, depth)]
     seconds = [[_seconds(number) for number in side] for side in numbers]
     if all(value is not None for side in seconds for value in side):
@@ -257,7 +257,7 @@ def _paired(
 
 
 def _seconds(number: Decimal) -> Decimal | None:
-    """A time stamp in seconds: a fraction, or an integer of the present time in s, ms, us or ns; else None."""
+    """A time stamp in seconds, from a decimal fraction or an integer Unix time in s, ms, us or ns; else None."""
     if number != number.to_integral_value() or number.as_tuple().exponent != 0:
         return number
     unit = next((unit for unit in (1, 10**3, 10**6, 10**9) if 10**9 <= number / unit < 10**10), None)
@@ -278,7 +278,7 @@ def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
-    """A number from 1 from the file of intrinsics."""
+    """A number of at least 1 from the file of intrinsics."""
     value = stored.get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
@@ -303,7 +303,7 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
 
 
 def _four(K: Any) -> tuple[float, ...]:
-    """fx, fy, cx, cy from these four numbers, or from the nine of a 3 x 3 matrix."""
+    """fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:
         return tuple(values.ravel().tolist())
@@ -319,8 +319,8 @@ def _four(K: Any) -> tuple[float, ...]:
 class Tum(VideoFormat):
     """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. K must be given.
 
-    Lines of rgb.txt and depth.txt are ``timestamp filename``. Lines of groundtruth.txt are
-    ``timestamp tx ty tz qx qy qz qw``. Depth is in units of 1/5000 m. Format: Sturm et al. 2012.
+    Lines of rgb.txt and depth.txt are ``timestamp filename``. Lines of groundtruth.txt are ``timestamp tx ty tz qx qy
+    qz qw``. Depth is in units of 1/5000 m. The format is described by Sturm et al. (2012).
 
     Parameters: `VideoFormat`.
     """

@@ -1,9 +1,9 @@
-"""Pauses of a video (times at which nothing moves), and the rules that find them.
+"""Pauses of a video (times at which nothing moves), and rules that find pauses.
 
 >>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
 
 A clip goes from one pause to the next. At a pause, neither the robot nor a hand should be in the image. Only the
-recording folder of mstfilter stores the pauses. For other layouts, one of the rules below finds them.
+recording folder of mstfilter stores the pauses. For other layouts, a rule of this module finds the pauses.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Ends(PauseRule):
 
 @dataclass(frozen=True)
 class EveryNth(PauseRule):
-    """Every n-th frame is a pause, for single images of a scene that was changed between them."""
+    """Every n-th frame is a pause, for single images of a scene that changes between the images."""
 
     n: PositiveInt = 1
 
@@ -42,7 +42,7 @@ class EveryNth(PauseRule):
 
 @dataclass(frozen=True)
 class At(PauseRule):
-    """Frames by index from 0 (negative from the end), or the frames nearest to times in seconds since the first."""
+    """The pauses are given by frame index (negative from the end) or in seconds since the first frame."""
 
     frames: tuple[int, ...] = ()
     seconds: tuple[float, ...] = ()
@@ -95,21 +95,21 @@ def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 class Still(PauseRule):
     """Middle frames of the intervals in which the image does not change, for a camera that does not move.
 
-    Images are reduced to blocks of grey levels. Two images differ by motion if more than a small share of the blocks
-    differ by more than their noise. A still interval is a run of frames that do not differ from its first frame. So
-    slow motion adds up. Each interval of at least `hold_s` seconds gives one pause, its middle frame. Changes that
-    all blocks share (exposure, flicker) are ignored. The noise of each block is measured in the video, which must be
-    at rest for a quarter of its time.
+    Images are reduced to blocks of grey levels. Two images differ if more than 0.1 % of the blocks change by more
+    than their noise. A still interval is a run of frames that do not differ from its first frame, so slow motion also
+    ends an interval. Each interval of at least `hold_s` seconds gives one pause at its middle frame. Changes that all
+    blocks share (exposure, flicker) are ignored. The noise of each block is measured in the video, so the scene must
+    be at rest for a quarter of the video.
 
-    An interval in which a robot waits in the image, or moves by less than a grey level, also gives a pause. Check the
-    pauses, and give them explicitly if they are wrong.
+    An interval in which a robot waits in the image, or changes it by less than a grey level, also gives a pause.
+    Check the pauses, and replace wrong pauses by explicit pauses.
 
     Parameters
     ----------
     hold_s : float
         Shortest interval, in seconds.
     levels : float
-        A block differs if its grey level (of 255) changes by this value, or by six times its noise if that is more.
+        Smallest change of the grey level (of 255) at which a block differs, and at least six times the block's noise.
     region : tuple of 4 float
         Part of the image that is used: left, top, right, bottom as shares of width and height. The selected part can
         exclude people behind the table.
@@ -178,13 +178,13 @@ class Still(PauseRule):
 class Settled(Still):
     """The frames at which the image has been still for `hold_s` seconds, found while the frames arrive.
 
-    The rule and its parameters are those of `Still`. But each pause is the frame at which its interval reaches
-    `hold_s`, and the noise is measured in the last hundred frames. So a pause depends on earlier frames only, and the
-    pauses of a stream and of its recording are the same.
+    The parameters are the same as in `Still`. Each pause is the frame at which a still interval becomes `hold_s`
+    long. The noise is measured in the last hundred frames. A pause depends on earlier frames only, so a stream and
+    its recording have the same pauses.
     """
 
     def watch(self) -> Callable[[float, np.ndarray], bool]:
-        """A function of the time and the colour image of each frame in order: whether the frame is a pause."""
+        """A function that takes time and colour image of the next frame and returns whether the frame is a pause."""
         changes = deque[np.ndarray](maxlen=_RECENT)
         first = last = None  # images of the first frame of the interval and of the last frame
         began, found = 0.0, False

@@ -1,12 +1,12 @@
-"""Opens recordings of any format.
+"""Functions that open recordings of any format.
 
 >>> open_recording("recordings/mine")
 >>> open_recording("session.mcap")
 >>> open_recording("rgbd_dataset", options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
-Options are fields of the format (``mstfilter list format`` shows them), given as ``FIELD=VALUE``. Commas make a list.
-The format ``./file.py:Class`` is a reader that the user wrote. Each format is a class of `mstfilter.formats`. A rule
-of ``formats/pauses.py`` finds the pauses.
+Options ``FIELD=VALUE`` set fields of the format (shown by ``mstfilter list format``). Commas separate the values of a
+list. The format ``./file.py:Class`` is a reader of the user. Each other format is a class of `mstfilter.formats`. A
+rule of ``formats/pauses.py`` finds the pauses.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ def open_recording(
     path : str or Path
         File or folder.
     format : str
-        Name of a format, or ``./file.py:Class``. Empty means detected.
+        Name of a format, or ``./file.py:Class``. By default, the format is detected.
     options : sequence of str
-        ``FIELD=VALUE`` of the format.
+        Settings ``FIELD=VALUE`` of the format.
     pauses : str
-        Rule for the pauses: see `mstfilter.formats.pauses.pauses_from_text`. Empty means the format's default.
+        Rule for the pauses (`mstfilter.formats.pauses.pauses_from_text`). The default is the rule of the format.
     allow_files : bool
         Whether ``./file.py:Class`` may be loaded.
     """
@@ -66,7 +66,7 @@ def open_format(
 
 
 def pause_rule(text: str) -> PauseRule:
-    """The rule of a text: "still", "ends", "every", frames "0,40,85", seconds "0s,4.2s"."""
+    """The pause rule for a text: "still", "ends", "every", frames "0,40,85", or seconds "0s,4.2s"."""
     rule: PauseRule = _REGISTRY.build("pauses", pauses_from_text(text))
     return rule
 
@@ -101,7 +101,7 @@ def format_settings(options: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_lists(text: str) -> str:
-    """``K=1,2,3`` as ``K=["1", "2", "3"]``; the type of the field makes numbers of words."""
+    """Convert ``K=1,2,3`` to ``K=["1", "2", "3"]``. The type of the field converts words to numbers."""
     path, equals, value = text.partition("=")
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text

@@ -1,21 +1,21 @@
 """Videos with depth: the interface of all readers, and common functions.
 
-A reader is a subclass of `RecordingFormat`. One of a video is a `VideoFormat`, which defines ``video(path)``:
+A reader is a subclass of `RecordingFormat`. A reader of videos is a `VideoFormat`, which defines ``video(path)``:
 
 >>> reader = Tum(K=(525, 525, 319.5, 239.5))
 >>> if reader.detects(path):
 ...     recording = reader.open(path)
 
-To read another layout, define a subclass in a file and pass it: ``mstfilter convert IN OUT --format ./mine.py:Mine``.
-The fields of the class are options of the command line. Build the reader's recording with `Video`, which checks every
-frame when it is read. For arrays in memory use `Recording.from_arrays`.
+To read another layout, define a subclass in a file and pass the class: ``mstfilter convert IN OUT --format
+./mine.py:Mine``. The fields of the class are options of the command line. Build the recording with `Video`, which
+checks every frame on access. For arrays in memory use `Recording.from_arrays`.
 
 >>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
-The camera pose is found from the support plane of the first pause unless it is given. A stored motion of the camera
-is used only relative to the first pause, because the table is seldom at z = 0 in the world of a trajectory. Cameras
-have no distortion, so distorted images are undistorted when they are read.
+The default camera pose is computed from the support plane of the first pause. A stored motion of the camera is used
+only relative to the first pause, because the table is seldom at z = 0 in the world of a stored trajectory. A `Camera`
+has no distortion, so distorted images are undistorted on access.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ from mstfilter.scene import (
 
 
 class RecordingFormat(ABC):
-    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses, with fields for what files do not store."""
+    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses, with fields for data missing in files."""
 
     @classmethod
     @abstractmethod
     def detects(cls, path: Path) -> bool:
-        """Whether the names of files show that a path has this layout. The method raises no error."""
+        """Whether the file names at a path match the layout. The method raises no error."""
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
@@ -66,7 +66,7 @@ _NEGLIGIBLE = 0.5  # pixels
 
 
 def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarray | None:
-    """Column and row in the distorted image of each pixel of the undistorted one, (H, W, 2) float32.
+    """Column and row in the distorted image for each pixel of the undistorted image, (H, W, 2) float32.
 
     `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... Returns None if no pixel moves by half a pixel.
     """
@@ -87,7 +87,7 @@ def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarra
 
 
 def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0, smooth: bool = False) -> np.ndarray:
-    """The undistorted image. Depth and labels must not be interpolated (`smooth`)."""
+    """The undistorted image. `smooth` interpolates colours; depth and labels must not be interpolated."""
     import cv2
 
     if source is None:
@@ -99,7 +99,7 @@ def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0,
 
 @dataclass(frozen=True)
 class KnownWorld:
-    """Camera pose and workspace, if they are known. Empty fields are computed from the first pause."""
+    """Known camera pose and workspace. Empty fields are computed from the first pause."""
 
     #: tuple of 16 float: pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
     T_world_camera: tuple[float, ...] = ()
@@ -108,7 +108,7 @@ class KnownWorld:
 
     @cached_property
     def pose(self) -> RigidTransform | None:
-        """The pose; None if it is not given."""
+        """The given pose, or None without a pose."""
         if not self.T_world_camera:
             return None
         if len(self.T_world_camera) != 16:
@@ -117,7 +117,7 @@ class KnownWorld:
 
     @cached_property
     def grid(self) -> VoxelGrid | None:
-        """The workspace; None if it is not given."""
+        """The given workspace, or None without a workspace."""
         if not self.workspace:
             return None
         if len(self.workspace) != 6:
@@ -202,7 +202,7 @@ class Video:
         return camera, source, lambda index, view: self._frame(index, view, source)
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording. Pose and workspace are computed now, and images are read on access."""
+        """The recording of the video. Pose and workspace are computed in the call. Images are read on access."""
         camera, source, read = self.frame_reader()
         height, width = camera.height, camera.width
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
@@ -257,16 +257,17 @@ def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: floa
 
 @dataclass(frozen=True)
 class VideoFormat(RecordingFormat):
-    """A layout of videos.
+    """A layout of RGB-D videos on disk.
 
     Parameters
     ----------
     K : tuple of 4 float
-        fx, fy, cx, cy in pixels. By default, from the files.
+        fx, fy, cx, cy in pixels. By default, K is read from the files.
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3 of both images. Default: from the files, else none.
+        OpenCV's k1, k2, p1, p2, k3 of colour and depth images. The default is the coefficients in the files, else
+        none.
     tolerance_s : float
         Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float
@@ -274,7 +275,7 @@ class VideoFormat(RecordingFormat):
     pauses : PauseRule
         The rule that finds the pauses.
     world : KnownWorld
-        Pose and workspace, if they are known.
+        Known camera pose and workspace.
     """
 
     K: tuple[float, ...] = ()
@@ -291,12 +292,12 @@ class VideoFormat(RecordingFormat):
         """All frames of the files, and their calibration. Raises InputError if the data are not valid."""
 
     def open(self, path: Path) -> Recording:
-        """The recording of the part of the video that is used."""
+        """The recording of the selected part of the video."""
         return self.video(path).between(self.start_s, self.stop_s).recording(self.pauses, self.world)
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:
-    """Instance image (H, W) uint16 in which no object has the number 255, which is the robot's."""
+    """Instance image (H, W) uint16 without the object number 255, which is reserved for the robot."""
     free = np.setdiff1d(np.arange(256, 65536), labels)[0]
     return np.where(labels == 255, free, labels).astype(np.uint16)
 
@@ -306,7 +307,7 @@ def pair_stamps(
 ) -> tuple[tuple[int, int], ...]:
     """Pairs (colour index, depth index) in order of time.
 
-    The stamps are mutually nearest and at most `tolerance_s` apart.
+    The two stamps of a pair are mutually nearest and at most `tolerance_s` apart.
 
     Warns if more than a tenth of the colour images are in no pair. Raises InputError if there is no pair.
     """

@@ -6,8 +6,8 @@
 >>> hypothesis = Hypothesis.from_labels(labels, clip.grid)  # doctest: +SKIP
 >>> project(hypothesis, clip.after.camera)            # label image of the hypothesis  # doctest: +SKIP
 
-Units are metres, radians and seconds; rigid motions are scipy `RigidTransform` objects named ``T_to_from``. The
-package does not depend on filters or file formats.
+Units are metres, radians and seconds; rigid motions are scipy `RigidTransform` objects named ``T_to_from``.
+`mstfilter.scene` does not depend on filters or file formats.
 """
 
 from mstfilter.lazy import attach

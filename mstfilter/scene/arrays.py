@@ -17,14 +17,14 @@ import numpy as np
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
-    """A read-only view of an array that shares its data."""
+    """A read-only view of the data of an array."""
     view = array.view()
     view.flags.writeable = False
     return view
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array whose memory no other array can change, copied if necessary."""
+    """A read-only array. An array with writeable memory is copied, so no other array can change the result."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
@@ -36,10 +36,10 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def component_key(component: object) -> bytes:
-    """Key of a component: its class, its fields including arrays, and, for a class of the user, its file or code.
+    """Key of a component from its class, its fields with their arrays and, for a class of the user, its file or code.
 
-    If a component has a ``bound_key`` (for oracles, the ground truth of a recording), the key includes it. Torch
-    modules are identified by their weights, other fields by their pickled content.
+    The key also includes the attribute ``bound_key`` of an oracle, which identifies the ground truth of a recording.
+    Torch modules are identified by their weights. Other objects are identified by their pickled content.
     """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)
@@ -61,7 +61,7 @@ def component_key(component: object) -> bytes:
 
 
 def _code(cls: type) -> str:
-    """The code of the methods of a user's class, which can change under the same name."""
+    """The code of the methods of a class of the user, as text."""
     own = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")]
     values = [value for base in own for value in vars(base).values()]
     inner = [getattr(v, "fget", None) or getattr(v, "func", None) or getattr(v, "__func__", v) for v in values]
@@ -70,7 +70,7 @@ def _code(cls: type) -> str:
 
 
 def _text(constant: Any) -> str:
-    """A constant of compiled code, or code without its file and line, as text."""
+    """Text of a constant of compiled code, or of code without its file name and line numbers."""
     if isinstance(constant, CodeType):
         return repr((constant.co_code, constant.co_names)) + "".join(_text(part) for part in constant.co_consts)
     return repr(sorted(map(repr, constant)) if isinstance(constant, frozenset) else constant)
@@ -92,5 +92,5 @@ def content_key(*parts: object) -> bytes:
 
 
 def max_of_three(values: np.ndarray) -> np.ndarray:
-    """Maximum over a last axis of length 3, faster than ``values.max(axis=-1)``."""
+    """Maximum over the last axis, which has length 3. The function is faster than ``values.max(axis=-1)``."""
     return np.asarray(np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2]))

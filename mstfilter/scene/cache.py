@@ -1,8 +1,8 @@
-"""Cache of intermediate results, identified by the content of their input.
+"""Cache of intermediate results. The content of the input identifies a result.
 
-Some results depend only on the data and not on the hypothesis. Examples are the boundary map of a frame and the flow
-between two frames. `memo` stores results of this kind. All hypotheses of a step share them. A second run on the same
-data in one process uses them too.
+Some results depend only on the data and not on the hypothesis, for example the boundary map of a frame. `memo` stores
+results that do not depend on the hypothesis. All hypotheses of a step share a stored result. A second run on the same
+data in the same process also uses the stored results.
 
 >>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)
@@ -35,8 +35,8 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    If the total exceeds `limit_bytes`, the least recently used values are dropped. `forget` drops the values that
-    were not used of late. The counter `hits` counts by name how often values were found in memory or on disk.
+    If the total size exceeds `limit_bytes`, the least recently used values are dropped. `forget` drops the values
+    that were not used recently. The counter `hits` counts, by name, the values found in memory or on disk.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
@@ -51,15 +51,15 @@ class Cache:
         self._disk: DiskCache | None = None
 
     def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
-        """The value of ``compute()``, computed if it is not in the cache.
+        """The cached value of ``compute()``. The function `compute` is called only if the value is not in the cache.
 
-        `name` states what is computed. `key` contains content keys (`Frame.key`, `Camera.key`, `VoxelGrid.key`) and
-        every parameter that affects the value. Name and key together determine the value completely, so `compute`
-        must not draw random numbers. The value must not be changed afterwards.
+        `name` is the name of the computation. `key` contains content keys (`Frame.key`, `Camera.key`,
+        `VoxelGrid.key`) and every parameter that affects the value. Name and key together determine the value
+        completely, so `compute` must not draw random numbers. The caller must not change the value.
 
         If `stored_as` is a type, the value is also stored on disk (see `on_disk`). The type is an array, a dataclass
-        whose fields are arrays, strings or None, or a tuple of these. Use `stored_as` only for values that take much
-        longer to compute than to read.
+        with fields that are arrays, strings or None, or a tuple of arrays and dataclasses. Use `stored_as` only if
+        computing the value takes much longer than reading the value.
         """
         return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
 
@@ -70,9 +70,9 @@ class Cache:
         compute: Callable[[Sequence[int]], Sequence[_Value]],
         stored_as: Any = None,
     ) -> list[_Value]:
-        """The values of several keys. ``compute(indices)`` computes all missing values together.
+        """The values of several keys. One call ``compute(indices)`` computes all missing values.
 
-        A value that another thread computes at present is not computed again, but waited for.
+        If another thread computes a value at the moment, the call waits for this value.
         """
         found: dict[Hashable, _Value] = {}
         left: dict[Hashable, int] = {}
@@ -143,13 +143,13 @@ class Cache:
 
     @property
     def n_bytes(self) -> int:
-        """Size of all values."""
+        """Size of all values in bytes."""
         return self._n_bytes
 
     def forget(self) -> None:
-        """Drop the values that were not used since the second last call.
+        """Drop the values that were not used since the second last call of `forget`.
 
-        A loop over pauses that calls this method after each step keeps the values of the last two steps.
+        A loop over pauses that calls `forget` after each step keeps the values of the last two steps.
         """
         with self._lock:
             for entry in [entry for entry, used in self._used.items() if used < self._n_forgotten - 1]:
@@ -157,7 +157,7 @@ class Cache:
             self._n_forgotten += 1
 
     def clear(self) -> None:
-        """Drop all values in memory and reset the counts of hits."""
+        """Drop all values in memory and reset the counter `hits`."""
         with self._lock:
             self._entries.clear()
             self._used.clear()
@@ -166,9 +166,9 @@ class Cache:
 
     @contextlib.contextmanager
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
-        """Also store values with `stored_as` in a folder that several processes share (see `DiskCache`).
+        """Also store the values with `stored_as` on disk, in a folder that several processes can share (`DiskCache`).
 
-        `limit_bytes` is the largest size of the folder. Values from another `version` of the code are not found.
+        `limit_bytes` is the largest size of the folder. Values of another `version` of the code are not used.
         """
         from mstfilter.scene.disk_cache import DiskCache
 
@@ -184,19 +184,19 @@ scene_cache = Cache()  #: The cache of this process
 
 
 def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
-    """The value of ``compute()``, computed if it is not in `scene_cache`. Parameters: `Cache.get`."""
+    """The value of ``compute()``, computed if `scene_cache` has no value for the key. See `Cache.get`."""
     return scene_cache.get(name, key, compute, stored_as)
 
 
 def memo_many(
     name: str, keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Sequence[_Value]], stored_as: Any = None
 ) -> list[_Value]:
-    """The values of several keys; ``compute(indices)`` computes the missing values. See `Cache.get_many`."""
+    """The values of several keys. ``compute(indices)`` computes the missing values. See `Cache.get_many`."""
     return scene_cache.get_many(name, keys, compute, stored_as)
 
 
 def _size_of(value: Any) -> int:
-    """Bytes of the arrays inside a value, including those in containers and dataclasses."""
+    """Size in bytes of the arrays inside a value, including arrays in containers and dataclasses."""
     if isinstance(value, np.ndarray):
         return value.nbytes + 128
     if isinstance(value, dict):

@@ -6,8 +6,8 @@
 >>> camera.project(np.array([0.0, 0.0, 1.0]))[0]
 array([319.5, 239.5])
 
-Axes are OpenCV's: x right, y down, z forward. Pixel (u, v) = (column, row) with (0, 0) at the centre of the first
-pixel. If a camera has no pose (`T_world_camera=None`), the world axes are its axes.
+Camera axes follow OpenCV: x points right, y down, z forward. A pixel is (u, v) = (column, row). The centre of the
+first pixel is (0, 0). Without a pose (`T_world_camera=None`), the world axes are the camera axes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Camera:
     width, height : int
         Image size in pixels.
     T_world_camera : scipy RigidTransform, optional
-        Pose: maps camera axes to world axes (metres).
+        Pose that maps camera axes to world axes, in metres.
     """
 
     K: np.ndarray
@@ -102,7 +102,7 @@ class Camera:
 
     @cached_property
     def pose(self) -> RigidTransform:
-        """`T_world_camera`; the identity if it is not known."""
+        """`T_world_camera`, or the identity for a camera without a pose."""
         return RigidTransform.identity() if self.T_world_camera is None else self.T_world_camera
 
     @property
@@ -155,7 +155,7 @@ class Camera:
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Column, row and z-depth (...) of world points (..., 3), and whether each pixel is in the image.
 
-        Column and row are int64, 0 outside the image.
+        Column and row are int64, and 0 for points outside the image.
         """
         uv, z = self.project(points)
         pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
@@ -164,7 +164,7 @@ class Camera:
         return u, v, z, inside
 
     def scaled(self, factor: float) -> Camera:
-        """The camera of the same image resized by `factor` (pixel centres keep their positions)."""
+        """The camera of the image resized by `factor`. The outer corner (-0.5, -0.5) of the first pixel is fixed."""
         width, height = round(self.width * factor), round(self.height * factor)
         K = self.K.copy()
         K[:2, :2] *= factor
@@ -181,17 +181,17 @@ _WIDTH, _HEIGHT = 640, 480  # pixels: the image size in which numbers of pixels 
 
 
 def scaled_length(pixels: float, width: int) -> float:
-    """Scale a length in pixels from an image of 640 columns to one of `width` columns."""
+    """Scale a length in pixels from an image of 640 columns to an image of `width` columns."""
     return pixels * width / _WIDTH
 
 
 def scaled_area(pixels: float, n_pixels: int) -> float:
-    """Scale an area in pixels from an image of 640 x 480 pixels to one of `n_pixels` pixels."""
+    """Scale an area in pixels from an image of 640 x 480 pixels to an image of `n_pixels` pixels."""
     return pixels * n_pixels / (_WIDTH * _HEIGHT)
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
-    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m); `up` is at the image's top."""
+    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), with `up` at the image top."""
     position = np.asarray(position, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - position
     forward /= np.linalg.norm(forward)
@@ -206,7 +206,7 @@ def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, fl
 def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform:
     """A RigidTransform from a 4x4 matrix.
 
-    Raises InputError if the matrix has scale or shear, because scipy would orthogonalise it without an error.
+    Raises InputError if the matrix has scale or shear, because scipy would orthogonalise the matrix without an error.
     """
     try:
         matrix = np.asarray(matrix, dtype=np.float64)

@@ -3,8 +3,8 @@
 >>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
 ...     run()                                    # values with `stored_as` are stored, and found again
 
-The argument `stored_as` of `mstfilter.scene.memo` selects these values. diskcache stores the entries and removes the
-least recently used ones beyond the limit. An entry is the bytes of an .npz file. Nothing is unpickled.
+The argument `stored_as` of `mstfilter.scene.memo` selects the stored values. The library diskcache stores the entries
+and removes the least recently used entries beyond the limit. Entries are .npz files and are not unpickled.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FILE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{2}/[0-9a-f]{28}\.val".replace("/", re.
 
 
 class _BytesDisk(diskcache.Disk):
-    """Storage of bytes under bytes. The class of diskcache itself would unpickle stored values."""
+    """Storage of values and keys that are bytes. The base class `diskcache.Disk` would unpickle stored values."""
 
     def put(self, key: bytes) -> tuple[Any, bool]:
         return sqlite3.Binary(key), True
@@ -59,21 +59,21 @@ class _BytesDisk(diskcache.Disk):
             super().remove(file_path)
 
     def _check_file(self, name: Any) -> None:
-        """Raise ValueError unless a name in the data base is that of a file that diskcache makes in the folder."""
+        """Raise ValueError unless a file name from the data base has diskcache's form and is in the folder."""
         inside = Path(self._directory).resolve() / str(name)
         if not _FILE.fullmatch(str(name)) or inside.parent.resolve() != inside.parent:
             raise ValueError(f"entry has the file {name!r}")
 
 
 class DiskCache:
-    """Values in a folder, which is created if necessary. `version` is part of the key of every entry.
+    """Values in a folder. The folder is created if necessary. `version` is part of the key of every entry.
 
     Several processes may use the folder at the same time. An entry that cannot be read is treated as missing. Nothing
     is stored, and no error is raised, if the folder cannot be written, the disk is full, or another process locks the
     folder. A locked folder is reported by an InputWarning.
 
-    A new folder is accessible to this user only. Raises InputError if the folder belongs to another user or is
-    writable by others, since its entries are used as results.
+    Only the current user can access a new folder. InputError is raised if the folder belongs to another user or if
+    other users can write to the folder.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int, version: str) -> None:
@@ -101,7 +101,7 @@ class DiskCache:
             self._entries = None
 
     def _can_lock(self) -> bool:
-        """Whether the data base can be written now. diskcache itself would wait for a minute."""
+        """Whether the data base can be written now. The library diskcache would wait a minute for a lock."""
         with contextlib.closing(sqlite3.connect(self.folder / "cache.db", timeout=_LOCK_S)) as probe:
             try:
                 probe.execute("BEGIN IMMEDIATE")
@@ -114,7 +114,7 @@ class DiskCache:
         return True
 
     def _give_up(self) -> None:
-        """Stop using the folder, since every further entry would wait again."""
+        """Stop using the locked folder, because every further access would wait for the lock."""
         self._entries = None
         message = f"the cache {self.folder} is locked by another process for more than {_LOCK_S} s"
         warnings.warn(InputWarning(message, "this process continues without it"), stacklevel=4)
@@ -137,7 +137,7 @@ class DiskCache:
             return None
 
     def store(self, name: str, key: Hashable, value: Any) -> None:
-        """Write an entry if possible."""
+        """Write an entry. Errors of the folder or the disk are ignored."""
         if self._entries is None:
             return
         data = io.BytesIO()
@@ -152,7 +152,7 @@ class DiskCache:
                 return
 
     def close(self) -> None:
-        """Close the files of this thread."""
+        """Close the files that this thread has opened."""
         if self._entries is not None:
             self._entries.close()
 
@@ -161,7 +161,7 @@ class DiskCache:
 
 
 def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
-    """Arrays of a value, named by their path in it: ``0.labels`` is field `labels` of the first item of a tuple."""
+    """Arrays of a value by path inside the value. The path ``0.labels`` is field `labels` of tuple item 0."""
     if value is None:
         return {}
     if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
-"""Hypotheses as plain arrays, without pickle.
+"""Conversion of hypotheses to plain arrays and back, without pickle.
 
 >>> np.savez_compressed(path, **encode_hypotheses(hypotheses))  # doctest: +SKIP
 >>> hypotheses = decode_hypotheses(dict(np.load(path)))  # doctest: +SKIP
@@ -16,15 +16,15 @@ from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, O
 
 
 def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
-    """Hypotheses on one grid as named arrays.
+    """Convert hypotheses on one grid to named arrays.
 
-    The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and one row per object:
-    ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``. The
-    crops of the sources are ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and ``source_bits``, the
-    packed bits of all crops in order.
+    The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and arrays with one row per
+    object: ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``.
+    The field `source` of the objects is stored as ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and
+    ``source_bits``. The array ``source_bits`` has the packed bits of all crops in order.
 
     For a hypothesis with probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
-    ``source_probability`` has the probabilities of all crops in order. Views of objects have one row each:
+    ``source_probability`` has the probabilities of all crops in order. Each view of an object has a row in
     ``view_of`` (the row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4), ``view_key``.
     ``view_bits`` and ``view_signed`` have the values of all views in order.
     """
@@ -85,7 +85,7 @@ def _joined(arrays: Sequence[np.ndarray], dtype: type) -> np.ndarray:
 
 
 class _Reader:
-    """Splits joined values into consecutive arrays."""
+    """Splits a concatenated array into consecutive arrays."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.values, self.at = values, 0
@@ -96,7 +96,7 @@ class _Reader:
 
 
 def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...]:
-    """Hypotheses, rebuilt from the arrays of `encode_hypotheses`."""
+    """Convert the arrays of `encode_hypotheses` back to hypotheses."""
     labels = arrays["labels"]
     grid = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), labels.shape[1:])
     records: list[list[ObjectRecord]] = [[] for _ in labels]
@@ -134,7 +134,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
 
 
 def _decode_views(arrays: Mapping[str, np.ndarray]) -> dict[int, list[ObjectView]]:
-    """The views of each object, by its row."""
+    """The views of each object, by the row of the object."""
     found: dict[int, list[ObjectView]] = {}
     if "view_of" in arrays:
         bits, signed = _Reader(arrays["view_bits"]), _Reader(arrays["view_signed"])

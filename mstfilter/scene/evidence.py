@@ -1,12 +1,13 @@
-"""Evidence about hypotheses in one frame: the space that it observes as free, and scores.
+"""Evidence about hypotheses in one frame: observed free space, and scores.
 
 >>> refined, quality = FreeSpace().project(hypothesis, frame)           # one hypothesis, one frame
 >>> refined, quality = FreeSpace().refine(hypotheses, clip)             # several, at the end of a clip
 >>> log_score = evidence.log_score(hypotheses, clip)                    # (n,) nats, larger is better
 
 Free-space projection is the first step of the measurement update (paper, section IV-D). The quality of a prediction
-is Q = 1 - (occupied voxels that are cleared) / (occupied voxels). An update adds lambda log Q to its log weight;
-lambda is `quality_exponent`. So a prediction with objects in free space loses voxels, and its weight decreases.
+is Q = 1 - (cleared voxels) / (occupied voxels). An update adds lambda log Q to the log weight of the prediction. The
+factor lambda is the parameter `quality_exponent` of the update. A prediction with objects in free space loses voxels
+and weight.
 """
 
 from __future__ import annotations
@@ -58,11 +59,11 @@ class Projection(Checked, ABC):
     @returns(_check_projected)
     @abstractmethod
     def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
-        """The nearest hypothesis that agrees with a frame, and the share of voxels that it keeps, in [0, 1]."""
+        """The nearest hypothesis that agrees with a frame, and the share of kept voxels, in [0, 1]."""
 
     @returns(_check_refined)
     def refine(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-        """Project hypotheses onto the last frame of a clip, and return the shares of voxels (n,) that they keep."""
+        """Project hypotheses onto the last frame of a clip. Returns hypotheses and the shares (n,) of kept voxels."""
         pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
@@ -80,9 +81,9 @@ class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
     A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The first
-    margin is for the extent of the voxel. The second margin is for the sensor noise at this range
-    (`mstfilter.scene.depth_sigma`). Voxels without a measurement (no reading, the robot, outside the image, behind a
-    surface) are unknown and are kept. A voxel with a measured point inside is kept.
+    margin accounts for the size of the voxel. The second margin accounts for the sensor noise at the range of the
+    surface (`mstfilter.scene.depth_sigma`). Voxels without a measurement (no reading, the robot, outside the image,
+    behind a surface) are unknown and are kept. A voxel that contains a measured point is kept.
 
     With several cameras (`Frame.views`), a voxel is free if at least one camera observes it as free and no camera has
     a measured point in it.
@@ -90,9 +91,9 @@ class FreeSpace(Projection):
     Parameters
     ----------
     margin_voxels : float
-        Margin for the extent of a voxel, in voxels.
+        Margin for the size of a voxel, in voxels.
     margin_sigmas : float
-        Margin for the noise, in standard deviations of a depth reading at this range.
+        Margin for the noise, in standard deviations of a depth reading at the range of the surface.
     table_height : float
         Voxels with centres below this height (metres above the table) are always cleared.
     """
@@ -102,7 +103,7 @@ class FreeSpace(Projection):
     table_height: Annotated[float, Bounds()] = 0.0
 
     def known_free(self, frame: Frame, grid: VoxelGrid) -> np.ndarray:
-        """Voxels (X, Y, Z) bool that a frame observes as free. Cached by content."""
+        """Voxels (X, Y, Z) bool that a frame observes as free. The result is cached."""
         key = (frame.key, grid.key, component_key(self))
         return memo("known_free", key, lambda: read_only(self._known_free(frame, grid)))
 
@@ -134,7 +135,7 @@ class FreeSpace(Projection):
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:
-    """log max(Q, 1e-3) (n,) of qualities Q (n,). The bound keeps all weights positive."""
+    """log max(Q, 1e-3) (n,) of qualities Q (n,). The bound 1e-3 keeps all weights positive."""
     return np.log(np.maximum(quality, _SMALLEST_QUALITY))
 
 
@@ -142,21 +143,20 @@ _LEAST_PIXELS = 30  # in an image of 640 x 480 pixels: an object with fewer of t
 
 
 def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray, float]:
-    """Share of the visible surface of each object that a frame shows at its place, and that of all objects together.
+    """Shares of the visible surface that a frame confirms, for each object and for all objects together.
 
-    The test uses the pixels that would show an object, without the outline, where a voxel can cover more than the
-    object. A pixel with a reading in front of the surface is not used, since another object may stand there. Pixels
-    without a reading are not used. At each other pixel, the surface is at its place if the pixel belongs to an object
-    (`foreground`), and if its reading is not far behind the surface. The tolerance is a voxel and three standard
-    deviations of the sensor.
+    The test renders the hypothesis and uses the pixels inside the outlines of objects. Pixels without a reading are
+    not used. A pixel with a reading in front of the surface is not used, because another object may hide the surface.
+    At each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is not far
+    behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth noise.
 
     Returns
     -------
     of_objects : (k,) ndarray
-        Share of each label. NaN for label 0, and for objects with few of these pixels or with more pixels without a
-        reading.
+        Share of each label. The share is NaN for label 0, for objects with few used pixels, and for objects with more
+        pixels without a reading.
     of_scene : float
-        Share of all objects together. 1 if no pixel can be used.
+        Share of all objects together. The share is 1 if no pixel can be used.
     """
     rendered, shown = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid).pixels
     would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])
@@ -178,7 +178,7 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
 
 
 def _interior(rendered: Rendering, size: float) -> np.ndarray:
-    """Pixels (H, W) bool half a voxel away from the outline of their object; a voxel has `size` / depth pixels."""
+    """Pixels (H, W) bool at least half a voxel inside an outline. The edge of a voxel has `size` / depth pixels."""
     shown = rendered.labels > 0
     if not shown.any():
         return shown
@@ -187,12 +187,12 @@ def _interior(rendered: Rendering, size: float) -> np.ndarray:
 
 
 class Evidence(Checked, ABC):
-    """One term of the score of a candidate.
+    """A term in the score of candidate hypotheses.
 
-    The documentation of a term states which data it uses, so that users can see which data are counted twice.
+    The documentation of each term states the data that the term uses, so that users see which data count twice.
     """
 
     @returns(lambda self, found, hypotheses, clip: check_array(found, (len(hypotheses),)).astype(np.float64))
     @abstractmethod
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """Log score (n,) of hypotheses about the end of a clip, in nats, finite, up to a common constant."""
+        """Finite log scores (n,), in nats and up to a common constant, of hypotheses about the end of a clip."""

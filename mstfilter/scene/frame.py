@@ -5,8 +5,8 @@
 >>> clip = Clip([frame, frame_2], grid, 1)     # the frames from pause 0 to pause 1
 >>> clip.before, clip.after                    # its first and its last frame
 
-If several cameras observe the scene, the images of one camera are segmented and tracked. The simultaneous frames of
-the other cameras are its `views`. Free space is computed from all cameras:
+If several cameras observe the scene, the images of a main camera are segmented and tracked. A frame of the main
+camera has the simultaneous frames of the other cameras as `views`. Free space is computed from all cameras:
 
 >>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """
@@ -39,8 +39,8 @@ def depth_sigma(z: ArrayLike) -> np.ndarray:
     """Standard deviation (m) of a depth reading at z-depth `z` (m), in the shape of `z`.
 
     The sensor measures disparity, so the standard deviation grows with the square of depth: sigma = 0.00185 m (z /
-    m)^2. The factor was fitted to table patches of 45 Kinect v1 and Xtion frames (0.6 to 1.5 m). The factor fits the
-    patches within 10 % up to 1.2 m.
+    m)^2. The factor 0.00185 m was fitted to image patches of tables in 45 Kinect v1 and Xtion frames (0.6 to 1.5 m).
+    Up to 1.2 m, the formula is within 10 % of the measured values.
     """
     z = np.asarray(z)
     return _SIGMA_AT_ONE_METRE * z * z
@@ -64,8 +64,8 @@ def _decode(path: Path, flags: int) -> np.ndarray:
 def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarray:
     """The image in the bytes of a PNG, JPEG or TIFF file, decoded with the `flags` of ``cv2.imdecode``.
 
-    Raises InputError with the message `problem` if the bytes are not an image, or an image of more than `MAX_PIXELS`
-    pixels. An image above the limit is not decoded.
+    Raises InputError with the message `problem` if the bytes are not an image. An image of more than `MAX_PIXELS`
+    pixels is not decoded and also raises InputError.
     """
     import cv2
 
@@ -96,7 +96,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the first frame header; struct.error if there is none."""
+    """Width and height in the first frame header. Raises struct.error if the data have no frame header."""
     at = 2
     while True:
         mark, kind, length = struct.unpack_from(">BBH", data, at)
@@ -112,7 +112,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
-    """Width and height in the first directory; struct.error if it is not complete."""
+    """Width and height in the first directory. Raises struct.error if the directory is not complete."""
     (at,) = struct.unpack_from(f"{order}I", data, 4)
     (n,) = struct.unpack_from(f"{order}H", data, at)
     found = {}
@@ -180,7 +180,7 @@ _BLOCKS_ACROSS = 80
 
 
 def grey_blocks(rgb: np.ndarray) -> np.ndarray:
-    """Mean grey level (h, w) float32 of square blocks, about 80 per row, of an image (H, W, 3)."""
+    """Mean grey levels (h, w) float32 of the square blocks of an image (H, W, 3), with about 80 blocks per row."""
     grey = np.asarray(rgb, dtype=np.float32).mean(axis=2)
     side = max(1, grey.shape[1] // _BLOCKS_ACROSS)
     h, w = grey.shape[0] // side, grey.shape[1] // side
@@ -200,9 +200,9 @@ class Frame:
     camera : Camera
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
-        Pixels that show the robot. Robot pixels are unknown, neither background nor free space.
+        Pixels that show the robot. The depth at robot pixels is treated as unknown.
     views : tuple of Frame
-        Frames of other cameras at the same time, without views. All cameras need a pose in the same world.
+        Simultaneous frames, without views, of other cameras. With views, all cameras need a pose in one world.
     """
 
     rgb: np.ndarray
@@ -266,7 +266,7 @@ class Frame:
 
     @property
     def all_views(self) -> tuple[Frame, ...]:
-        """This frame and its views."""
+        """The frame itself and its views."""
         return (self, *self.views)
 
     @cached_property
@@ -279,7 +279,7 @@ class Frame:
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(H, W, 3) float64 world points in metres, NaN without a reading."""
+        """(H, W, 3) float64 world points in metres, NaN at pixels without a reading."""
         return read_only(self.camera.unproject(self.depth))
 
 
@@ -287,13 +287,13 @@ class Frame:
 class Clip:
     """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
-    `before` shows the scene at the previous pause and `after` at this pause. The frames between both show the action.
-    The first clip of a recording has one frame.
+    `before` is the frame at the previous pause, and `after` is the frame at the pause that ends the clip. The frames
+    between the two pauses show the action. The first clip of a recording has one frame.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Frames in time order. The first and last show the scene at rest. A lazy sequence stays lazy.
+        Frames in time order. The first and the last frame show the scene at rest. A lazy sequence is read on access.
     grid : VoxelGrid
         The workspace.
     index : int
@@ -322,7 +322,7 @@ class Clip:
 
     @cached_property
     def key(self) -> bytes:
-        """Content key of all frames and the grid. Reads every image once."""
+        """Content key of all frames and the grid. The first access reads every image."""
         return content_key("frames", self.grid.key, *(frame.key for frame in self.frames))
 
     @property
@@ -332,7 +332,7 @@ class Clip:
 
     @property
     def after(self) -> Frame:
-        """The frame at this pause."""
+        """The frame at the pause that ends the clip."""
         return self.frames[-1]
 
     def __len__(self) -> int:

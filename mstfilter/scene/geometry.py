@@ -5,10 +5,9 @@
 >>> camera = frame.camera.at(plane.T_world_camera)        # z up, table at z = 0
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
 
-Disparity D = 8 f b / z (f focal length, b baseline, z depth) is affine in pixel coordinates on a plane, and its noise
-is the same everywhere. So the support plane is a least-squares fit of D by an affine function of the pixel (u, v).
-Disparity is in units of a Kinect (f = 525 pixels, b = 0.075 m, 1/8 pixel) for every image size, so that thresholds
-correspond to the same noise.
+On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
+The noise of disparity does not depend on depth, so the support plane is a least-squares fit of disparity by an affine
+function. Disparity is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from mstfilter.scene.voxels import VoxelGrid
 
 @dataclass(frozen=True, eq=False)
 class FrameGeometry:
-    """Voxel centres of a grid in the image of a frame."""
+    """Projection of the voxel centres of a grid into the image of a frame."""
 
     #: (X, Y, Z) int32: flat index of the pixel of the centre; -1 outside the image or behind the camera.
     pixel: np.ndarray
@@ -38,18 +37,18 @@ class FrameGeometry:
     signed: np.ndarray
 
     def known_free(self, margin: float | np.ndarray) -> np.ndarray:
-        """(X, Y, Z) bool: centres more than `margin` metres in front of the measured surface."""
+        """(X, Y, Z) bool: voxel centres more than `margin` metres in front of the measured surface."""
         with np.errstate(invalid="ignore"):
             return self.signed < -np.asarray(margin, dtype=np.float32)
 
     @property
     def unknown(self) -> np.ndarray:
-        """(X, Y, Z) bool: no depth was measured along the ray of the centre."""
+        """(X, Y, Z) bool: voxel centres at pixels without a measured depth."""
         return np.isnan(self.signed)
 
 
 def frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
-    """The voxel centres of a grid in the image of a frame. Cached by content."""
+    """The projection of the voxel centres of a grid into the image of a frame. The result is cached."""
     return memo("frame_geometry", (frame.key, grid.key), lambda: _frame_geometry(frame, grid))
 
 
@@ -65,7 +64,7 @@ def _frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 
 def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel and z-depth (single and double precision) of every voxel centre, for all frames of a camera."""
+    """Pixel and z-depth (single and double precision) of every voxel centre, the same for all frames of a camera."""
     u, v, z, inside = camera.pixels_of(grid.centres())
     pixel = np.where(inside & (z > 1e-6), v * camera.width + u, -1).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
@@ -79,7 +78,7 @@ _FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of dispar
 class SupportPlane:
     """The plane on which the objects stand."""
 
-    #: Camera pose in the world of the plane: z is the normal of the plane, which is at z = 0; the origin is at the
+    #: Camera pose in world axes of the plane: the plane is at z = 0, z is its normal; the origin is at the
     #: median of its pixels, y points away from the camera.
     T_world_camera: RigidTransform
     on_or_behind: np.ndarray  #: (H, W) bool, readings on the plane or behind it
@@ -100,10 +99,10 @@ _MIN_SHARE = 0.1  # smallest share of inliers among the readings
 
 
 def fit_support_plane(frame: Frame) -> SupportPlane:
-    """Find the plane with the most readings (RANSAC, then least squares). Cached by content.
+    """Find the plane with the most readings (RANSAC, then least squares). The result is cached.
 
-    The pose of the frame is not used. The minimal sets are drawn with a constant seed, so the same frame gives the
-    same plane. Raises InputError if there are too few readings or too few inliers.
+    The pose of the frame is not used. RANSAC samples with a constant seed, so the same frame gives the same plane.
+    Raises InputError if there are too few readings or too few inliers.
     """
     return memo("support_plane", frame.key, lambda: _fit(frame))
 
@@ -148,7 +147,7 @@ def _fit(frame: Frame) -> SupportPlane:
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """Camera pose in a world with z up and the plane (a, b, c of its disparity) at z = 0."""
+    """Camera pose in a world with z up and the plane at z = 0. The plane has the disparity a u + b v + c."""
     scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K
@@ -169,10 +168,10 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
 
 
 def table_residual(frame: Frame) -> np.ndarray:
-    """Measured minus table disparity in 1/8 pixels, (H, W) float32. Cached by content.
+    """Measured minus table disparity in 1/8 pixels, (H, W) float32. The result is cached.
 
-    The table is at z = 0 of the camera's world. Positive values are above the table. NaN means no reading, and +inf a
-    reading whose ray does not meet the table.
+    The table is the plane z = 0 of the world. Positive values are above the table. NaN means no reading. The value
+    +inf means a reading on a ray that does not meet the table.
     """
 
     def compute() -> np.ndarray:
@@ -195,11 +194,11 @@ _LEAST_SIDE, _LARGEST_SIDE = 1.0, 2.0  # metres
 
 
 def workspace(frame: Frame) -> VoxelGrid:
-    """A grid in voxels of 1 cm around the visible part of the table, which is at z = 0.
+    """A grid with voxels of 1 cm around the visible part of the table. The table is at z = 0.
 
-    The grid is .5 m high, and each side is 1 to 2 m long. The grid covers as much of the table as possible. Along a
-    side where the table is shorter or longer than the grid, the grid is centred on the readings more than 1 cm above
-    the table. Readings beside the visible table, for example on a wall behind it, are ignored.
+    The grid is .5 m high, and each side is 1 to 2 m long. The grid covers as much of the table as possible. If the
+    table is shorter or longer than the grid along an axis, the grid is shifted towards the readings more than 1 cm
+    above the table. Readings outside the visible table, for example on a wall, are ignored.
     """
     voxel_size, height = 0.01, 50
     points = frame.points[frame.valid]

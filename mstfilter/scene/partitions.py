@@ -1,7 +1,7 @@
 """Partitions of voxels or pixels: renumbered labels, and the common refinement of several partitions.
 
-A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation.
-There are far fewer cells than voxels.
+A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation. The
+number of cells is far smaller than the number of voxels.
 
 >>> both = common_refinement([np.array([0, 1, 1, 2]), np.array([0, 7, 7, 7])])
 >>> both.cells, both.sizes
@@ -20,7 +20,7 @@ import numpy as np
 
 
 def canonical(labels: np.ndarray) -> np.ndarray:
-    """The same segmentation with labels numbered 1, 2, ... by their first voxel; 0 is free."""
+    """The same segmentation with labels 1, 2, ... in the order of their first voxels. Label 0 is free and stays 0."""
     flat = np.asarray(labels).ravel()
     present, first = np.unique(flat, return_index=True)
     order = np.argsort(np.where(present == 0, -1, first), kind="stable")
@@ -47,14 +47,14 @@ class CommonRefinement:
         return int(self.first[-1])
 
     def objects_in(self, cells: np.ndarray) -> np.ndarray:
-        """Whether each object (n_objects + 1,) contains one of these cells; False for 0, free."""
+        """Whether each object contains at least one of the `cells`, (n_objects + 1,). Label 0 (free) gives False."""
         present = np.zeros(self.n_objects + 1, bool)
         present[self.objects[:, cells]] = True
         present[0] = False
         return present
 
     def overlaps(self) -> np.ndarray:
-        """Number (n_objects + 1, n_objects + 1) of positions that two objects share; row and column 0 are 0."""
+        """Number of positions that two objects share, (n_objects + 1, n_objects + 1). Row and column 0 are zero."""
         total = self.n_objects + 1
         shared = np.zeros((total, total))
         sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
@@ -89,7 +89,7 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
 
 
 def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
-    """The number of distinct codes other than 0, and the codes renumbered 1, 2, ... in ascending order; 0 stays 0."""
+    """The number of distinct nonzero codes, and the codes renumbered 1, 2, ... in ascending order. Code 0 stays 0."""
     if codes.max(initial=0) > 8 * len(codes) + 1000:  # too large for a table
         codes = np.unique(np.append(codes, 0), return_inverse=True)[1][:-1]
     number = np.zeros(codes.max(initial=0) + 1, np.int64)

@@ -1,12 +1,12 @@
-"""Examination of a recording before a run, and of the first hypotheses.
+"""Plausibility checks of a recording before a run, and of the first hypotheses.
 
 >>> for finding in examine(recording.frames, recording.pauses, recording.grid):
 ...     print(finding.stop, finding.message, finding.hints)
 
-Some faults give confident wrong hypotheses and no error: wrong units, a camera matrix of another image size, a moved
-camera, or unregistered depth. `examine` compares the frames at the pauses with what a camera over a table can
-observe. If the result cannot be correct, the finding stops the run. Other findings are warnings. The limits were
-chosen from the correct and wrong recordings of ``experiments/plausibility``.
+Some faults of the input give confident wrong hypotheses and no error: wrong units, a camera matrix of another image
+size, a moved camera, or unregistered depth. `examine` tests whether a camera over a table can have taken the frames
+at the pauses. A finding stops the run if the hypotheses cannot be correct. Other findings are warnings. The limits of
+the checks were chosen in ``experiments/plausibility``.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _SHIFTS = 16  # pixels of an image of 320 columns
 
 @dataclass(frozen=True)
 class Finding:
-    """A property of the input that probably was not intended."""
+    """A property of the input that the user probably did not intend."""
 
-    stop: bool  #: whether the result cannot be right
+    stop: bool  #: whether the hypotheses cannot be correct
     message: str
     hints: tuple[str, ...]
 
@@ -72,11 +72,11 @@ _GIVE_WORKSPACE = "give a workspace around the objects, or none: it is then plac
 
 
 def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
-    """Findings about the frames of a recording at its pauses, and about their workspace.
+    """Findings about the frames of a recording at its pauses, and about the workspace.
 
-    Findings that stop a run are first.
+    Findings that stop a run come first.
 
-    The frames are read one by one. Images of 160 and 320 columns are kept in memory, and corners from images of 640.
+    The frames are read one by one. Only reduced images (160 and 320 columns) and corners are kept in memory.
     """
     found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
     if not any(finding.stop for finding in found):
@@ -89,7 +89,7 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
 
 
 def report_findings(findings: Iterable[Finding], where: str) -> None:
-    """Raise the first finding that stops a run as InputError, or warn of all; `where` names the recording."""
+    """Raise InputError for a finding that stops a run, or warn of each finding. Messages begin with `where`."""
     for finding in findings:
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)
@@ -113,7 +113,7 @@ def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[F
 
 
 class Look:
-    """Measurements of the checks in the frame at a pause."""
+    """Measurements in the frame at a pause, for the checks."""
 
     def __init__(self, frame: Frame, grid: VoxelGrid, index: int = 0) -> None:
         self.index, self.grid = index, grid
@@ -128,7 +128,7 @@ class Look:
 
     @cached_property
     def in_columns(self) -> np.ndarray:
-        """(n,) bool: readings in the workspace or above or below it."""
+        """(n,) bool: readings inside, above or below the workspace."""
         return _in_columns(self.grid, self.points)
 
     @cached_property
@@ -138,12 +138,12 @@ class Look:
 
     @cached_property
     def distance(self) -> float:
-        """Median depth in metres of the readings on the table, or of all readings if they are few."""
+        """Median depth in metres of the readings on the table, or of all readings if few are on the table."""
         depth = self.frame.depth[self.frame.valid]
         return float(np.median(depth[self.on_table] if self.on_table.mean() > _MIN_ON_TABLE else depth))
 
     def plane(self, chosen: np.ndarray) -> tuple[float, float, np.ndarray] | None:
-        """Tilt (degrees) and height (m) of the plane of chosen readings (n,), and its normal (3,) in camera axes."""
+        """Tilt (degrees), height (m) and normal (3,) in camera axes of the plane through the chosen readings (n,)."""
         valid = np.zeros_like(self.frame.valid)
         valid[self.frame.valid] = chosen
         depth = np.where(valid, self.frame.depth, np.nan)
@@ -165,7 +165,7 @@ class Look:
 
 
 def _sampled(frame: Frame, width: int) -> Frame:
-    """Every k-th pixel of a frame, about `width` columns."""
+    """The frame reduced to every k-th pixel, with about `width` columns."""
     step = max(1, round(frame.camera.width / width))
     part = slice(step // 2, None, step)
     rgb, depth = frame.rgb[part, part], frame.depth[part, part]
@@ -177,7 +177,7 @@ def _sampled(frame: Frame, width: int) -> Frame:
 
 
 def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """(...) bool: points (..., 3) whose x and y are in the grid."""
+    """(...) bool: points (..., 3) with x and y inside the grid."""
     index = grid.index_of(points)[..., :2]
     return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
 
@@ -186,13 +186,13 @@ _Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
-    """A finding if a value is outside its usual limits. The finding stops the run if the value is impossible."""
+    """A finding for a value outside the `usual` limits. Outside the `possible` limits, the finding stops the run."""
     if not usual[0] <= value <= usual[1]:
         yield Finding(not possible[0] <= value <= possible[1], text, hints)
 
 
 def _intrinsics(camera: Camera) -> Iterator[Finding]:
-    """Focal lengths and principal points that no usual camera has."""
+    """Findings about unusual focal lengths and principal points."""
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     width, height = camera.width, camera.height
     hint = "check K: it is in pixels of these images; scale it if they were resized"
@@ -218,7 +218,7 @@ def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
-    """Images without content; `which` names the frame."""
+    """Findings about images without content. `which` names the frame in the messages."""
     depth = frame.depth[np.isfinite(frame.depth)]
     masked = 0.0 if frame.robot_mask is None else frame.robot_mask.mean()
     if masked > 0.95 or not frame.valid.any():
@@ -233,7 +233,7 @@ def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
 
 
 def _support(first: Look) -> Iterator[Finding]:
-    """A pose, intrinsics or a support plane that contradict the readings at the first pause."""
+    """Findings if the pose, intrinsics or support plane contradict the readings at the first pause."""
     free, camera, table = first.plane(np.ones(len(first.points), bool)), first.frame.camera, first.table
     hints = (
         f"{_CHECK_POSE}; without a pose it is found from the table",
@@ -253,11 +253,11 @@ def _support(first: Look) -> Iterator[Finding]:
 
 
 def _other_support(first: Look) -> Iterator[Finding]:
-    """A wall or the floor at z = 0, in front of which a large plane is the table.
+    """Findings if a wall or the floor is at z = 0 and another large plane is the table.
 
-    A table is parallel to the floor, and higher above the floor than objects are above a table. A table in front of a
-    wall meets the wall at a right angle and extends far from it. The normal of a table points to the top of the
-    image. The normal of a wall does not point there.
+    A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
+    is at a right angle to a wall and extends far from the wall. In the image, the normal of a table points up, and
+    the normal of a wall does not point up.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
@@ -277,7 +277,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
 
 def _scale(first: Look) -> Iterator[Finding]:
-    """Distances that are unusual for a camera over a table."""
+    """Findings about distances that are unusual for a camera over a table."""
     z, size = first.distance, first.grid.voxel_size
     possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
     text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
@@ -293,7 +293,7 @@ def _scale(first: Look) -> Iterator[Finding]:
 
 
 def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A workspace without the table, or below or above the objects."""
+    """A finding if the workspace is beside the table, or below or above the objects."""
     if any((look.inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS for look in looks):
         return
     raised = max(int((look.in_columns & (look.points[:, 2] > _MIN_HEIGHT)).sum()) for look in looks)
@@ -311,7 +311,7 @@ def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 class _Corners:
-    """Corners of the image (ORB) on the table and outside the workspace, where nothing moves."""
+    """Image corners (ORB) on static surfaces: on the table and outside the workspace."""
 
     def __init__(self, frame: Frame, grid: VoxelGrid) -> None:
         import cv2
@@ -327,7 +327,7 @@ class _Corners:
         self.points, self.camera = points[row, column], frame.camera
 
     def moved(self, other: _Corners) -> tuple[int, int, float]:
-        """Corners that agree with the poses of two cameras, corners that agree on another camera, its shift (m)."""
+        """Number of corners that agree with both camera poses, number that agree on another pose, and shift (m)."""
         import cv2
 
         if self.features is None or other.features is None:
@@ -347,10 +347,10 @@ class _Corners:
 
 
 def drift(first: Look, look: Look) -> tuple[float, float, float]:
-    """Tilt (degrees), height (m) and shift (m) of the camera relative to its pose, from the first pause to another.
+    """Tilt (degrees), height (m) and shift (m) of the camera relative to its given pose, between two pauses.
 
-    If few readings are left at z = 0, tilt and height are those of the plane of the table. The shift is measured at
-    corners of the image on the table and outside the workspace.
+    If few readings remain at z = 0, tilt and height are computed from the plane of the table. The shift is measured
+    at corners of the image on the table and outside the workspace.
     """
     tilt = height = shift = 0.0
     left = look.on_table.mean() / max(first.on_table.mean(), 1e-9)
@@ -364,7 +364,7 @@ def drift(first: Look, look: Look) -> tuple[float, float, float]:
 
 
 def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
-    """The first pause at which the camera is not where its pose states."""
+    """A finding for the first pause at which the camera is not at its given pose."""
     for look in looks[1:]:
         found = drift(looks[0], look)
         size = max(value / limit for value, limit in zip(found, _DRIFT, strict=True))
@@ -381,7 +381,7 @@ def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 class _Edges:
-    """Edges of depth (H, W) float32 0 or 1, and ranks (H, W) from 0 to 1 of the gradients of colour."""
+    """Depth edges (H, W) float32, 0 or 1, and the ranks (H, W) of colour gradients, from 0 to 1."""
 
     def __init__(self, frame: Frame) -> None:
         import cv2
@@ -401,7 +401,7 @@ class _Edges:
         self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
 
     def under(self, other: _Edges) -> np.ndarray:
-        """(33, 33) sum of the colour ranks of `other` below the depth edges, by shift from -16 to 16 pixels."""
+        """Sum of the colour ranks of `other` at the depth edges, for each shift from -16 to 16 pixels, (33, 33)."""
         import cv2
 
         inner = slice(_SHIFTS, -_SHIFTS)
@@ -412,11 +412,11 @@ _BOX = np.ones((3, 3), np.uint8)
 
 
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
-    """Agreement of the edges of depth and colour at all pauses.
+    """Agreement of depth edges and colour edges at all pauses.
 
-    Returns the best agreement minus the median over shifts, and the share of it that is lost without a shift. The
-    third value is the best shift (rows, columns) of colour in pixels of an image of 320 columns. The fourth value is
-    the increase of the agreement if depth belongs to other pauses (in reverse, or one earlier or later).
+    The first value is the best agreement minus the median over shifts. The second value is the relative loss of
+    agreement without a shift. The third value is the best shift (rows, columns) of colour in pixels of 320 columns.
+    The fourth value is the increase of the agreement if depth belongs to other pauses.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -440,7 +440,7 @@ def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int]
 
 
 def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
-    """Depth that does not belong to the colour at the same pixel or the same pause."""
+    """A finding if depth does not belong to the colour at the same pixel or the same pause."""
     peak, lost, shift, rise = edge_agreement(looks)
     if peak < _PEAK:
         return
@@ -457,14 +457,14 @@ def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
-    """Pauses that all show one image."""
+    """A finding if all pauses show the same image."""
     if len(looks) > 1 and len({content_key(look.frame.rgb, look.frame.depth) for look in looks}) == 1:
         text = f"the images of all {len(looks)} pauses are identical, which no camera gives"
         yield _warning(text, "check that every frame is read from its own file")
 
 
 def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
-    """A video with a change but only one pause, so that earlier images are not used."""
+    """A finding if the scene changes in a video with only one pause. The other images are then not used."""
     if len(pauses) > 1 or len(frames) == 1:
         return
     change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))
@@ -474,7 +474,7 @@ def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Findi
 
 
 def _warn(message: str, *hints: str) -> None:
-    """Warn at the line that called this package."""
+    """Issue a warning that shows the line of code that called this package."""
     level = 1
     frame: FrameType | None = sys._getframe()
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("mstfilter", "functools"):

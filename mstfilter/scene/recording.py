@@ -5,8 +5,8 @@
 >>> for clip in recording.clips():
 ...     clip.before, clip.after                              # Frames, read when they are used
 
-If the camera pose is not given, the world axes are those of the support plane at the first pause. If the workspace is
-not given, it is placed around the objects on the table.
+If the camera pose is not given, the support plane at the first pause defines the world axes. The default workspace
+covers the visible table.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _LONG = 20  # frames; more are probably not one clip
 
 
 class PauseRule(Bounded, ABC):
-    """Finds the pauses of a video; the rules are in `mstfilter.formats`."""
+    """Finds the pauses of a video. The module `mstfilter.formats` contains rules."""
 
     @abstractmethod
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         """Ascending frame indices of the pauses.
 
-        `times` are seconds, one per frame; ``read_rgb(index)`` is the colour image (H, W, 3) uint8 of a frame.
+        `times` has the seconds of all frames. ``read_rgb(index)`` is the colour image (H, W, 3) uint8 of a frame.
         """
 
 
@@ -52,7 +52,7 @@ _rule_of_text = late("mstfilter.formats.sources:pause_rule", "The rule of a text
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames ``read(index)``, which are read on access. The last 40 are kept in memory."""
+    """Frames that ``read(index)`` reads on access. The last 40 frames are kept in memory."""
 
     def __init__(self, read: Callable[[int], Frame], n: int) -> None:
         self._read = lru_cache(maxsize=40)(read)
@@ -96,11 +96,11 @@ class Recording:
     manifest : dict
         Content of manifest.json, for recordings read from a folder.
     truth : callable
-        ``truth(t)`` returns the true labels (X, Y, Z) uint16 at pause `t`, on `grid`; None if unknown.
+        ``truth(t)`` returns the true labels (X, Y, Z) uint16 at pause `t`, on `grid`, or None if unknown.
     instance : callable
-        ``instance(index)`` returns the true label image (H, W) of a frame; None if unknown.
+        ``instance(index)`` returns the true label image (H, W) of a frame, or None if unknown.
     poses : callable
-        ``poses(index)`` returns the true T_world_object (4, 4) of each object of a frame, by label; None if unknown.
+        ``poses(index)`` returns the true T_world_object (4, 4) of each object in a frame by label, or None.
     """
 
     frames: Sequence[Frame]
@@ -164,18 +164,18 @@ class Recording:
         K : (3, 3) array
             Intrinsics in pixels.
         pauses : sequence of int, str or PauseRule, optional
-            Frames at which nothing moves. The filter estimates hypotheses at each of them. A rule or its text finds
-            the pauses: "still", "ends", "every", or "0s,4.2s". The default is "still" if `times` are given, as on the
-            command line, and else "ends".
+            Frames at which nothing moves. The filter estimates hypotheses at each pause. A `PauseRule`, or a text
+            such as "still", "ends", "every" or "0s,4.2s", selects the pauses. The default rule is "still" if `times`
+            are given for more than two frames, else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
-            Pose of the camera, or its pose in every frame if the camera moves. The table must be at z = 0. The
-            default is computed from the support plane of the first pause.
+            Pose of the camera, or one pose per frame if the camera moves. The table must be at z = 0. The default
+            pose is computed from the support plane of the first pause.
         grid : VoxelGrid, optional
-            Workspace. The default is 1 x 1 x 0.5 m in voxels of 1 cm around the objects on the table.
+            Workspace. The default grid covers the visible table: sides of 1 to 2 m, height 0.5 m, voxels of 1 cm.
         robot_masks : (T, H, W) bool, optional
             Pixels that show the robot.
         times : sequence of float, optional
-            Seconds. Default: 0, 1, 2, ...
+            Times in seconds. The default times are 0, 1, 2, ...
         name : str
             Name for messages and reports.
 
@@ -244,12 +244,12 @@ class Recording:
 
     @cached_property
     def key(self) -> bytes:
-        """Content key of all frames, the grid, the pauses and the times. Reads every image."""
+        """Content key of all frames, the grid, the pauses and the times. The first access reads every image."""
         return content_key(self.grid.key, self.pauses, self.times, *(frame.key for frame in self.frames))
 
     @cached_property
     def truth_key(self) -> bytes:
-        """Content key of the ground truth: volumes, label images, poses. Reads every frame."""
+        """Content key of the ground truth: volumes, label images, poses. The first access reads every frame."""
         keys = [content_key(self.truth(t)) for t in range(len(self.pauses))]
         for index in range(len(self)):
             poses = sorted((self.poses(index) or {}).items())
@@ -262,7 +262,7 @@ class Recording:
     def clips(self) -> tuple[Clip, ...]:
         """One clip per pause.
 
-        The first clip is the first pause alone, and each other clip goes from one pause to the next.
+        The first clip has the frame at the first pause. Each other clip has the frames from one pause to the next.
 
         The first call warns if the input is not plausible. The first call raises InputError if no hypothesis can be
         correct (`mstfilter.scene.examine`).
@@ -277,9 +277,9 @@ class Recording:
     def in_world_of(self, other: Recording) -> Recording:
         """This recording with the workspace and the first camera pose of another recording, without true volumes.
 
-        Use this method for parts of one session whose camera has the same pose at both first pauses:
-        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. Clips of one part then update hypotheses
-        of the other.
+        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pauses:
+        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can then
+        update hypotheses of the other recording.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()
@@ -299,14 +299,14 @@ class Recording:
 
     @cached_property
     def _examined(self) -> None:
-        """Warnings and errors about the frames at the pauses, evaluated once."""
+        """Warn or raise an error about the frames at the pauses. The checks run once."""
         report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
 class UsesFiles(ABC):
-    """A component that reads files of the user. Inherit `UsesFiles` in addition to the interface."""
+    """A component that reads files of the user. The component inherits `UsesFiles` in addition to its interface."""
 
-    #: Fields with paths of files or folders. A run whose files have changed is another run.
+    #: Fields with paths of files or folders. A changed file gives another run.
     path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")
 
     @abstractmethod
@@ -332,7 +332,7 @@ def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
 
 
 def _stacked(images: Any, what: str) -> np.ndarray:
-    """Images as one array; InputError if they have different shapes."""
+    """Images as one array. Raises InputError if the images have different shapes."""
     try:
         return np.asarray(images)
     except ValueError as error:
@@ -341,7 +341,7 @@ def _stacked(images: Any, what: str) -> np.ndarray:
 
 
 def check_depth(depth: np.ndarray, where: str) -> None:
-    """Raise InputError if a depth image (H, W) is empty, or its median cannot be a distance of a table in metres."""
+    """Raise InputError if a depth image (H, W) has no reading, or if its median is not plausible in metres."""
     with np.errstate(invalid="ignore"):
         metres = depth[np.isfinite(depth) & (depth > 0)]
     if metres.size == 0:
@@ -358,7 +358,7 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """Camera with a pose, and a workspace. What is not given is computed from the frame of the first pause."""
+    """Camera with a pose, and workspace. A missing pose or workspace is computed from the `first` frame."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:

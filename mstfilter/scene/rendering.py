@@ -4,10 +4,10 @@
 >>> labels, depth = render_hypothesis(hypothesis, camera)
 >>> labels, depth = render(label_grid, grid, camera)
 
-The ray of each pixel is followed from voxel to voxel. The ray jumps in free space. If the nearest occupied voxel has
+The ray of each pixel is followed from voxel to voxel, with jumps over free space. If the nearest occupied voxel has
 the chessboard distance D, the cube of half-width D - 1 around the current voxel is empty. The ray continues at the
-face where it leaves this cube. With D = 1 this is the voxel traversal of Amanatides and Woo (1987). The jumps save
-steps and do not change the result. A hypothesis is rendered object by object, and hypotheses share their objects.
+face where the ray leaves the empty cube. Without jumps, the method is the voxel traversal of Amanatides and Woo
+(1987). The jumps do not change the result. Hypotheses with the same object share the cached image of the object.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _Box = tuple[slice, ...]
 
 
 class Rendering(NamedTuple):
-    """Label image (H, W) uint16 with 0 without a hit, and z-depth (H, W) float32 in metres with NaN without a hit."""
+    """Label image (H, W) uint16, and z-depth (H, W) float32 in metres. Without a hit: label 0, depth NaN."""
 
     labels: np.ndarray
     depth: np.ndarray
 
 
 def project(hypothesis: Hypothesis, camera: Camera) -> np.ndarray:
-    """Label image (H, W) uint16 of a hypothesis; 0 where no object is visible. Cached by content."""
+    """Label image (H, W) uint16 of a hypothesis. Pixels without a visible object are 0. The result is cached."""
     return render_hypothesis(hypothesis, camera).labels
 
 
 def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
-    """Label image and depth of a hypothesis, read-only. Cached by content."""
+    """Label image and depth of a hypothesis, read-only. The result is cached."""
 
     def compute() -> Rendering:
         image = np.zeros((camera.height, camera.width), np.uint16)
@@ -56,9 +56,9 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
 
 
 def _object_depth(mask: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray]:
-    """A window of the image and the depth (h, w) of an object in it, inf without a hit. Hypotheses share objects.
+    """The image window that can show an object, and the depth (h, w) of the object in the window, inf without a hit.
 
-    `mask` (a, b, c) are its voxels in a box of the grid.
+    `mask` (a, b, c) has the voxels of the object in a box of the grid.
     """
 
     def compute() -> tuple[_Box, np.ndarray]:
@@ -84,10 +84,10 @@ def render(labels: np.ndarray, grid: VoxelGrid, camera: Camera) -> Rendering:
 
 
 def _cast(labels: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray, np.ndarray]:
-    """Cast rays into a box of the grid that has these labels (a, b, c).
+    """Cast rays into a box of the grid. `labels` (a, b, c) are the labels in the box.
 
-    Returns the window of the image that can show the box, and two arrays (h, w) of its pixels: the flat voxel, and
-    the depth as float32. Without a hit they are -1 and inf.
+    Returns the image window that can show the box, and two arrays (h, w): the flat voxel index and the depth
+    (float32) of each pixel. Pixels without a hit have the values -1 and inf.
     """
     lower = np.array([side.start for side in box])
     # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
@@ -105,7 +105,7 @@ def _cast(labels: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tup
 
 
 def _window(shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: Camera) -> tuple[slice, slice]:
-    """Image rows and columns that can show the box, or all of them if a corner is not in front of the camera."""
+    """Image rows and columns that can show the box, or the whole image if a corner is not in front of the camera."""
     corners = np.array(np.meshgrid(*[(0, n) for n in shape], indexing="ij")).reshape(3, -1).T
     uv, z = camera.project(grid.origin + (corners + lower) * grid.voxel_size)
     if (z < 1e-3).any():
@@ -119,7 +119,7 @@ def _window(shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: 
 def _traverse(
     box: np.ndarray, start: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Follow rays (n, 3) from `start`. Returns ray number, flat voxel index and t of rays that hit a voxel."""
+    """Follow rays (n, 3) from `start`. Returns the ray number, flat voxel index and ray parameter t of each hit."""
     distance = distance_transform_cdt(box == 0, metric="chessboard").astype(np.int32).ravel()
     shape = np.array(box.shape)
     strides = np.array([shape[1] * shape[2], shape[2], 1])

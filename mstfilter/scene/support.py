@@ -1,13 +1,13 @@
-"""What stands on the table: the pixels of objects in a depth image with noise and missing readings.
+"""Foreground: the pixels of objects on the table, in a depth image with noise and missing readings.
 
 >>> found = foreground(frame, grid)
 >>> found.pixels                        # (H, W) bool, may belong to an object
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading
 
-Depth decides where it is measured: a reading on the table never belongs to an object. Readings above the table are
-noise of the sensor unless they form a region. Dark and shiny surfaces and glare have no readings. There colour
-decides: a pixel belongs to an object if its colour is not that of the table around it. The table is
-z = 0 if the camera has a pose, else the plane that contains the most readings.
+Pixels with a reading are classified by depth. A reading on the table never belongs to an object. Single readings
+above the table are noise; regions of readings are objects. Dark and shiny surfaces and glare have no readings. A
+pixel without a reading belongs to an object if its colour differs from the table nearby. The table is z = 0 if the
+camera has a pose, else the plane that contains the most readings.
 """
 
 from __future__ import annotations
@@ -55,20 +55,20 @@ class Foreground:
     """The pixels that can belong to objects, and the frame with their depth."""
 
     pixels: np.ndarray  #: (H, W) bool
-    frame: Frame  #: the frame; pixels of objects without a reading have an estimated depth
+    frame: Frame  #: the frame, with estimated depth at pixels of objects without a reading
 
 
 def above_table(frame: Frame) -> np.ndarray:
-    """Disparity above the table, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
+    """Disparity minus table disparity, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
 
-    One unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that contains the
-    most readings.
+    One sensor unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that
+    contains the most readings.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
 
 
 def filled_above_table(frame: Frame) -> np.ndarray:
-    """`above_table`, filled from the nearest reading if depth has holes everywhere (sparse sensors)."""
+    """Disparity as in `above_table`. For a sparse sensor, holes have the value of the nearest reading."""
     height = above_table(frame)
     beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
     return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
@@ -83,32 +83,32 @@ def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
 
 
 def posed_camera(frame: Frame) -> Camera:
-    """The camera of a frame; without a pose, with that relative to the fitted table (`fit_support_plane`)."""
+    """The camera of a frame. A missing pose is computed relative to the fitted table (`fit_support_plane`)."""
     camera = frame.camera
     return camera if camera.T_world_camera is not None else camera.at(fit_support_plane(frame).T_world_camera)
 
 
 def pixels_above_table(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) with a reading above the table that is not on the robot."""
+    """Pixels (H, W) that have a reading above the table and do not show the robot."""
     with np.errstate(invalid="ignore"):
         return frame.valid & (above_table(frame) > TABLE_TOLERANCE)
 
 
 def readings_above_table(frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-    """Those of `pixels_above_table` with a reading in the grid, (H, W) bool. Without a grid, all of them."""
+    """The `pixels_above_table` with a reading in the grid, (H, W) bool. Without a grid, no pixel is excluded."""
     pixels = pixels_above_table(frame)
     return pixels if grid is None else pixels & grid.contains(grid.index_of(frame.points))
 
 
 def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
-    """The pixels of objects in the workspace, and their depth. Cached by content.
+    """The pixels of objects in the workspace, and their depth. The result is cached.
 
     Parameters
     ----------
     frame : Frame
         The image.
     grid : VoxelGrid
-        The workspace. Without one, objects are everywhere above the table.
+        The workspace. By default, objects can be anywhere above the table.
     """
     key = (frame.key, None if grid is None else grid.key)
     return memo("foreground", key, lambda: _foreground(frame, grid))
@@ -127,7 +127,7 @@ def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
 
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
-    """Readings (H, W) bool that form a region above the table."""
+    """Pixels (H, W) bool with readings that form a region above the table."""
     raised = readings_above_table(frame, grid)
     height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
@@ -141,7 +141,7 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
 
 
 def _on_table(frame: Frame) -> np.ndarray:
-    """Readings (H, W) bool of the table."""
+    """Pixels (H, W) bool with a reading on the table."""
     with np.errstate(invalid="ignore"):
         return frame.valid & (np.abs(above_table(frame)) <= TABLE_TOLERANCE)
 
@@ -153,10 +153,10 @@ def _without_readings(frame: Frame) -> np.ndarray:
 
 
 def _shadows(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) bool that the projector of the sensor does not light, since a nearer surface stands beside them.
+    """Pixels (H, W) bool in the shadow that a nearer surface casts in the light of the projector of the sensor.
 
-    The gap in a row between depths z1 < z2 is then at most f b (1 / z1 - 1 / z2) pixels wide, where
-    b is the baseline of a Kinect. The side of the projector is not used.
+    A shadow in an image row between depths z1 < z2 is at most f b (1 / z1 - 1 / z2) pixels wide. The symbol f is the
+    focal length, and b is the baseline of a Kinect. The test accepts a projector on either side of the camera.
     """
     read = np.isfinite(frame.depth)  # also of the robot, which casts shadows
     columns = np.broadcast_to(np.arange(frame.camera.width), read.shape)
@@ -176,11 +176,11 @@ def _shadows(frame: Frame) -> np.ndarray:
 
 
 def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """The missing pixels (H, W) bool that belong to objects by their colour or by their outline.
+    """The pixels (H, W) bool without a reading that belong to objects, by colour or by outline.
 
-    The colour of the table is that of the table around a pixel. Far from the table, it is the colour of the whole
-    table, and a pixel belongs to an object if readings of objects (H, W) bool `measured` enclose its region. A solid
-    gap in the table that is no glare belongs to an object of any colour, for example to a glass.
+    A pixel near the table must differ in colour from the table nearby. A pixel far from the table must differ from
+    the whole table, and its region must be enclosed by readings of objects (`measured`). A large gap in the readings
+    of the table, without glare, also belongs to an object, for example a glass.
     """
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
@@ -193,9 +193,9 @@ def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.n
 
 
 def _compared_with_table(lab: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether table is near (H, W) bool, and how the colour of each pixel (H, W, 3) differs from that of the table.
+    """Whether the table is near a pixel, (H, W) bool, and two colour differences (H, W) between pixel and table.
 
-    The difference is that of brightness in standard deviations, and the squared Mahalanobis distance, both (H, W).
+    The differences are the brightness in standard deviations, and the squared Mahalanobis distance of the colour.
     """
     share = _surroundings(table.astype(np.float32))
     near = share > _TABLE_NEAR
@@ -213,7 +213,7 @@ def _opened(pixels: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The regions of pixels (H, W) bool of which most readings around them are readings `by` (H, W) bool."""
+    """The regions of `pixels` (H, W) bool for which most readings around the region are in `by` (H, W) bool."""
     regions, n = ndimage.label(pixels)
     kept = np.zeros(n + 1, bool)
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
@@ -225,7 +225,7 @@ def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarr
 
 
 def _measured_part(frame: Frame) -> np.ndarray:
-    """The rectangle of the image (H, W) bool in which the sensor has readings; registered depth has empty margins."""
+    """The rectangle of the image (H, W) bool that has readings. Registered depth images have empty margins."""
     part = np.zeros(frame.depth.shape, bool)
     rows, columns = (np.flatnonzero(frame.valid.mean(axis=axis) >= _EMPTY) for axis in (1, 0))
     if len(rows) and len(columns):
@@ -234,7 +234,7 @@ def _measured_part(frame: Frame) -> np.ndarray:
 
 
 def _surroundings(image: np.ndarray) -> np.ndarray:
-    """Mean of an image (H, W, ...) around each pixel; computed at a quarter of the resolution."""
+    """Mean of an image (H, W, ...) around each pixel, computed at a quarter of the resolution."""
     size = image.shape[1], image.shape[0]
     small = cv2.resize(image, (max(1, size[0] // 4), max(1, size[1] // 4)), interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(
@@ -244,7 +244,7 @@ def _surroundings(image: np.ndarray) -> np.ndarray:
 
 
 def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Readings of objects, and the regions without readings that touch them or stand on the table by themselves.
+    """Readings of objects, and regions without readings that touch an object or are surrounded by the table.
 
     All images are (H, W) bool. Small gaps of missing readings are closed.
     """
@@ -260,7 +260,7 @@ def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing
 
 
 def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: np.ndarray) -> bool:
-    """Whether region `k` of an image (H, W), which has no readings, is large enough and surrounded by the table."""
+    """Whether region `k` of a label image (H, W), without readings, is large enough and surrounded by the table."""
     height, width = regions.shape
     rows, columns = box
     if (regions[box] == k).sum() < scaled_area(_SMALLEST_DARK, regions.size):
@@ -273,7 +273,7 @@ def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: 
 
 
 def _ring(regions: np.ndarray, k: int, box: tuple[slice, slice]) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """The pixels (h, w) bool around region `k` of an image, and the part of the image that they lie in."""
+    """The pixels (h, w) bool around region `k` of a label image, and the image window of the pixels."""
     reach = _reach(regions.shape[1])
     rows, columns = (slice(max(0, side.start - reach), side.stop + reach) for side in box)
     inside = regions[rows, columns] == k
@@ -290,12 +290,11 @@ def _ellipse(radius: float) -> np.ndarray:
 
 
 def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
-    """Depth (H, W) with estimates at pixels of objects without a reading; None if all of them have one.
+    """Depth (H, W) with estimates at pixels of objects without a reading; None if no reading is missing.
 
-    An estimate beside a reading is that reading, since two objects can meet at a narrow gap. In wide gaps, the
-    inverse of depth is interpolated by a harmonic function, which is exact on planes. No estimate is behind the
-    table. An object with fewer than ten readings gets one depth: the depth of the nearest part of the table that its
-    pixels hide.
+    In narrow gaps, an estimate is the nearest reading, because two objects can meet in a gap. In wide gaps, the
+    inverse of depth is a harmonic function, which is exact on planes. No estimate is behind the table. Missing pixels
+    of an object with fewer than ten readings get the smallest table depth at its pixels.
     """
     if not (pixels & ~frame.valid).any():
         return None
@@ -333,9 +332,9 @@ def _estimated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray, width:
 
 
 def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Depth (n,) at missing pixels whose inverse is the mean of its neighbours (Laplace's equation).
+    """Depth (n,) at missing pixels. The inverse depth is the mean over the neighbours (Laplace's equation).
 
-    `known` and `missing` (H, W) bool are the pixels of one connected region. Its outline has no other condition.
+    `known` and `missing` (H, W) bool are the pixels of one connected region. The outline adds no boundary condition.
     """
     used, asked = known | missing, missing.ravel()
     graph = pixel_graph(used[:, :-1] & used[:, 1:], used[:-1] & used[1:])
@@ -345,7 +344,7 @@ def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> 
 
 
 def pixel_graph(right: np.ndarray, down: np.ndarray) -> coo_array:
-    """The graph (H W, H W) of the pixels of an image, with one entry for each pair of neighbours that are joined.
+    """Adjacency matrix (H W, H W) of the pixels of an image, with one entry for each pair of joined neighbours.
 
     `right` (H, W - 1) and `down` (H - 1, W) bool say whether a pixel is joined to its right or its lower neighbour.
     """

@@ -1,6 +1,6 @@
 """Voxel grids and hypotheses.
 
-A `Hypothesis` is the particle of MST. A hypothesis has an object label for every voxel, with 0 for free space. The z
+A `Hypothesis` is a particle of the filter. A hypothesis has an object label for every voxel; 0 is free space. The z
 axis of the world points up, and the table is at z = 0.
 
 >>> import numpy as np
@@ -35,7 +35,7 @@ _NO_MOTION = RigidTransform.identity()  # shared: making it takes longer than th
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid:
-    """A regular lattice of cubes.
+    """A regular grid of cubic voxels.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class VoxelGrid:
 
     @property
     def text(self) -> str:
-        """Size of the workspace and of its voxels, for messages."""
+        """Size of the workspace and of its voxels, as text for messages."""
         extent = " x ".join(f"{self.voxel_size * n:.2f}" for n in self.shape)
         return f"workspace {extent} m, {' x '.join(map(str, self.shape))} voxels of {1000 * self.voxel_size:g} mm"
 
@@ -131,7 +131,7 @@ class VoxelGrid:
 
 
 def _numbers(value: object) -> np.ndarray:
-    """Values as float64; NaN if they are not numbers."""
+    """Values as float64, or NaN if the values are not numbers."""
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -139,7 +139,7 @@ def _numbers(value: object) -> np.ndarray:
 
 
 def occupied_box(mask: np.ndarray) -> tuple[slice, ...] | None:
-    """Slices of the smallest box that contains all True cells of a mask; None if there are none."""
+    """Slices of the smallest box that contains all True cells of a mask, or None for an empty mask."""
     box = []
     for axis in range(mask.ndim):
         hits = np.flatnonzero(mask.any(axis=tuple(a for a in range(mask.ndim) if a != axis)))
@@ -154,8 +154,8 @@ class Crop:
     """Voxels of one object inside a small box of the grid."""
 
     occupied: np.ndarray  #: (a, b, c) bool, the box
-    offset: np.ndarray  #: (3,) int, index of its first voxel in the grid
-    #: (a, b, c) float16, probability that the object is there; None: certain where `occupied` is True
+    offset: np.ndarray  #: (3,) int, index of the first voxel of the crop in the grid
+    #: (a, b, c) float16, probability that the object occupies the voxel; None: 1 where `occupied` is True, else 0
     probability: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -169,7 +169,7 @@ class Crop:
 
     @classmethod
     def of(cls, mask: np.ndarray, probability: np.ndarray | None = None) -> Crop:
-        """The tight crop of a boolean grid and of a grid of probabilities. An empty mask gives an empty crop."""
+        """The smallest crop of a boolean grid and a grid of probabilities. An empty mask gives an empty crop."""
         box = occupied_box(mask if probability is None else mask | (probability > 0))
         if box is None:
             return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
@@ -184,22 +184,22 @@ class Crop:
 
 
 class Seen(IntFlag):
-    """What a frame shows of a voxel with respect to one object: the bits of `ObjectView.bits`."""
+    """Flags for the observation of a voxel in one frame, relative to one object (`ObjectView.bits`)."""
 
     SURFACE = 1  #: visible surface of the object
-    OTHER_SURFACE = 2  #: visible surface of something else
+    OTHER_SURFACE = 2  #: visible surface of another object or of the background
     FREE = 4  #: in front of the measured surface
     BEHIND = 8  #: behind the surface of the object
-    HIDDEN = 16  #: behind the surface of something else
+    HIDDEN = 16  #: behind another surface
 
     def among(self, bits: Any) -> Any:
-        """Whether at least one of these bits is set, as bool, for an array or a torch tensor of uint8."""
+        """Whether at least one of the flags is set, for each element of a uint8 array or torch tensor."""
         return (bits & int(self)) > 0
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectView:
-    """What one frame showed of an object, in a box of the grid, and the motion of the object since then."""
+    """The observation of an object in one frame, in a box of the grid, with the later motion of the object."""
 
     offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
     bits: np.ndarray  #: (a, b, c) uint8, flags of `Seen`
@@ -214,23 +214,23 @@ class ObjectView:
 
     @cached_property
     def name(self) -> tuple[str, bytes]:
-        """Key of the contents and the motion."""
+        """Key of the contents and of the motion."""
         return self.key, self.motion.as_matrix().tobytes()
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectRecord:
-    """What a hypothesis stores about an object."""
+    """The data of one object in a hypothesis."""
 
-    label: int  #: its value in the voxel grid, 1 .. 65535
+    label: int  #: value of the object in the label grid, 1 .. 65535
     id: int  #: identity of the object over time, within one lineage of hypotheses
-    birth: int = 0  #: index of the pause at which it was first proposed
+    birth: int = 0  #: index of the pause at which the object was first proposed
     #: Occupancy of the object after its last change other than a rigid motion. None: its current voxels.
     source: Crop | None = None
     #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
-    completion_key: str | None = None  #: key of the segment that it was completed from
-    views: tuple[ObjectView, ...] = ()  #: what the frames so far showed of it, oldest first
+    completion_key: str | None = None  #: key of the segment that was completed to the object
+    views: tuple[ObjectView, ...] = ()  #: observations of the object in frames, oldest first
 
     def __repr__(self) -> str:
         moved = ", moved" * (self.motion is not _NO_MOTION)
@@ -240,11 +240,11 @@ class ObjectRecord:
     def born(
         cls, label: int, birth: int, completion_key: str | None = None, views: tuple[ObjectView, ...] = ()
     ) -> ObjectRecord:
-        """The record of a new object. The id ``65536 * birth + label`` is different for different births."""
+        """The record of a new object. Each pair of birth and label has a different id."""
         return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key, views=views)
 
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
-        """The record after a motion T of the object. `source` are the voxels before all motions."""
+        """The record after a motion T of the object. `source` has the voxels before all motions."""
         total = T if self.source is None else T * self.motion
         return replace(self, source=source, motion=total, views=tuple(view.moved(T) for view in self.views))
 
@@ -271,7 +271,7 @@ def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
 
 
 def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
-    """Labels as uint16. Raises InputError if they do not have the shape of the grid."""
+    """Labels as uint16. Raises InputError if the labels do not have the shape of the grid."""
     labels = as_labels(labels)
     if labels.shape != grid.shape:
         raise InputError(f"label grid has shape {labels.shape}, the voxel grid is {grid.shape}")
@@ -280,7 +280,7 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
-    """The probabilities of a hypothesis for each voxel, given its objects and their positions."""
+    """The occupancy probability of each voxel, given the objects of a hypothesis and their positions."""
 
     #: (X, Y, Z) uint16, the most probable object, also where free space is more probable. Equal to the label where
     #: there is one.
@@ -297,7 +297,7 @@ class Occupancy:
         return content_key("occupancy", self.owner, self.probability)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
-        """The occupancy after a change of labels (X, Y, Z): changed voxels are certain, unknown objects removed."""
+        """The occupancy after a change of labels. Changed voxels are certain. Objects not in `known` are removed."""
         changed = before != after
         owner = np.where(changed | (after > 0), after, self.owner)
         p = np.where(changed, after > 0, self.probability)
@@ -305,18 +305,18 @@ class Occupancy:
         return Occupancy(np.where(gone, 0, owner), np.where(gone, 0, p))
 
     def without(self, voxels: np.ndarray) -> Occupancy:
-        """With some voxels (X, Y, Z) bool free."""
+        """The occupancy with some `voxels` (X, Y, Z) bool set to free."""
         return Occupancy(np.where(voxels, 0, self.owner), np.where(voxels, 0, self.probability))
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A 3-D instance segmentation of the workspace: the particle.
+    """A 3-D instance segmentation of the workspace; a particle of the filter.
 
     Parameters
     ----------
     labels : (X, Y, Z) uint16
-        Label 0 is free or unknown, and k >= 1 is an object. Labels need not be consecutive.
+        Label 0 is free or unknown space, and a label k >= 1 is an object. Labels need not be consecutive.
     grid : VoxelGrid
         Positions of the voxels.
     objects : tuple of ObjectRecord
@@ -357,17 +357,17 @@ class Hypothesis:
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
-        """A hypothesis whose objects are all new."""
+        """A hypothesis from a label grid. All objects are new."""
         labels = labels_on(grid, labels)
         present = np.flatnonzero(np.bincount(labels.ravel()))
         records = tuple(ObjectRecord.born(int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
-        """The same objects with other voxels.
+        """A hypothesis with the same objects and other voxels.
 
-        Objects whose voxels change lose `source` and `motion`. Records of objects without voxels are removed.
-        Raises InputError if a label has no record.
+        Objects with changed voxels lose `source` and `motion`. Records of objects without voxels are removed. Raises
+        InputError if a label has no record.
         """
         labels = labels_on(self.grid, labels)
         different = labels != self.labels
@@ -385,14 +385,14 @@ class Hypothesis:
         return Hypothesis(labels, self.grid, objects, occupancy)
 
     def without(self, voxels: np.ndarray) -> Hypothesis:
-        """The same objects without some voxels (X, Y, Z) bool, which become certainly free; see `with_labels`."""
+        """The hypothesis with some `voxels` (X, Y, Z) bool set to free. See `with_labels`."""
         found = self.with_labels(np.where(voxels, 0, self.labels).astype(np.uint16))
         occupancy = found.occupancy
         return found if occupancy is None else replace(found, occupancy=occupancy.without(voxels))
 
     @property
     def shares(self) -> Occupancy:
-        """The occupancy, which is also defined for a hypothesis without probabilities."""
+        """The occupancy. For a hypothesis without probabilities, every label has probability 1."""
         return self.occupancy or Occupancy(self.labels, (self.labels > 0).astype(np.float16))
 
     def crop(self, label: int) -> Crop:
@@ -440,14 +440,14 @@ class Hypothesis:
     mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
-        """Rigid motion of an object in world metres since it was first seen or last changed (`ObjectRecord`)."""
+        """Rigid motion of an object in world metres since its first observation or last change (`ObjectRecord`)."""
         return self.record(label).motion
 
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:
         """Oriented bounding box of the voxels of an object.
 
-        Returns T_world_box and the lengths (3,) of the sides in metres. The origin is the centre, and z is up. The
-        sides are parallel to the rectangle of least area around the voxels seen from above.
+        Returns T_world_box and the lengths (3,) of the sides in metres. The origin of the box is its centre, and its
+        z axis points up. The horizontal sides are the smallest rectangle around the voxels in the top view.
         """
         import cv2
 
@@ -475,6 +475,6 @@ def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
 
 
 def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
-    """Raise InputError if one of several hypotheses has another grid. The message names their role."""
+    """Raise InputError if a hypothesis has another grid. `side` describes the hypotheses in the message."""
     for k, hypothesis in enumerate(hypotheses):
         check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)

@@ -2,11 +2,11 @@
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 
-Most objects are convex. So depth has a concave crease or a step where two objects touch, and where an object touches
-the table. A convex crease, such as the edge of a box, lies inside one object. Disparity D = 8 f b / z (f focal
-length, b baseline, z depth) is affine on every plane, and its noise does not depend on the range. So the largest
-eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not visible
-in depth. The weight of colour is lower, because print on a box is not a boundary.
+Most objects are convex, so depth has a concave crease or a step between objects that touch, and between an object and
+the table. A convex crease, such as the edge of a box, lies inside one object. On a plane, disparity D = 8 f b / z (f
+focal length, b baseline, z depth) is affine in the pixel coordinates. The noise of D does not depend on depth. The
+largest eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not
+visible in depth. Colour has a lower weight than depth, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LIGHTNESS_UNIT, _CHROMA_UNIT = 20.0, 8.0  # differences of L and of a, b (CIE L
 
 
 class BoundaryModel(Checked, ABC):
-    """Estimates where one object ends and another begins."""
+    """Estimates the boundaries between objects in a frame."""
 
     @returns(lambda self, found, frame: check_array(found, frame.depth.shape, "f", 0, 1))
     @abstractmethod
@@ -49,7 +49,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model for the clip's last frame. The `component_key` of the model includes the content that it uses."""
+        """The model for the clip's last frame. The `component_key` of the model includes the file content."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,17 @@ class ColourDepthBoundary(BoundaryModel):
     Parameters
     ----------
     colour_weight : float
-        Weight of the colour edges; 0 disables them.
+        Weight of the colour edges. The weight 0 disables colour.
     quiet_table : float
-        Pixels (of a 640 px wide image). The boundary is 0 where everything within this distance is table. So print,
-        grain and shadows on the table are ignored. A negative value disables the rule.
+        Distance in pixels of a 640 px wide image. At pixels farther from all surfaces above the table, the boundary
+        is 0, so print, grain and shadows on the table are ignored. Negative values disable the rule.
     """
 
     colour_weight: float = 0.4
     quiet_table: float = 12.0
 
     def boundary(self, frame: Frame) -> np.ndarray:
-        """Boundary strength (H, W). The robot has 1 at its rim and 0 inside, so that it separates regions."""
+        """Boundary strength (H, W). The strength is 1 at the rim of the robot and 0 inside the robot."""
         resize = scaled_length(1, frame.camera.width)
         edges: np.ndarray = np.zeros(frame.depth.shape, np.float32)
         if self.colour_weight > 0:
@@ -123,8 +123,8 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
     """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
 
-    Concave curvature is the largest eigenvalue of the Hessian, convex curvature minus the smallest. `resize` is the
-    image width / 640.
+    Concave curvature is the largest eigenvalue of the Hessian. Convex curvature is minus the smallest eigenvalue.
+    `resize` is the image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

@@ -8,8 +8,8 @@ maximises this value, and a `CutSampler` draws cuts at random.
 >>> sample = ExactCuts().sample(np.random.default_rng(0), tree, w, 10)
 
 In a Gibbs distribution with inverse temperature b, a cut has probability proportional to exp(b v(c)). One pass up the
-tree computes ``stop[n]``, the probability that a cut which reaches node n contains n itself. A walk down from the
-root with these probabilities draws a cut exactly.
+tree computes ``stop[n]``, the probability that a cut contains node n if the cut contains no ancestor of n. A random
+walk down from the root with the probabilities ``stop`` draws an exact sample.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CLIP = 1e-3  # `MergeLogOdds` clips probabilities to _CLIP .. 1 - _CLIP
 
 
 class CutValue(Checked, ABC):
-    """Rates how well a region fits one object."""
+    """Rates how well a region corresponds to one object."""
 
     @returns(lambda self, found, tree, frame: check_array(found, (tree.n_nodes,)))
     @abstractmethod
@@ -49,18 +49,18 @@ class CutValue(Checked, ABC):
 
 @dataclass(frozen=True)
 class SceneCutObjectness(CutValue):
-    """SceneCut's objectness: regions that form early and end late (Pham et al. 2018, eq. 4-5).
+    """SceneCut's objectness: high for weak inner and strong outer boundaries (Pham et al. 2018, eq. 4-5).
 
     ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)`` and ``w = ln(s) area^0.95``. A region smaller than
     1000 or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of
-    planes with the size of furniture, is omitted. Here the support plane is removed directly as background.
+    planes with the size of furniture, is omitted. The support plane is removed as background.
 
     Parameters
     ----------
     background_weight : float
-        Area of a pixel that is not above the table. In SceneCut the area is 1. With 1, the table contributes most of
-        v*. The width of the sampled distribution is relative to v*, so a larger table gives more random samples. With
-        weight 0, cuts of the table have no cost, and chains spend their steps on these cuts.
+        Area of a pixel that is not above the table. In SceneCut, the area is 1. With area 1, the table contributes
+        most of the optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives
+        more random cuts. With area 0, cuts of the table have no cost, and chains spend steps on these cuts.
     """
 
     background_weight: float = 0.003
@@ -84,10 +84,10 @@ class SceneCutObjectness(CutValue):
 class MergeLogOdds(CutValue):
     """Log likelihood of independent merge decisions.
 
-    ``w(n) = -sum of logit P(boundary) over the merges inside n``. So exp(v(c)) is proportional to the probability
-    that exactly the merges above the cut join different objects. The values are log probabilities, so cuts are
-    sampled at a temperature, without a scale sigma. If the tree has odds (`LearnedTree`), its odds are used.
-    Without odds, `start` is the probability. Probabilities are clipped to 0.001 .. 0.999.
+    ``w(n) = -sum of logit P(boundary) over the merges inside n``. The probability that exactly the merges above the
+    cut join different objects is proportional to exp(v(c)). The values are log probabilities, so cuts are sampled at
+    a temperature, without a scale sigma. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
+    `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
@@ -145,7 +145,7 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
 
 
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
-    """Nodes (n,) in ascending order of the cut of largest value, for node values `w` (N,), by one pass up the tree.
+    """The cut of largest value, as nodes (n,) in ascending order, for node values `w` (N,).
 
     If a parent and its children have equal values, the parent is kept.
     """
@@ -183,10 +183,10 @@ class Gibbs:
     b: float  #: inverse temperature, per unit of value
     w: list[float]  #: node values
     log_z: list[float]  #: log normaliser of the subtree
-    stop: list[float]  #: probability that a cut which reaches the node contains the node itself
+    stop: list[float]  #: probability that a cut without an ancestor of the node contains the node
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
-        """Draw a cut of the subtree of `node`, unordered. `random` returns uniform numbers in [0, 1)."""
+        """Draw a cut of the subtree of `node`, with unordered nodes. `random` returns uniform numbers in [0, 1)."""
         children, stop = self.tree.children, self.stop
         cut, stack = [], [node]
         while stack:
@@ -216,7 +216,7 @@ def gibbs(tree: Tree, w: np.ndarray, b: float) -> Gibbs:
 
 @dataclass(frozen=True)
 class ExactCuts(CutSampler):
-    """Independent exact draws from the Gibbs distribution exp(v / temperature), `temperature` in units of value."""
+    """Independent exact draws from the Gibbs distribution exp(v / temperature)."""
 
     temperature: PositiveFloat = 1.0
 

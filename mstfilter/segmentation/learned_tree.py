@@ -1,15 +1,15 @@
-"""Segmentation trees whose merges are decided by learned log odds of "different objects".
+"""Segmentation trees that merge regions by learned log odds that two regions are different objects.
 
-Watershed regions of a boundary map are merged. The pair with the lowest log odds is merged first. The log odds that
-two regions are different objects are linear in `FEATURES` of their border and of their union. The features are
-recomputed when a region grows. A model file has the features and their weights, fitted on simulated scenes only.
+Watershed regions of a boundary map are merged in pairs. The pair with the lowest log odds is merged first. The log
+odds are linear in `FEATURES` of the border and of the union of two regions. The features are recomputed when a region
+grows. A model file has the weights of the features, which were fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
 >>> w = MergeLogOdds().values(tree, frame)
 
 Features that depend on the size of a region are in pixels of a 640 px wide image. Disparity is in sensor units (1/8
-px at f = 525 px), lengths are in metres. "Front" is the region that is nearer to the camera at the border.
+px at f = 525 px), and lengths are in metres. The "front" region of a pair is nearer to the camera at the border.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _FIT = "python experiments/segmentation_fit/run.py"
 
 
 def quadric_residual(sums: np.ndarray) -> np.ndarray:
-    """Squared residual (k,) of the least-squares quadric of disparity of each region (k, C), sensor units squared."""
+    """Squared residual (k,) of a quadric fitted to the disparity of each region (k, C), in squared sensor units."""
     gram = sums[:, REGION["gram"]].reshape(-1, 6, 6)
     moment = sums[:, REGION["moment"]]
     n = sums[:, REGION["pixels"].start]
@@ -89,7 +89,7 @@ class _RegionMeans:
 
 
 class _PairMeasures:
-    """Measurements of k pairs of regions; parameters as in `pair_features`."""
+    """Measurements of k pairs of regions. The parameters are the same as in `pair_features`."""
 
     def __init__(
         self, a: np.ndarray, b: np.ndarray, border: np.ndarray, table_a: np.ndarray, table_b: np.ndarray, scale: float
@@ -186,8 +186,8 @@ def pair_features(
 ) -> np.ndarray:
     """The named features (k, f) of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
 
-    `border` (k, B) are the common borders of the pairs, seen from `a`. `table_a` and `table_b` (k, B) are the borders
-    of a and b with the table, with zeros if there is none. `scale` is the image width / 640.
+    `border` (k, B) has the common borders of the pairs, with `a` first. `table_a` and `table_b` (k, B) have the
+    borders with the table, or zeros. `scale` is the image width / 640.
     """
     pair = _PairMeasures(a, b, border, table_a, table_b, scale)
     return np.stack([FEATURES[name](pair) for name in names], axis=1)
@@ -206,7 +206,7 @@ def check_weights(weights: Mapping[str, float], names: Iterable[str], where: obj
 
 
 class Agglomeration:
-    """Best-first merging of regions by the log odds that they differ. Region 0, the table, is never merged."""
+    """Merging of regions, with the lowest log odds first. Region 0, the table, is never merged."""
 
     def __init__(self, regions: Regions, log_odds: PairLogOdds) -> None:
         n = len(regions.sums)
@@ -271,14 +271,14 @@ class Agglomeration:
 class MergedTree(TreeBuilder):
     """Best-first merging of watershed regions by learned log odds.
 
-    The table is one leaf, with all else that is no object. Only the root merges it with other regions.
+    One leaf has the table and all other pixels without an object. Only the root merges this leaf with other regions.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
 
     @abstractmethod
     def model(self) -> tuple[Mapping[str, float], str]:
-        """Weights of the features, and key of the model files. Raises InputError if they do not match the code."""
+        """Weights of the features, and key of the model files. Raises InputError for weights of other features."""
 
     @abstractmethod
     def look(self, frame: Frame) -> SeenBorders | None:
@@ -291,16 +291,16 @@ class MergedTree(TreeBuilder):
 
     @property
     def bound_key(self) -> bytes:
-        """Key of the model, since cached values depend on the weights."""
+        """Key of the model. Cached values depend on the weights of the model."""
         return self.weights_key.encode()
 
     def regions(self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray) -> Regions:
-        """The measured leaves; `pixels` (H, W) bool are those of objects."""
+        """The measured leaves. `pixels` (H, W) bool are the pixels of objects."""
         leaves = object_leaves(self.leaves.build(boundary, frame).leaves, pixels)
         return measure_regions(leaves, frame, boundary, self.look(frame))
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
-        """Build the tree. `odds` are the log odds of each merge, `start` the maximum of their probabilities below."""
+        """Build the tree. `odds` has the log odds of merges, and `start` the largest probability inside a node."""
         if frame is None:
             raise InputError(
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
@@ -317,7 +317,7 @@ class MergedTree(TreeBuilder):
 
 @dataclass(frozen=True)
 class LearnedTree(MergedTree):
-    """`MergedTree` with the measurements of the image.
+    """A `MergedTree` with features of the image.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ class LearnedTree(MergedTree):
 
 @functools.lru_cache(maxsize=4)
 def read_tree_weights(name: str) -> tuple[Mapping[str, float], str]:
-    """Weights of `PAIR_FEATURES` by name, and the hash of their file. A file is read once per process."""
+    """Weights of `PAIR_FEATURES` by name, and the hash of the file. A file is read once per process."""
     path = Path(name) if name.endswith(".json") else models_folder() / name / "weights.json"
     weights = read_json(path, "weights of a tree", f"fit them with: {_FIT}")
     check_weights(weights, PAIR_FEATURES, path, _FIT)
@@ -347,17 +347,17 @@ def read_tree_weights(name: str) -> tuple[Mapping[str, float], str]:
 
 @dataclass(frozen=True)
 class BorderTree(MergedTree):
-    """`MergedTree` with the measurements of the image and the evidence of a border network.
+    """A `MergedTree` with features of the image and of the output of a border network.
 
-    The evidence is the log odds of a border between two regions, and the distance between the estimated centres of
-    their objects. All weights were fitted together, on scenes that were not used to train the network.
+    The network gives the log odds of a border between two regions, and the distance between the estimated centres of
+    their objects. The scenes for fitting the weights were not used to train the network.
 
     Parameters
     ----------
     leaves : TreeBuilder
         Builds the leaves that are merged.
     weights : str
-        Name of a trained model of the package, or the path of its folder.
+        Name of a trained model of the package, or the path of a model folder.
     """
 
     weights: str = "border"
@@ -379,8 +379,7 @@ class BorderTree(MergedTree):
 def tree_of_merges(image: np.ndarray, n_regions: int, merges: list[tuple[int, int, float]]) -> Tree:
     """The tree of a list of merges. Merge k creates node n_regions + k. A root joins the remaining regions.
 
-    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is its two nodes and its log
-    odds.
+    `image` (H, W) int has the region of every pixel; region 0 is the table. A merge is (node, node, log odds).
     """
     if n_regions == 1:
         return Tree(np.zeros(1, np.int64), image, np.zeros(1), np.zeros(1))

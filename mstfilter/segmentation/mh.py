@@ -1,10 +1,10 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
-The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with
-``s2 = sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The second form is
-for values that are log odds (`MergeLogOdds`), which need no scale.
+The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with ``s2 =
+sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The form with a
+`temperature` is for values that are log odds (`MergeLogOdds`) and need no scale.
 
-- ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain, MoveNode mixed with subtree redraws.
+- ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain with MoveNode and subtree redraws.
 - ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
 - ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", restart=True,
   include_optimal=True, redraw_repeated=True)``.
@@ -118,7 +118,7 @@ class MoveRule(ABC):
 
     @abstractmethod
     def choose(self, random: Callable[[], float], state: CutState) -> Any:
-        """Draw a choice; `random` returns uniform numbers in [0, 1)."""
+        """Draw a choice. `random` returns uniform numbers in [0, 1)."""
 
     @abstractmethod
     def outcome(self, state: CutState, choice: Any) -> Move | None:
@@ -127,7 +127,7 @@ class MoveRule(ABC):
 
 @dataclass(frozen=True)
 class NodeMoves(MoveRule):
-    """MoveNode of the paper: a uniform node of the cut, then up or down with equal probability, if possible."""
+    """MoveNode of the paper: a random node of the cut moves up or down with equal probability, if possible."""
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool]:
         """A node of the cut, and True for up."""
@@ -153,21 +153,21 @@ class NodeMoves(MoveRule):
 
 @dataclass(frozen=True)
 class AuthorsMoves(MoveRule):
-    """The moves of the authors' program, including its error: the target distribution is not stationary.
+    """The moves of the authors' program, including an error: the target distribution is not stationary.
 
     The choice is uniform over (node, direction). A move up is allowed for every node except the root. A move up
-    removes all nodes of the cut below the parent. The program takes 1 / M as the forward probability of a move up.
-    But each sibling in the cut proposes the same move, so merges are accepted too often.
+    removes all nodes of the cut below the parent. The program takes 1 / (number of choices) as the forward
+    probability of a move up. But each sibling in the cut proposes the same move up, so merges are accepted too often.
     """
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:
-        """A node of the cut, and True for up; None if no move is possible."""
+        """A node of the cut, and True for a move up; None if no move is possible."""
         moves = self.possible(state)
         return moves[int(random() * len(moves))] if moves else None
 
     @staticmethod
     def possible(state: CutState) -> list[tuple[int, bool]]:
-        """All moves (node, True for up)."""
+        """All moves (node, True for a move up)."""
         moves = []
         for node in state.nodes:
             if node != state.root:
@@ -204,16 +204,16 @@ class AuthorsMoves(MoveRule):
 
 @dataclass(frozen=True, eq=False)
 class SubtreeRedraw(MoveRule):
-    """Redraw the cut inside a random subtree from the Gibbs distribution `law`, the target with a temperature.
+    """Redraw the cut inside a random subtree from the Gibbs distribution `law`, the target of the chain.
 
-    The subtree's node is uniform over the inner nodes in every state. If an ancestor of it is in the cut, the cut
-    does not change. A choice is (inner node, new nodes).
+    The root of the subtree is uniform over the inner nodes. If an ancestor of this root is in the cut, the cut does
+    not change. A choice is (inner node, new nodes).
     """
 
     law: Gibbs
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, list[int]]:
-        """An inner node, and the new nodes of the cut below it."""
+        """An inner node, and the new nodes of the cut inside its subtree."""
         tree = self.law.tree
         inner = tree.n_nodes - tree.n_leaves
         if inner == 0:
@@ -237,9 +237,9 @@ LOCAL_MOVES: dict[str, type[MoveRule]] = {"node": NodeMoves, "authors": AuthorsM
 
 
 class CutChain:
-    """A Metropolis-Hastings chain over cuts from an initial cut, one step at a time.
+    """A Metropolis-Hastings chain over cuts that starts at an initial cut.
 
-    The target distribution has the log probability ``log_p(value)`` for a cut with this value, up to a constant.
+    A cut of value v has the log probability ``log_p(v)`` in the target distribution, up to a constant.
     """
 
     def __init__(self, tree: Tree, w: np.ndarray, log_p: Callable[[float], float], cut: np.ndarray) -> None:
@@ -253,7 +253,7 @@ class CutChain:
         self.value = sum(self.w[x] for x in self.state.nodes)
 
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
-        """Move of a choice (None: no change), value after the move, and log of its acceptance ratio."""
+        """Move of a choice (None: no change), value after the move, and log of the acceptance ratio."""
         move = rule.outcome(self.state, choice)
         if move is None or move.log_ratio == -inf:
             return None, self.value, -inf
@@ -285,16 +285,15 @@ class MetropolisHastingsCuts(CutSampler):
     Parameters
     ----------
     sigma2 : float
-        s2 relative to the squared value of the optimal cut, without unit. It is not used with a temperature.
+        s2 relative to the squared value of the optimal cut, without unit. With a temperature, s2 is not used.
     burn_in : int
         Steps before the first sample of each chain, in addition to `thinning`.
     thinning : int
         Number of steps between samples.
     moves : {"node", "authors"}
-        Rule of the local moves: the exact rule of the paper, or that of the authors, with a wrong forward
-        probability.
+        Rule of the local moves: the exact rule of the paper, or the rule of the authors' program.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move. Used only with a temperature.
+        Fraction of steps that redraw a random subtree instead of a local move; 0 without a temperature.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
@@ -302,7 +301,8 @@ class MetropolisHastingsCuts(CutSampler):
     redraw_repeated : bool
         If True and a cut was drawn before, draw once more and keep the second cut in any case.
     temperature : float
-        0: the distribution of the paper. > 0: the Gibbs distribution exp(v / temperature), in units of value.
+        Temperature of the target exp(v / temperature), in units of value. With 0, the chain has the target of the
+        paper.
     """
 
     sigma2: PositiveFloat = 1e-3
@@ -358,7 +358,7 @@ class MetropolisHastingsCuts(CutSampler):
         return lambda value: -((best - value) ** 2) / s2
 
     def _values(self, rng: np.random.Generator, chain: CutChain, w: np.ndarray) -> Iterator[float]:
-        """Make steps of a chain without end. Yields the value of the cut after each step."""
+        """Make an unlimited number of steps of a chain. Yields the value of the cut after each step."""
         random = _uniforms(rng).__next__
         local = LOCAL_MOVES[self.moves]()
         redraw = None
@@ -370,15 +370,15 @@ class MetropolisHastingsCuts(CutSampler):
 
 
 def _uniforms(rng: np.random.Generator) -> Iterator[float]:
-    """Uniform numbers drawn in blocks, which is ten times faster than single draws."""
+    """Uniform random numbers. Drawing blocks of numbers is ten times faster than drawing single numbers."""
     while True:
         yield from rng.random(1024).tolist()
 
 
 def _autocorrelation(trace: np.ndarray) -> float | None:
-    """Integrated autocorrelation time of a trace in steps; None if it is shorter than 100 steps or constant.
+    """Integrated autocorrelation time of a trace in steps; None for a constant trace or fewer than 100 steps.
 
-    A chain shorter than about 50 autocorrelation times underestimates them, so a low value does not prove
+    The estimate is too low for a chain shorter than about 50 autocorrelation times. A low value does not prove
     convergence.
     """
     if len(trace) < 100 or np.ptp(trace) == 0:

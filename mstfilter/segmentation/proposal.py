@@ -1,11 +1,11 @@
-"""Hypotheses from one image: tree cuts, completed to 3-D (paper IV-B).
+"""Hypotheses from one image: cuts of a segmentation tree, completed to 3-D (paper IV-B).
 
 >>> proposal = TreeCutProposal()
 >>> population = proposal.sample(np.random.default_rng(0), clip, 10)
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
 
 There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. If
-several objects of a hypothesis contain a voxel, one of them gets it. Each hypothesis is resolved separately.
+several completed segments of a hypothesis contain a voxel, the voxel is assigned to one object.
 
 An `ObjectRule` decides which regions of a cut are objects:
 
@@ -65,17 +65,17 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its readings are on the table, behind it or outside the workspace, or if fewer
-    than `min_points` readings remain. These are for an image of 640 x 480 pixels, and scaled by the area of the
-    image.
+    A region is background if most of its readings are on the table, behind the table or outside the workspace. A
+    region with fewer than `min_points` other readings is also background. `min_points` is for an image of 640 x 480
+    pixels and is scaled by the area of the image.
 
     Parameters
     ----------
     min_points : int
         Readings of the smallest object.
     mend : bool
-        Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If not,
-        every reading above the table can belong to an object, as published.
+        Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If
+        False, every reading above the table can belong to an object, as published.
     """
 
     min_points: int = 60
@@ -86,7 +86,7 @@ class ObjectRule:
         return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
-        """Test every node of a tree. Without a grid the workspace is everything above the table."""
+        """Test every node of a tree. Without a grid, the workspace is all space above the table."""
         found = self.foreground(frame, grid)
         pixels, frame = found.pixels, found.frame
         readings = tree.accumulate_pixels(frame.valid)
@@ -101,7 +101,7 @@ class ObjectRule:
         return Segments(pixels, is_object)
 
     def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-        """(H, W) int32 segments of a cut (default: the optimal one): 0 is background, and k + 1 its k-th node."""
+        """(H, W) int32 label image of a cut: 0 is background, and k + 1 is the k-th node of the cut."""
         segments = self.segments(tree, frame, grid)
         cut = np.asarray(cut)
         numbers = np.where(segments.is_object[cut], np.arange(1, len(cut) + 1), 0)
@@ -109,11 +109,11 @@ class ObjectRule:
 
 
 def _core(tree: Tree, pixels: np.ndarray, radius: int) -> np.ndarray:
-    """Number of pixels (N,) of each node whose square neighbourhood lies in the node and in `pixels`.
+    """Number (N,) of pixels of each node with a square neighbourhood inside the node and inside `pixels`.
 
-    A neighbourhood lies in the lowest node that contains all of it, and in the ancestors of this node. So one pass
-    over the pixels is sufficient. In depth-first order of the leaves, the lowest node is the one that contains the
-    first and the last leaf of the neighbourhood.
+    A neighbourhood lies in the lowest node that contains all its leaves, and in the ancestors of this node, so one
+    pass over the pixels is sufficient. The lowest node is found from the first and the last leaf of the neighbourhood
+    in depth-first order.
     """
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     # First fill single missing readings inside an object.
@@ -134,12 +134,12 @@ class TreeCutProposal(Proposal):
     Parameters
     ----------
     sampler : CutSampler
-        Draws the cuts, and must match the value: a `temperature` for log odds, `sigma2` for `SceneCutObjectness`.
+        Draws the cuts. The sampler needs a `temperature` for log odds, or `sigma2` for `SceneCutObjectness`.
     objects : ObjectRule
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
-        With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is
-        ``log p(c) - log p(c*)`` as in the paper and the authors' program. With "p", p counts twice.
+        With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is ``log
+        p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability counts twice.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -156,7 +156,7 @@ class TreeCutProposal(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def tree_of(self, frame: Frame, grid: VoxelGrid | None = None) -> tuple[Tree, np.ndarray]:
-        """The tree of a frame in a workspace and its node values (N,). Cached by content."""
+        """The tree of a frame in a workspace and its node values (N,). The result is cached."""
 
         def compute() -> tuple[Tree, np.ndarray]:
             found = self.objects.foreground(frame, grid)
@@ -172,7 +172,7 @@ class TreeCutProposal(Proposal):
         return replace(self, boundary=self.boundary.at(clip)) if isinstance(self.boundary, ClipBoundary) else self
 
     def label_image(self, frame: Frame, grid: VoxelGrid | None = None, cut: np.ndarray | None = None) -> np.ndarray:
-        """(H, W) int32 segments of a cut, 0 background, k + 1 its k-th node; the optimal cut by default."""
+        """(H, W) int32 label image of a cut (default: optimal). 0 is background, and k + 1 is the k-th node."""
         tree, w = self.tree_of(frame, grid)
         return self.objects.label_image(tree, optimal_cut(tree, w) if cut is None else cut, frame, grid)
 
@@ -213,10 +213,10 @@ def complete_segments(
 ) -> tuple[tuple[Hypothesis, ...], dict[str, Any]]:
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts for the notes.
 
-    Each sample is an array of segments, int64. ``mask_of(segment)`` returns (H, W) bool. Each distinct segment is
-    completed once, with the stream ``"completion", segment``. So the result does not depend on the other segments. A
-    stochastic completer completes a segment again for each further sample, with the stream
-    ``"completion", segment, k``.
+    Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
+    segment is completed once, with the random stream ``"completion", segment``. The result for a segment does not
+    depend on the other segments. A stochastic completer completes a segment again for each further sample, with the
+    random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()
@@ -247,8 +247,8 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from completed segments of a frame, at the pause `birth`.
 
-    Labels are 1, 2, ... in order. Segments without voxels get no record. `threshold` is the smallest probability of
-    an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
+    Segments get the labels 1, 2, ... in order. Segments without voxels get no record. `threshold` is the smallest
+    probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

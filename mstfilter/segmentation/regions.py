@@ -1,7 +1,7 @@
 """Measurements of image regions and of their common borders.
 
-Regions and borders are measured as sums over pixels. So the row of a merged region is the sum of two rows. Disparity
-is in sensor units (1/8 px at f = 525 px), lengths are in metres.
+Each measurement is a sum over pixels, so the row of a merged region is the sum of two rows. Disparity is in sensor
+units (1/8 px at f = 525 px), and lengths are in metres.
 
 >>> leaves = object_leaves(watershed, pixels)                 # objects do not share a leaf with the table
 >>> regions = measure_regions(leaves, frame, boundary)
@@ -87,9 +87,9 @@ class Regions:
 
 
 def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Leaves (H, W) int that do not cross the border of the pixels of objects (H, W) bool; 0 is the other pixels.
+    """Split leaves (H, W) int at the outline of the object `pixels` (H, W) bool. Pixels outside objects become 0.
 
-    Each connected part of a leaf is a leaf. Parts of a few pixels join the nearest larger one.
+    Each connected part of a leaf becomes a leaf. Parts of a few pixels join the nearest larger part.
     """
     image = np.where(pixels, leaves + 1, 0)
     parts = connected_pixels(image[:, :-1] == image[:, 1:], image[:-1] == image[1:])
@@ -106,9 +106,9 @@ def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def connected_pixels(right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Number (H, W) of the connected part of each pixel of an image.
+    """Number (H, W) of the connected component of each pixel of an image.
 
-    `right` and `down` are as in `pixel_graph`.
+    `right` and `down` are the parameters of `pixel_graph`.
     """
     parts = connected_components(pixel_graph(right, down), directed=False)[1]
     return np.asarray(parts.reshape(len(right), down.shape[1]))
@@ -117,9 +117,9 @@ def connected_pixels(right: np.ndarray, down: np.ndarray) -> np.ndarray:
 def measure_regions(
     region: np.ndarray, frame: Frame, boundary: np.ndarray, seen: SeenBorders | None = None
 ) -> Regions:
-    """Measure regions (H, W) int of an image with a boundary map (H, W), and what a network sees.
+    """Measure regions (H, W) int of an image, with a boundary map (H, W) and the output of a border network.
 
-    Region 0 is the table and all else that is no object; see `object_leaves`.
+    Region 0 is the table and all other pixels without an object. See `object_leaves`.
     """
     width = region.shape[1]
     n = int(region.max()) + 1
@@ -137,7 +137,7 @@ def measure_regions(
 
 
 def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, seen: SeenBorders | None) -> np.ndarray:
-    """Sums (n, C), columns `REGION`, over the readings of each region (H, W); the perimeter is missing.
+    """Sums (n, C), columns `REGION`, over the readings of each region (H, W), without the perimeter.
 
     `bend` (H, W) is the concave minus the convex curvature.
     """
@@ -173,9 +173,9 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
 
 
 def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:
-    """For every region, its neighbours and the border rows (columns `BORDER`).
+    """For every region, a mapping from neighbours to border rows (columns `BORDER`).
 
-    `maps` (H, W, 4) are the boundary strength, the concave and the convex curvature, and the log odds of a border.
+    `maps` (H, W, 4) has the boundary strength, the concave and the convex curvature, and the log odds of a border.
     """
     reach = max(1, round(scaled_length(3, region.shape[1])))
     first, second, rows = [], [], []
@@ -218,7 +218,7 @@ def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray
 
 
 def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: int) -> np.ndarray:
-    """Values of an image (H, W) at pixels moved along an axis. Pixels outside take the value at the edge."""
+    """Values of an image (H, W) at pixels moved along an axis. Pixels outside the image have the edge value."""
     index = list(at)
     index[axis] = np.clip(at[axis] + shift, 0, image.shape[axis] - 1)
     return image[tuple(index)]

@@ -2,7 +2,7 @@
 
 A tree is stored as a parent array. Leaves come first (0 .. n_leaves - 1), and the root is last. Every parent has a
 larger index than its children, so a loop over ascending indices visits children first. A *cut* is an ascending array
-of nodes that covers every leaf exactly once, so it is a segmentation of the image.
+of nodes that covers every leaf exactly once, so a cut is a segmentation of the image.
 
 >>> import numpy as np
 >>> from mstfilter.segmentation import Tree
@@ -14,9 +14,10 @@ array([[1, 1],
        [1, 0]])
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
-in order of the mean strength of their common border. The height of a merge is this mean strength. A logistic curve
-maps this height to P(boundary), the probability that the merge joins different objects. `start` is P(boundary) of the
-merge that makes a node. `start` is near 0 if the node lies inside one object, and near 1 if it contains several.
+in order of the mean strength of their common border. The height of a merge is the mean strength of the common border.
+A logistic curve maps the height to P(boundary), the probability that the merge joins different objects. `start` is
+P(boundary) of the merge that makes a node. `start` is near 0 for a node inside one object, and near 1 for several
+objects.
 """
 
 from __future__ import annotations
@@ -199,17 +200,17 @@ class TreeBuilder(Checked, ABC):
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         """The tree of a boundary map (H, W).
 
-        Some builders also need the frame, and use the pixels (H, W) bool that can belong to objects. By default,
-        these are `pixels_above_table`.
+        Some builders also need the frame and the pixels (H, W) bool that can belong to objects. The default pixels
+        are `pixels_above_table`.
         """
 
 
 @dataclass(frozen=True)
 class UcmTree(TreeBuilder):
-    """Watershed, then average linkage by mean boundary strength, pruned to the strongest merges.
+    """Watershed and average linkage by mean boundary strength. Only the strongest merges are kept.
 
     The logistic curve and the colour weight of `ColourDepthBoundary` were fitted together on the 45 `learn` frames of
-    mOSD. experiments/osd_frames reports results on other camera set-ups.
+    mOSD. Results with other cameras are in experiments/osd_frames.
 
     Parameters
     ----------
@@ -265,7 +266,7 @@ def linkage_tree(
     shape: tuple[int, int],
     strength: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[Any, np.ndarray, np.ndarray] | None:
-    """Watershed and average linkage of a pixel graph: higra's tree, merge heights (N,), leaf image (H, W).
+    """Watershed and average linkage of a pixel graph. Returns higra's tree, merge heights (N,), leaf image (H, W).
 
     `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` returns the strength of the borders between
     the watershed regions. By default the strength is the mean weight of the edges of a border. `arcs` (E,) is the
@@ -291,10 +292,10 @@ def linkage_tree(
 def prune(
     parent: np.ndarray, altitude: np.ndarray, leaves: np.ndarray, max_leaves: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that these merges join become the leaves.
+    """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that the kept merges join become leaves.
 
-    Heights do not decrease upwards and parents come after children. So the kept merges contain the root and are
-    connected.
+    Heights do not decrease towards the root, and parents come after children, so the kept merges contain the root and
+    are connected.
     """
     n = len(parent)
     n_leaves = (n + 1) // 2

@@ -13,15 +13,15 @@ The studies use the families `s1`, `s2` and `s3`. A scene can also be simulated 
 >>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
 >>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
 
-A filter that decides what is pushed next runs with a `PushLoop`.
+With a `PushLoop`, a filter chooses the pushes.
 
-The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (what defines a scene), `world`
-(MuJoCo physics, pushes), `printing` and `textures` (appearance). Above them are `arrangement` (placement), `lighting`
-and `renderer` (images by ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
+The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
+(MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),
+`lighting` and `renderer` (ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
 
-The simulation lacks camera motion, glossy and transparent surfaces, light reflected between objects, articulated and
-soft objects, and a hand. Depth noise, the shadow of the projector and losses at edges are calibrated to real frames.
-Within surfaces, noise is not correlated between pixels.
+The simulation has no camera motion, no glossy or transparent surfaces, no light reflected between objects, no
+articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges are
+calibrated to real frames. Within surfaces, noise is not correlated between pixels.
 """
 
 from mstfilter.lazy import attach

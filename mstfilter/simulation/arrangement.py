@@ -1,7 +1,7 @@
 """Placement of objects on the table: clusters, touching pairs of equal objects (twins), stacks and hidden objects.
 
-Each object is moved towards the cluster until it nearly touches another object (bisection on MuJoCo's contacts). So
-contacts are controlled. After placement, the physics runs until all objects are at rest.
+Each object is moved towards the cluster until the object nearly touches another object. Bisection on MuJoCo's
+contacts finds the position. After placement, the physics runs until all objects are at rest.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class SceneObjects:
 
     shapes: tuple[Shape, ...]
     skins: tuple[Skin, ...]
-    twin_of: tuple[int, ...]  #: Index of the object that each one repeats, -1 for none
+    twin_of: tuple[int, ...]  #: For each object, the index of the object that it copies, or -1
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw the shapes and textures of a scene. A family of shapes repeats only after all others have been used."""
+    """Draw the shapes and textures of a scene. A shape family repeats only after all other families were drawn."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []
@@ -64,7 +64,7 @@ def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> S
 
 
 def _draw_rest_pose(rng: np.random.Generator, shape: Shape, pose: _RestPose = "any") -> tuple[np.ndarray, float]:
-    """An orientation in which the shape rests, and the height of its origin above its support."""
+    """A rest orientation (3, 3) of a shape, and the height of its origin above the support."""
     from scipy.spatial.transform import Rotation
 
     weights = np.array([w for _, w in shape.rests])
@@ -82,7 +82,7 @@ def _draw_rest_pose(rng: np.random.Generator, shape: Shape, pose: _RestPose = "a
 def _contact_distance(
     world: PhysicsWorld, k: int, goal: np.ndarray, angle: float, height: float, rotation: np.ndarray
 ) -> float:
-    """Least distance in metres from `goal` along a direction at which object k overlaps no object.
+    """Smallest distance in metres from `goal`, in direction `angle`, at which object k overlaps no other object.
 
     The distance is found by steps inwards until the first overlap, and then by bisection.
     """
@@ -116,7 +116,7 @@ def _put_beside(
     attempts: int = _ATTEMPTS,
     pose: _RestPose = "any",
 ) -> bool:
-    """Put object k next to one of `neighbours`, `gap` metres from the first object on its way.
+    """Move object k towards one of `neighbours`, up to `gap` metres from the first object on the path.
 
     `towards` (2,) is the approximate direction from the neighbour, or None for any direction.
     """
@@ -141,7 +141,7 @@ def _put_beside(
 
 
 def _put_on_top(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int]) -> bool:
-    """Put object k on a flat object, if it fits on one."""
+    """Put object k on top of a flat object if there is room."""
     start = world.positions()[k]
     flat = [j for j in placed if world.shapes[j].family in ("carton", "brick", "can", "angle")]
     for j in rng.permutation(flat) if flat else []:
@@ -172,7 +172,7 @@ def _visible_pixels(world: PhysicsWorld, camera: Camera) -> np.ndarray:
 
 
 def _put_behind(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int], camera: Camera) -> bool:
-    """Put object k behind one of the tallest objects where it is least visible, if there is room."""
+    """Put object k behind one of the tallest objects, at the tried place with the fewest visible pixels."""
     start, best = world.positions()[k], None
     tallest = sorted(placed, key=lambda j: -_top(world, j))[:5]
     for _ in range(_HIDING_PLACES):
@@ -243,10 +243,10 @@ def _try_arrangement(
 def arrange_objects(
     rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily, twin_of: tuple[int, ...]
 ) -> None:
-    """Place all objects and run the physics until they are at rest, with touching twins and some hidden objects.
+    """Place all objects, with touching twins and hidden objects, and run the physics until all objects are at rest.
 
-    In a dense heap, the physics may separate twins or reveal hidden objects. After some attempts fewer are
-    sufficient. Raises InputError if the objects do not fit on the table.
+    In a dense heap, the physics may separate twins or reveal hidden objects. After some attempts, fewer touching
+    twins and hidden objects are sufficient. Raises InputError if the objects do not fit on the table.
     """
     empty = world.save()
     twins = sum(t >= 0 for t in twin_of)

@@ -4,10 +4,10 @@
 >>> scene_family("demo").n_frames, scene_family("table").grid().shape
 (15, (100, 100, 50))
 
-A family is a frozen `SceneFamily`. `dataclasses.replace` makes variants for `simulate_recording`. Entries of
-`SCENE_FAMILIES` have a name on the command line and in studies. New kinds of objects are added to `_MAKERS` in
-`shapes`. The studies use `s1`, `s2` and `s3`: 5, 9 and 15 - 20 objects with the same camera, sensor, textures and
-contacts. `catalogue` separates scenes for tuning from scenes for reporting. In `s1` - `s3` the seed determines it.
+A family is a frozen `SceneFamily`. `dataclasses.replace` makes variants for `simulate_recording`. The command line
+and the studies use the names in `SCENE_FAMILIES`. New kinds of objects are added to `_MAKERS` in `shapes`. The
+studies use `s1`, `s2` and `s3` with 5, 9 and 15 to 20 objects and the same camera, sensor and textures. The field
+`catalogue` separates scenes for tuning from scenes for reporting. In `s1` to `s3`, the seed determines the catalogue.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _Edge = Annotated[float, Bounds(at_least=0.1, at_most=2.0)]
 
 @dataclass(frozen=True)
 class SceneFamily(Bounded):
-    """Parameters of scenes: how they are drawn, moved and imaged."""
+    """Parameters for sampling, pushing and rendering scenes."""
 
     name: str = "table"  #: name of the family
     n_objects_min: PositiveInt = 5  #: range of the number of objects on the table, twins included; uniform
     n_objects_max: int = 6  #: see `n_objects_min`
     n_twins: int = 1  #: objects that repeat the shape and texture of another object and touch it
     n_stacked: int = 0  #: objects that are put on top of another object, if there is room
-    #: Small objects that are put behind a tall one, seen from the camera. If there are any, at most a third of all
+    #: Small objects that are put behind tall objects, seen from the camera. If `n_hidden` > 0, at most a third of all
     #: objects is hidden at the first pause.
     n_hidden: int = 0
-    #: Probability that an object without a twin touches another one; otherwise the gap is 1 - 4 cm.
+    #: Probability that an object without a twin touches another object; otherwise the gap is 1 - 4 cm.
     contact: Share = 0.6
     shapes: str = "all"  #: families of objects, separated by commas; "all" for every family
     #: Pool of sizes and textures: one of two disjoint pools, or all. "by seed": the tuning pool for seeds below 1000,
@@ -60,7 +60,7 @@ class SceneFamily(Bounded):
     min_moved: PositiveInt = 2  #: objects that an action should move; fewer if no candidate push moves as many
     #: Displacement from which an object counts as moved, metres.
     move_threshold: Annotated[float, Bounds(at_least=0.0001, at_most=0.5)] = 0.02
-    n_candidates: PositiveInt = 24  #: a push is chosen from at most 4 `n_candidates` simulated ones
+    n_candidates: PositiveInt = 24  #: a push is chosen from at most 4 `n_candidates` simulated pushes
     arm: bool = True  #: whether the finger has a visible arm
     #: Size of the images, pixels. The camera is a Kinect's (focal length 525 pixels at 640 x 480), scaled.
     width: _ImageSize = 640
@@ -68,7 +68,7 @@ class SceneFamily(Bounded):
     supersample: bool = True  #: smooth the edges of objects with three rays per pixel
     #: From the camera to the middle of the table, metres.
     camera_distance: Annotated[float, Bounds(at_least=0.5, at_most=2.0)] = 0.8
-    workspace_x: _Edge = 1.0  #: edges of the voxel grid, metres, which is centred on the table and stands on it
+    workspace_x: _Edge = 1.0  #: edges in metres of the voxel grid, which stands on the middle of the table
     workspace_y: _Edge = 1.0
     workspace_z: _Edge = 0.5
     voxel_size: Annotated[float, Bounds(at_least=0.001, at_most=0.1)] = 0.01  #: edge of a voxel, metres
@@ -92,7 +92,7 @@ class SceneFamily(Bounded):
 
     @property
     def n_frames(self) -> int:
-        """Frames of a recording."""
+        """Number of frames of a recording."""
         return 1 + self.n_actions * (self.frames_per_clip - 1)
 
     def pool(self, seed: int) -> Pool:
@@ -183,7 +183,7 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
 
 
 def scene_family(name: str) -> SceneFamily:
-    """A named family; raises InputError if the name is unknown."""
+    """A family of `SCENE_FAMILIES`. Raises InputError if the name is unknown."""
     if name not in SCENE_FAMILIES:
         raise InputError(
             f"unknown scene family {name!r}", *suggestion(name, SCENE_FAMILIES), f"known: {', '.join(SCENE_FAMILIES)}"

@@ -23,11 +23,11 @@ _FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
 
 
 class Stage:
-    """The rendered poses: the poses of the physics without tremor.
+    """The rendered poses: the poses of the physics without small vibrations.
 
-    Soft contacts make bodies at rest move by micrometres between frames. A rendered pose is kept until a point of
-    the body is farther than `tolerance` metres from it. Images, poses and volumes all use the rendered poses, so they
-    agree exactly. The world is not changed.
+    Soft contacts make bodies at rest move by micrometres between frames. A rendered pose changes only if a point of
+    the body has moved by more than `tolerance` metres. Images, recorded poses and volumes agree exactly, because all
+    use the rendered poses. The physics is not changed.
     """
 
     def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
@@ -42,7 +42,7 @@ class Stage:
         mujoco.mj_kinematics(world.model, self._data)
 
     def follow(self) -> None:
-        """Update the rendered poses to those of the world, within the tolerance."""
+        """Update the rendered poses from the poses of the physics, within the tolerance."""
         world = self.world
         now, finger = world.poses(), world.finger_position()
         shift = np.linalg.norm(now[:, :3, 3] - self.poses[:, :3, 3], axis=1)
@@ -62,7 +62,7 @@ class Stage:
         return self.poses.copy(), self._finger.copy(), self._data.qpos.copy()
 
     def restore(self, saved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-        """Return to saved poses."""
+        """Set the rendered poses to saved poses."""
         self.poses, self._finger = saved[0].copy(), saved[1].copy()
         self._data.qpos[:] = saved[2]
         self._mj.mj_kinematics(self.world.model, self._data)
@@ -75,7 +75,7 @@ class Stage:
 
 
 def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Cosine (n,) float32 between the normals (n, 3) of points (n, 3) and a light source, 0 in its shadow."""
+    """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow."""
     ray = points - light
     length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2 + ray[:, 2] ** 2)
     cosine = -(ray[:, 0] * normal[:, 0] + ray[:, 1] * normal[:, 1] + ray[:, 2] * normal[:, 2]) / length
@@ -88,9 +88,9 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 
 
 class LightMap:
-    """Mean of cosine times visibility of light sources (k, 3) on the table, on a raster with some spacing in metres.
+    """Raster of the light on the table: the mean of cosine times visibility over light sources (k, 3).
 
-    A shadow on the table thus costs rays at the resolution of the raster, not of the image.
+    The raster has a `spacing` in metres. The number of shadow rays does not depend on the image size.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray) -> None:
@@ -113,7 +113,7 @@ class LightMap:
         self._values /= np.float32(len(self._lights))
 
     def sample(self, xy: np.ndarray) -> np.ndarray:
-        """Bilinear values (n,) at points (n, 2) of the table; beyond the map the value at its border."""
+        """Bilinear values (n,) at points (n, 2) of the table. Points outside the map have the value at the border."""
         place = np.clip((xy - _MAP_LOW) / self._spacing, 0, np.array(self._shape) - 1.001)
         at = place.astype(np.int64)
         share = (place - at).astype(np.float32)
@@ -197,7 +197,7 @@ def _rotate(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Normals of a turned solid made of flat wedges, with the azimuth of the point instead of the facet's."""
+    """Smooth normals of a solid of revolution made of flat facets: the azimuth is taken from the point."""
     if shape.print_as != "lathe" or len(shape.pieces) == 1:
         return normal
     radius = np.hypot(points[:, 0], points[:, 1])

@@ -1,8 +1,8 @@
-"""Drawing of flat charts: printed cartons and labels, wood, cloth, speckle, glaze, peel.
+"""Drawing of flat texture images (charts): printed cartons and labels, wood, cloth, speckle, glaze, peel.
 
-Each function takes a generator and the size of the chart in metres. The function returns an RGB uint8 image with 0.4
-mm per pixel, which `textures` scales to the resolution of the camera. Colours have low saturation, like real
-packaging under office light in a cheap camera.
+Each function takes a random generator and the size of the chart in metres. The function returns an RGB uint8 image
+with 0.4 mm per pixel. The module `textures` scales the image to the resolution of the camera. Colours have low
+saturation, as in images of real packaging under office light.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.printing import wood
@@ -40,7 +40,7 @@ _KINDS = (
 def shade(
     rng: np.random.Generator, light: tuple[float, float] = (0.45, 0.9), rich: float = 0.5, pool: Pool = ANY
 ) -> _Rgb:
-    """A colour of random hue; every third one is nearly white or grey."""
+    """A colour of random hue. With probability 0.33, the colour is nearly white or grey."""
     hue = pool.hue(rng)
     r, g, b = colorsys.hsv_to_rgb(
         hue, float(rng.uniform(0.2, rich)) * (0.25 if rng.uniform() < 0.33 else 1.0), float(rng.uniform(*light))
@@ -75,7 +75,7 @@ def _tint(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
 
 
 def _ink(colour: _Rgb) -> _Rgb:
-    """Black or white, whichever has more contrast to the ground."""
+    """Black or white, with the larger contrast to the ground colour."""
     return (28, 26, 30) if 0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2] > 125 else (240, 238, 232)
 
 
@@ -151,7 +151,7 @@ def carton_face(
     role: str,
     pool: Pool = ANY,
 ) -> np.ndarray:
-    """One face of a printed carton; `role` is "front", "back", "side" or "end"."""
+    """One face of a printed carton. `role` is "front", "back", "side" or "end"."""
     import cv2
 
     ground, second = colours

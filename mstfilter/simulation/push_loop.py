@@ -1,4 +1,4 @@
-"""A simulated scene that chosen pushes change, for filters that decide the next action of the robot.
+"""A simulated scene for filters that choose the next push of the robot.
 
 >>> from mstfilter import Belief, preset
 >>> from mstfilter.simulation import PushLoop, scene_family
@@ -9,8 +9,8 @@
 ...     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=50))
 ...     state, _ = mst.step(state, loop.play(push or pushes[0]))
 
-A policy chooses one of the candidates. The policy gets clips and beliefs. Only scores use the truth. The scene and
-its candidates depend on the family, the seed and the pushes so far.
+A policy chooses one of the candidate pushes from clips and beliefs. Only scores use the ground truth. The scene and
+its candidates depend on the family, the seed and the earlier pushes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mstfilter.simulation.world import FingerPush, PushEffect, draw_push, is_cle
 
 
 class _Recorded(NamedTuple):
-    """A frame of a loop."""
+    """A recorded frame of a `PushLoop`."""
 
     frame: Frame
     instance: np.ndarray
@@ -53,7 +53,7 @@ class PushLoop:
     Parameters
     ----------
     family : SceneFamily
-        `n_actions` is ignored, since any number of pushes can be played.
+        The field `n_actions` is ignored, because any number of pushes can be played.
     seed : int
 
     Attributes
@@ -93,9 +93,9 @@ class PushLoop:
         return len(self.effects)
 
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
-        """n pushes towards objects, with a free place for the finger to come down. The scene does not change.
+        """`n` random pushes towards objects. The start of each push is free of objects. The scene does not change.
 
-        Pushes are drawn towards true objects, so most of them move something. Some move nothing or drop an object.
+        Pushes are drawn towards true objects, so most pushes move an object. Some pushes miss or drop an object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)
@@ -111,7 +111,7 @@ class PushLoop:
         )
 
     def play(self, push: FingerPush) -> Clip:
-        """Simulate a push and record it. Returns the clip from the last pause to the new pause."""
+        """Simulate and record a push. Returns the clip from the last pause to the new pause."""
         check_component("push", push, FingerPush)
         first = len(self._recorded) - 1
         self.effects.append(self._scene.play(push, self._add_frame))
@@ -121,18 +121,18 @@ class PushLoop:
         return self.clip
 
     def save(self) -> LoopState:
-        """The present state, for `restore`: to try several pushes from it."""
+        """The present state, for `restore`. A policy can try several pushes from a saved state."""
         world, stage = self._scene.world.save(), self._scene.stage.save()
         return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 
     def restore(self, state: LoopState) -> None:
-        """Return to a saved state of this loop. The same pushes then give the same images."""
+        """Return to a saved state of the same `PushLoop`. After `restore`, the same pushes give the same images."""
         self._scene.world.restore(state.world)
         self._scene.stage.restore(state.stage)
         self._recorded, self.effects, self.clip = list(state.recorded), list(state.effects), state.clip
 
     def recording(self) -> Recording:
-        """Everything so far as a recording with ground truth."""
+        """A recording of all frames so far, with ground truth."""
         frames, instances, times, truths = zip(*self._recorded, strict=True)
         pauses = tuple(k for k, truth in enumerate(truths) if truth is not None)
         return Recording(

@@ -1,23 +1,23 @@
-"""Recording of simulated scenes, where one call and one integer seed make one folder.
+"""Recording of simulated scenes. A call with an integer seed writes a recording folder.
 
 >>> from mstfilter.simulation import scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 >>> recording.truth(0).shape  # doctest: +SKIP
 (80, 80, 30)
 
-The same family and seed give the same bytes on one machine with one build of the libraries. Each part draws from its
-own stream, named after the part and its index.
+The same family and seed give the same bytes on one machine with one build of the libraries. Each part of the
+simulation has a separate random stream, with a name and an index.
 
-`cached_recording` stores recordings on disk and finds them again.
+`cached_recording` stores recordings on disk and uses stored recordings again.
 
 >>> from mstfilter import open_recording
 >>> from mstfilter.simulation import cached_recording
 >>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
-The name of a cached folder has a hash of everything that determines its bytes: the family's fields, the seed, and the
-versions of the simulator and of MuJoCo. The folder is written under another name and renamed, so that it is complete.
-Several processes can ask for the same recording.
+The name of a cached folder has a hash of the fields of the family, the seed, and the versions of the simulator and of
+MuJoCo. A folder is written under a temporary name and renamed when the recording is complete. Several processes can
+ask for the same recording.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _Progress = Callable[[int, int, str], None]  # called with frames done, frames i
 
 
 def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
-    """The random stream of a part."""
+    """The random stream of a part of the simulation."""
     word = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
     return np.random.default_rng([seed, word, index])
 
@@ -77,7 +77,7 @@ def _check_seed(seed: int) -> None:
 
 
 class SimulatedScene:
-    """A world with its textures and sensors, for use step by step."""
+    """A simulated scene with physics, textures and sensors, for simulation step by step."""
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
         _check_seed(seed)
@@ -100,7 +100,7 @@ class SimulatedScene:
         return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
     def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
-        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame between them."""
+        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame in between."""
         family, world = self.family, self.world
         before, began = world.poses(), world.time
         for step in range(1, family.frames_per_clip - 1):
@@ -153,11 +153,11 @@ class SimulatedScene:
 def simulate_recording(
     family: SceneFamily, seed: int, path: str | Path, progress: _Progress | None = None
 ) -> Recording:
-    """Simulate a scene, which family and seed determine, write its recording and open it.
+    """Simulate the scene of a family and a seed, write the recording to a folder, and open the recording.
 
-    `path` is a folder that is empty or does not exist yet. Nothing is left behind on failure. `progress` is called
-    after each frame with frames done, frames in all, and a description. Raises InputError if the folder cannot be
-    written, or the objects cannot be arranged or pushed.
+    `path` is a folder that is empty or does not exist yet. If the simulation fails, no files are left. `progress` is
+    called after each frame with the number of frames done, the number of all frames, and a description. Raises
+    InputError if the folder cannot be written, or the objects cannot be arranged or pushed.
     """
     scene = SimulatedScene(family, seed)
     report = progress or (lambda done, total, description: None)
@@ -211,14 +211,14 @@ def _describe_push(push: FingerPush, result: PushEffect) -> dict[str, Any]:
 
 
 def cache_folder() -> Path:
-    """Folder of cached files, which is MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
+    """Folder of cached files: the variable MSTFILTER_CACHE, or else `mstfilter` in the user's cache folder."""
     if folder := os.environ.get("MSTFILTER_CACHE"):
         return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mstfilter"
 
 
 def recipe_key(family: SceneFamily, seed: int) -> str:
-    """A hash of everything that determines the bytes of a recording."""
+    """A hash of the family, the seed and the versions, which determine the bytes of a recording."""
     recipe = {
         "generator": GENERATOR_VERSION,
         "mujoco": version("mujoco"),
@@ -236,7 +236,7 @@ def cached_path(family: SceneFamily, seed: int, folder: Path) -> Path:
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
     """The folder of a simulated recording. The recording is simulated if it does not exist or has changed on disk.
 
-    `overrides` are fields of the family to change. Recordings are stored in `folder`, by default `recordings` in
+    `overrides` are changed fields of the family. Recordings are stored in `folder`, by default `recordings` in
     `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be
     written.
     """

@@ -1,4 +1,4 @@
-"""Colour, depth and instance images by ray casting, which needs no display, GPU or OpenGL.
+"""Colour, depth and instance images by ray casting. The renderer needs no display, GPU or OpenGL.
 
 One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
 the textures.
@@ -67,7 +67,7 @@ class Renderer:
         self._lamp_map, self._sky_map = LightMap(fine, room.lamp), LightMap(2 * fine, room.sky)
 
     def _render_background(self) -> None:
-        """The room without objects. Between images only the light on the table changes."""
+        """Render the room without objects. Between images, only the light on the table changes."""
         geom, z, normal = self.stage.cast(self._eye, self._rays, (ROOM_GROUP,))
         points = self._eye + self._rays * z[:, None]
         self._room_depth = np.where(geom >= 0, z, np.nan).astype(np.float32)
@@ -101,7 +101,7 @@ class Renderer:
         return colour
 
     def _unshadowed_light(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Light (n, 3) on floor, wall and the rim of the table, without shadows and decreasing with distance."""
+        """Light (n, 3) on floor, wall and rim of the table, without shadows. The light decreases with distance."""
         lamp = self.room.lamp.mean(axis=0)
         reach = np.linalg.norm(points - lamp, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -145,7 +145,7 @@ class Renderer:
         return View(colour.reshape(h, w, 3), depth.reshape(h, w), instance.reshape(h, w), slant.reshape(h, w))
 
     def _colours(self, rays: np.ndarray) -> np.ndarray:
-        """Colours (k, 3) of what rays (k, 3) meet, bodies or the room."""
+        """Colours (k, 3) of the surfaces that rays (k, 3) hit."""
         geom, z, normal = self.stage.cast(self._eye, rays, (ROOM_GROUP, OBJECT_GROUP, FINGER_GROUP))
         points = self._eye + rays * z[:, None]
         result = np.empty((len(rays), 3), np.float32)
@@ -160,7 +160,7 @@ class Renderer:
 
 
 def _edge_pixels(ids: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Pixels (k,) on borders of instances (H, W), or where the normal (H, W, 3) of a body turns sharply."""
+    """Pixel indices (k,) on borders of instances (H, W), or at sharp changes of the normal (H, W, 3) of a body."""
     edge = np.zeros(ids.shape, bool)
     x, y, z = (np.ascontiguousarray(normal[..., i]) for i in range(3))
     for here, there in NEIGHBOURS:

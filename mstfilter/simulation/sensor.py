@@ -1,10 +1,10 @@
 """Models of a structured-light depth sensor and of a colour camera.
 
-In depth, pixels on depth edges are shifted sideways, with some neighbours shifted together. Disparity has Gaussian
-noise and is rounded to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). The rounding gives
-sigma = 1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the
-left of objects), at some depth edges, on surfaces at a grazing angle, and out of range. Colour has exposure, blur of
-the optics, photon noise, and the sRGB curve.
+The depth sensor shifts pixels on depth edges sideways, in small patches. Disparity has Gaussian noise and is rounded
+to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). Noise and rounding give sigma = 1.85 mm
+(z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the left of
+objects), at some depth edges, on surfaces at a grazing angle, and out of range. The colour camera has optical blur,
+photon noise and the sRGB curve.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.sensor import DepthSensor
@@ -48,10 +48,10 @@ class DepthSensor(Bounded):
     lateral : float
         Standard deviation of the sideways shift on depth edges, in pixels of the sensor's raster.
     edge_dropout : float
-        Probability that a patch of pixels within two pixels of a depth edge has no reading. This value and `fill`
-        were fitted to the frequencies of missing readings 1 .. 10 pixels to each side of objects in 45 real frames.
+        Probability that a patch of pixels within two pixels of a depth edge has no reading. `edge_dropout` and `fill`
+        were fitted to the frequencies of missing readings 1 .. 10 pixels beside objects in 45 real frames.
     fill : float
-        The sensor fills shadows of the projector up to this width, in pixels of its raster.
+        Largest width of a projector shadow that the sensor fills, in pixels of the sensor's raster.
     """
 
     lateral: NonNegativeFloat = 0.5
@@ -87,10 +87,10 @@ class DepthSensor(Bounded):
         return np.where(lost | ~np.isfinite(z), np.nan, reading).astype(np.float32)
 
     def _unlit(self, depth: np.ndarray) -> np.ndarray:
-        """Surfaces that the projector, a baseline to the right of the camera, does not illuminate. (H, W) bool.
+        """Pixels (H, W) bool that the projector does not illuminate. The projector is to the right of the camera.
 
-        In the image of the projector, column u of depth z is at u - f b / z. A surface is in shadow if another
-        surface, farther right in the camera's image, is to its left in the projector's image.
+        A pixel in column u with depth z is in column u - f b / z of the projector's image. A surface is in shadow if
+        a surface farther right in the camera's image is farther left in the projector's image.
         """
         w = depth.shape[1]
         disparity = _FOCAL * w / 640.0 * _BASELINE / np.where(np.isfinite(depth), depth, np.inf)
@@ -100,7 +100,7 @@ class DepthSensor(Bounded):
 
 
 def _depth_edges(depth: np.ndarray) -> np.ndarray:
-    """Whether a pixel or its neighbour is at a step in depth. (H, W) bool."""
+    """Pixels (H, W) bool on either side of a step in depth."""
     edge = np.zeros(depth.shape, bool)
     for here, there in NEIGHBOURS:
         first, second = depth[here], depth[there]

@@ -1,7 +1,8 @@
-"""Household objects made of convex pieces: their shapes, sizes and voxels.
+"""Household objects made of convex pieces: shapes, sizes and voxels.
 
 `draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body, the poses in which it rests, its mass
-and the layout of its texture. The origin of the frame is the middle of the bounding box; z is up in the main pose.
+and the layout of its texture. The origin of the frame is the middle of the bounding box. In the upright pose, z
+points up.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -9,14 +10,14 @@ and the layout of its texture. The origin of the frame is the middle of the boun
 >>> len(shape.pieces), shape.family
 (1, 'can')
 
-Sizes and masses follow objects of the YCB set, rounded. The YCB set is described by Calli et al., "Benchmarking in
-manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3), 2015, table of
-objects. The objects are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl, banana, ball.
-The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not in the set
-and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm, which is thicker than
-real walls. A thinner wall would fall between the centres of 1 cm voxels and be missing in the true volume.
+Sizes and masses are rounded values of objects in the YCB set. The YCB set is described by Calli et al., "Benchmarking
+in manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3), 2015, table of
+objects. The objects from the set are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl,
+banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not
+in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm thick, more
+than real walls. A thinner wall could lie between the centres of 1 cm voxels and be missing in the true volume.
 
-`label_voxels` returns the true volume: the voxels of each object, including hidden ones.
+`label_voxels` returns the true volume: all voxels of each object, visible or not.
 
 >>> from mstfilter.scene import VoxelGrid
 >>> from mstfilter.simulation.shapes import label_voxels
@@ -53,16 +54,16 @@ _UP_X, _UP_Y, _UP_Z, _DOWN_Z = 1, 2, 3, -3
 
 @dataclass(frozen=True)
 class Pool:
-    """The sizes, hues and names from which scenes are drawn.
+    """A set of sizes, hues and names from which the objects of scenes are drawn.
 
     Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range in alternate bands,
-    so that they are equally difficult.
+    so that the pools are equally difficult.
     """
 
     half: int | None = None  #: {0, 1, None}: which of the two disjoint pools; None for all sizes, hues and names
 
     def factor(self, rng: np.random.Generator) -> float:
-        """Factor that scales a measure, 0.9 .. 1.1."""
+        """Random factor that scales a length, 0.9 .. 1.1."""
         u = float(rng.uniform())
         if self.half is None:
             return _SMALLEST + 8 * _BAND * u
@@ -97,7 +98,7 @@ class Shape:
 
     family: str  #: one of SHAPE_FAMILIES
     name: str  #: member of the family
-    #: Convex; their union is the object. They are moved so that its bounding box is centred on the origin.
+    #: Convex pieces of the object, moved so that the bounding box of the object is centred on the origin.
     pieces: Sequence[Piece]
     mass: float  #: kilograms
     #: {"box", "lathe"}: layout of the texture: six faces, or side, top, bottom and inside of a turned solid.
@@ -124,7 +125,7 @@ class Shape:
 
     @cached_property
     def density(self) -> float:
-        """Mass over the sum of the pieces' volumes, kg / m^3."""
+        """Mass divided by the sum of the volumes of the pieces, kg / m^3."""
         return self.mass / sum(piece.volume for piece in self.pieces)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
@@ -139,10 +140,10 @@ class Shape:
 
 
 def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, and 0 if it lies in none.
+    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, and 0 for other voxels.
 
     `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A centre in two objects
-    belongs to the first.
+    gets the label of the first object.
     """
     labels = np.zeros(grid.shape, np.uint16)
     for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):

@@ -1,7 +1,7 @@
 """Convex pieces of objects.
 
-A rigid object is a union of convex pieces. MuJoCo uses these pieces for collisions and ray casting, and
-`Piece.inside` is for the same solids. So images and true volumes agree.
+A rigid object is a union of convex pieces. MuJoCo uses the pieces for collisions and ray casting. `Piece.inside`
+tests points against the same pieces, so images and true volumes agree.
 
 >>> from mstfilter.simulation.solids import box
 >>> box((0.02, 0.03, 0.04)).inside([[0.0, 0.0, 0.039], [0.0, 0.0, 0.041]]).tolist()
@@ -125,7 +125,7 @@ def hull(vertices: ArrayLike) -> Piece:
 
 
 def _circle(sides: int) -> np.ndarray:
-    """Points (sides + 1, 2) of the unit circle, where the last one repeats the first."""
+    """Points (sides + 1, 2) of the unit circle. The last point repeats the first point."""
     angle = np.arange(sides + 1) * (2.0 * np.pi / sides)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -138,9 +138,9 @@ def frustum(lower: tuple[float, float], upper: tuple[float, float], sides: int =
 
 
 def ring(profile: list[tuple[float, float, float]], sides: int = 20) -> list[Piece]:
-    """The wall of a turned solid as convex wedges, `sides` in each layer.
+    """The wall of a solid of revolution as convex wedges, with `sides` wedges in each layer.
 
-    The profile has (inner radius, outer radius, z) from bottom to top. Neighbouring entries bound one layer.
+    The profile has (inner radius, outer radius, z) from bottom to top. Two neighbouring entries bound one layer.
     """
     circle = _circle(sides)
     wedges = []

@@ -1,8 +1,8 @@
-"""Textures of objects and the room around them.
+"""Textures of objects, and the room around the objects.
 
-The skin of a body consists of a few flat charts (`draw_skin`). Body coordinates and normal of a surface point
-determine its chart and its place in the chart (`texture_coordinates`). An `Atlas` holds the charts of all bodies in
-one array, so shading is one gather. Charts show the outside with the upper edge up, so text is never mirrored.
+The skin of an object consists of a few flat texture images, called charts (`draw_skin`). Coordinates and normal of a
+surface point determine its chart and its place in the chart (`texture_coordinates`). An `Atlas` holds the charts of
+all objects in one array. Charts show the surface from outside with the upper edge up, so text is not mirrored.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -11,7 +11,7 @@ one array, so shading is one gather. Charts show the outside with the upper edge
 >>> len(skin.charts), skin.gloss < 0.2
 (7, True)
 
-The `Room` consists of table top, floor, wall, light and exposure. The room is drawn for each scene (`draw_room`).
+A `Room` consists of table top, floor, wall, light and exposure. `draw_room` draws a room for each scene.
 
 >>> from mstfilter.simulation.textures import draw_room
 >>> room = draw_room(np.random.default_rng(0), texel=0.004)
@@ -36,7 +36,7 @@ _SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 class Skin:
     """Texture of a body: uint8 charts (h, w, 3), and the strength of the highlight, 0 .. 1.
 
-    The charts are six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside, and then the plain colour.
+    The charts are six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart is plain.
     """
 
     charts: tuple[np.ndarray, ...]
@@ -58,7 +58,7 @@ def _face_axes(face: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
-    """Width and height in metres of each chart of a shape, without the plain one."""
+    """Width and height in metres of each chart of a shape, without the plain chart."""
     if shape.print_as == "box":
         return [(2 * abs(r @ shape.half), 2 * abs(u @ shape.half)) for r, u in map(_face_axes, range(6))]
     across = 2 * float(min(shape.half[0], shape.half[1]))
@@ -69,10 +69,10 @@ def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
 def texture_coordinates(
     shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chart number (n,) of surface points, and place (n, 2) in it, 0 .. 1 from its upper left corner.
+    """Chart number (n,) of surface points, and place (n, 2) in the chart, 0 .. 1 from the upper left corner.
 
-    `points` and outward unit `normals` (n, 3) are in the body's frame, in metres. `plain` (n,) bool are points with
-    one colour.
+    `points` and outward unit `normals` (n, 3) are in the body's frame, in metres. `plain` (n,) bool marks points with
+    the plain colour.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":
@@ -147,7 +147,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
 
 
 class Atlas:
-    """The charts of many skins in one array, averaged to the resolution of a camera, `texel` metres."""
+    """The charts of many skins in one array, averaged to pixels of `texel` metres."""
 
     def __init__(self, skins: list[Skin], texel: float) -> None:
         import cv2
@@ -190,9 +190,9 @@ class Room:
     wall: np.ndarray  #: (3,) albedo of the wall
     carpet: np.ndarray  #: (n, n) relative brightness of a tile of the floor, which is repeated
     lamp: np.ndarray  #: (k, 3) metres, point sources of the lamp; several make soft shadows
-    lamp_colour: np.ndarray  #: (3,) irradiance of all of them on a surface that faces the lamp
+    lamp_colour: np.ndarray  #: (3,) irradiance of the whole lamp on a surface that faces the lamp
     sky: np.ndarray  #: (m, 3) metres, point sources of the ceiling, for diffuse light from above
-    sky_colour: np.ndarray  #: (3,) irradiance of all of them
+    sky_colour: np.ndarray  #: (3,) irradiance of the whole ceiling
     ambient: np.ndarray  #: (3,) irradiance without direction
     exposure: np.ndarray  #: (3,) gain of each channel: exposure and white balance
 

@@ -1,4 +1,4 @@
-"""The physical world: a table, rigid objects and a finger that pushes them, simulated by MuJoCo.
+"""Physics by MuJoCo: a table, rigid objects and a finger that pushes objects.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -8,13 +8,13 @@
 >>> bool(world.settle())
 True
 
-The time step is 2 ms, the integrator is implicit, friction cones are elliptic. Objects are unions of convex pieces
-with torsional and rolling friction. The finger is a capsule on three slides with stiff position actuators. The arm
-above it is visible but touches nothing.
+The time step is 2 ms, the integrator is implicit, and friction cones are elliptic. Objects are unions of convex
+pieces with torsional and rolling friction. The finger is a capsule on three slides with stiff position actuators. The
+arm above the finger is visible but has no contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates candidate lines through the objects from the saved state. `choose_push` takes the first line that moves
-enough objects and drops none. Physics is fast compared with rendering, so dozens of candidates are tried.
+simulates candidate pushes from one state. `choose_push` takes the first push that moves enough objects and drops
+none. Physics is faster than rendering, so dozens of candidates are tried.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
-    Object k of the world is shapes[k]. The id of the object in images, voxels and poses is k + 1. Objects start far
-    away. `place` puts one object on the table. The arm of the finger is visible but touches nothing.
+    Object k has the shape ``shapes[k]``. The id of the object in images, voxels and poses is k + 1. Objects start far
+    from the table. `place` puts one object on the table. The arm of the finger is visible but has no contacts.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:
@@ -157,7 +157,7 @@ class PhysicsWorld:
         return float(self.data.time)
 
     def place(self, k: int, position: ArrayLike, rotation: ArrayLike) -> None:
-        """Set the pose of object k, at rest."""
+        """Set the pose of object k, with zero velocity."""
         from scipy.spatial.transform import Rotation
 
         quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(scalar_first=True)
@@ -186,7 +186,7 @@ class PhysicsWorld:
         return self.data.qpos[:3].copy()
 
     def move_finger(self, position: ArrayLike) -> None:
-        """Set the position of the finger, at rest."""
+        """Set the position of the finger, with zero velocity."""
         self.data.qpos[:3] = position
         self.data.qvel[:3] = 0.0
         self.data.ctrl[:] = position
@@ -200,7 +200,7 @@ class PhysicsWorld:
         self._mj.mj_step(self.model, self.data, n)
 
     def settle(self) -> bool:
-        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s; False if this takes more than 4 s."""
+        """Run until no object moves faster than 0.01 m/s or rad/s for 0.1 s. Returns False after 4 s of motion."""
         calm = 0
         for _ in range(200):
             self.step(10)
@@ -229,7 +229,7 @@ class PhysicsWorld:
         return float(-contact.dist[objects].min(initial=0.0))
 
     def save(self) -> np.ndarray:
-        """The full state of the simulation. After `restore`, the simulation continues bit for bit the same."""
+        """The full state of the simulation. After `restore`, the simulation gives bit-identical results."""
         kind = self._mj.mjtState.mjSTATE_INTEGRATION
         state = np.empty(self._mj.mj_stateSize(self.model, kind))
         self._mj.mj_getState(self.model, self.data, state, kind)
@@ -268,11 +268,11 @@ class FingerPush:
     """A straight push along the table."""
 
     start: tuple[float, float]  #: (x, y) metres, where the finger comes down
-    end: tuple[float, float]  #: (x, y) metres, where it goes up
+    end: tuple[float, float]  #: (x, y) metres, where the finger goes up
     seconds: float  #: from one pause to the next, without the time to settle
 
     def swept(self, grid: VoxelGrid) -> np.ndarray:
-        """(X, Y, Z) bool: voxels with centres that the finger passes during the push."""
+        """(X, Y, Z) bool: voxels with centres in the volume that the finger sweeps."""
         centres = grid.centres()
         a, b = np.array(self.start), np.array(self.end)
         along = np.clip((centres[..., :2] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0.0, 1.0)
@@ -281,7 +281,7 @@ class FingerPush:
         return np.asarray((beside <= _FINGER_RADIUS) & (above <= _FINGER_HALF + _FINGER_RADIUS))
 
     def target(self, t: float) -> np.ndarray:
-        """Target (3,) of the finger t seconds after the pause."""
+        """Target position (3,) of the finger t seconds after the pause."""
         a, b = np.array(self.start), np.array(self.end)
         share = t / self.seconds
         if share < _DOWN:
@@ -323,7 +323,7 @@ def advance_push(world: PhysicsWorld, push: FingerPush, start: float, stop: floa
 
 
 def finish_push(world: PhysicsWorld) -> bool:
-    """Park the finger and wait until all objects are at rest. Returns False if this takes too long."""
+    """Park the finger and wait until all objects are at rest. Returns False if objects still move after 4 s."""
     world.move_finger(_PARKED)
     return world.settle()
 
@@ -336,7 +336,7 @@ def play_push(world: PhysicsWorld, push: FingerPush, family: SceneFamily) -> Pus
 
 
 def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: SceneFamily) -> PushEffect:
-    """The effect of a push, from the poses (n, 4, 4) before it."""
+    """The effect of a push, from the poses (n, 4, 4) before the push."""
     after = world.positions()
     trace = np.einsum("nij,nij->n", before[:, :3, :3], world.rotations())
     kept = bool(family.contains_points(after).all())
@@ -359,7 +359,7 @@ def is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
 
 
 def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
-    """A line towards one object, preferably an object with others behind it."""
+    """A random push towards one object, preferably in the direction of another object."""
     at = world.positions()[:, :2]
     goal = at[int(rng.integers(len(at)))]
     others = at[np.linalg.norm(at - goal, axis=1) > 1e-6]
@@ -378,11 +378,11 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 
 
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
-    """Choose a push that moves objects by simulating candidates. The world does not change.
+    """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. If none does, the candidate
-    is taken that moves most and topples fewest. Candidates that drop an object or leave one in motion are discarded.
-    Raises InputError if no candidate moves any object.
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate moves
+    fewer objects or topples an object, the best compromise is taken. Candidates that drop an object or leave an
+    object in motion are discarded. Raises InputError if no candidate moves any object.
     """
     saved = world.save()
     best: tuple[float, FingerPush] | None = None
