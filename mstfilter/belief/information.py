@@ -1,8 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
 An action has one outcome under each hypothesis. The expected information of an action is the mutual information
-between the hypothesis and the outcome. The hypothesis determines the outcome. So this is the entropy of the weights
-summed over equal outcomes, which is at most the entropy of the weights.
+between the hypothesis and the outcome. The hypothesis determines the outcome, so the mutual information is the entropy
+of the distribution of the outcomes. The entropy of the weights is an upper bound.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -15,11 +15,12 @@ the information is
 
     I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ.
 
-Outcomes that differ in far fewer than tau cells count as one. Outcomes that differ in far more cells count as two.
+Outcomes that differ in far fewer than tau cells count as equal. Outcomes that differ in far more cells count as
+different.
 I_0 is the information without noise. I_tau decreases to 0 as tau grows. Suppose that every cell is measured with an
 independent error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual
-information with the measurement. The bound is by Kolchinsky, Tracey (2017), *Estimating mixture entropy with pairwise
-distances*, with the Bhattacharyya distance.
+information of hypothesis and measurement. Kolchinsky and Tracey (2017), *Estimating mixture entropy with pairwise
+distances*, derive the bound with the Bhattacharyya distance.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. Called only if `tolerance` > 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. Not called if `tolerance` is 0.
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float
@@ -79,7 +80,7 @@ def outcome_information(
 
 
 def hamming(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Number (n, n) of cells in which outcomes (n, k) differ, for k groups of `sizes` cells."""
+    """Number (n, n) of cells in which pairs of outcomes (n, k) differ, for k groups of `sizes` cells."""
     return np.stack([(rows != row) @ sizes.astype(np.float64) for row in rows])
 
 
@@ -91,9 +92,9 @@ def canonical_rows(rows: np.ndarray) -> np.ndarray:
 def partition_distance(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Least number (n, n) of cells that must change their object to make two partitions equal.
 
-    ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``. A and B are the objects of i and
-    j, and the maximum is over one-to-one matchings m (Gusfield 2002, *Partition-distance*; free space matches free
-    space only). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
+    ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``. A_k are the objects of partition i
+    and B_k the objects of partition j. The maximum is over one-to-one matchings m of objects (Gusfield 2002,
+    *Partition-distance*). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
     """
     n, width = len(rows), int(rows.max(initial=0)) + 1
     distance = np.zeros((n, n))

@@ -36,7 +36,7 @@ class SameSegmentation(Equivalence):
 class WeightedCoverage(Similarity):
     """Weighted coverage (form ``objects`` of `mstfilter.scoring.quality`) of all pairs of hypotheses.
 
-    `stride` is the step between the voxels that are used, along each axis. The time decreases with stride^3.
+    `stride` is the step between the voxels that are used, along each axis. The time is in proportion to stride^-3.
     """
 
     stride: PositiveInt = 1
