@@ -1,4 +1,4 @@
-"""What ``mstfilter list`` prints. The command needs only numpy and scipy."""
+"""The output of ``mstfilter list``. The command needs only numpy and scipy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands of many runs: study, train."""
+"""Commands that make many runs or train networks: study, train."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def study(
 
 
 def _print_summary(summary: Any) -> None:
-    """Print the primary endpoints by family and arm, and arm minus reference."""
+    """Print the primary endpoints by scene family and arm, and the differences from the reference arm."""
     from rich.console import Console
     from rich.table import Table
 
@@ -68,7 +68,7 @@ def _print_summary(summary: Any) -> None:
 
 
 def _range(low: float, high: float, sign: str = "") -> str:
-    """An interval; a dash if there is none."""
+    """The text of an interval; a dash for NaN."""
     return "–" if low != low else f"{low:{sign}.3f} .. {high:{sign}.3f}"
 
 

@@ -1,4 +1,4 @@
-"""The folder of a run, written pause by pause. Reports read this folder, and an interrupted run resumes from it.
+"""The folder of a run, written pause by pause. Reports read the folder, and an interrupted run resumes from the folder.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
@@ -16,9 +16,9 @@ Layout::
     metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
     compare/without-past     run folders of other filters on the same recording, if asked for
 
-A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
-are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same bytes in all files except seconds.json.
+A pause is written under a temporary name and renamed when it is complete, so a stopped run has only complete pauses.
+`filter_recording` resumes from state.npz of the last complete pause. `mstfilter.scene.encode_hypotheses` makes the
+arrays ``particles/...`` in state.npz. The same seed gives the same bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class _SecondsFile(RootModel[dict[str, float]]):
 
 @dataclass(frozen=True)
 class HypothesisCodec(Codec):
-    """Hypotheses on one grid as arrays, bit for bit."""
+    """Converts hypotheses on one grid to arrays and back, without any change."""
 
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
         return encode_hypotheses(particles)
@@ -187,9 +187,9 @@ class RunFolder:
         return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
 
     def check(self) -> RunFolder:
-        """Read every file of the run and of its comparison runs, before work with them starts.
+        """Read every file of the run and of its comparison runs, before the files are used.
 
-        Raises InputError if a file is missing or damaged, or files of a pause do not belong together.
+        Raises InputError if a file is missing or damaged, or if files of a pause are inconsistent.
         """
         if self.n_pauses > len(self.description["recording"]["pauses"]):
             raise InputError(f"{self.path}: there are more pauses than run.json lists")
@@ -201,7 +201,7 @@ class RunFolder:
         return self
 
     def _check_pause(self, t: int, n_before: int) -> int:
-        """Check the files of a pause after one with `n_before` hypotheses; returns the number of hypotheses."""
+        """Check the files of a pause, given the number of hypotheses before. Returns the number of hypotheses."""
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
         _ = self.seconds(t), self.questions(t)
@@ -254,7 +254,7 @@ class RunFolder:
         questions: Questions | None = None,
         instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, and of the pause if known: true labels, questions, true label image.
+        """Write the results of a step, and, if known, true labels, questions and true label image of the pause.
 
         An interrupted call writes nothing.
         """
@@ -292,7 +292,7 @@ class RunFolder:
     def repair(self) -> None:
         """Prepare the folder for resuming. Remove remains of a killed process, and damaged pauses with a warning.
 
-        All pauses after a damaged one are removed.
+        All pauses after a damaged pause are removed.
         """
         sweep(self.path)
         sweep(self.path / "pauses")
@@ -335,7 +335,7 @@ class RunFolder:
         return self._truth(t).get("labels")
 
     def questions(self, t: int) -> Questions | None:
-        """The questions of a pause with ground truth; None if unknown."""
+        """The questions of a pause with ground truth; None if the truth is unknown."""
         pairs = self._truth(t).get("questions")
         return Questions(self._truth(t)["labels"].shape, *pairs) if pairs is not None and pairs.size else None
 
@@ -360,7 +360,7 @@ class RunFolder:
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed.
 
-        The state is kept in `scene_cache`, since a report uses it many times.
+        The state is kept in `scene_cache`, because a report reads the state many times.
         """
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"):
@@ -369,7 +369,7 @@ class RunFolder:
         return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
 
     def estimates(self) -> list[PauseEstimate]:
-        """The weighted hypotheses of all pauses, to be scored by `mstfilter.scoring.score_pauses`."""
+        """The weighted hypotheses of all pauses, the input of `mstfilter.scoring.score_pauses`."""
         run, found = self.check(), []
         if run.n_pauses == 0:
             raise InputError(f"{self.path}: the run has no complete pause yet")

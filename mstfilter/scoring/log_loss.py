@@ -10,7 +10,7 @@ have no uncertainty of shape. Noise at the borders of objects makes wrong foreca
 therefore recalibrated by isotonic regression, fitted to other scenes. The score is the mean log loss in nats; lower is
 better. Before recalibration, the score itself adds noise at the borders if noise lowers the loss on the other scenes.
 So a method gains nothing by adding noise at the borders (`experiments/information` shows this for all methods). The
-score compares how well forecasts distinguish true and false questions. Noise of another kind, or noise at a higher
+score measures how well forecasts distinguish the answers yes and no. Noise of another kind, or noise at a higher
 rate than the largest of `NOISE_RATES`, can still give a small gain.
 """
 
@@ -51,7 +51,7 @@ class BeliefScore(NamedTuple):
 
     @property
     def base_rate_loss(self) -> float:
-        """Log loss, in nats, of a constant forecast that equals the share of true questions."""
+        """Log loss, in nats, of a constant forecast that equals the share of answers yes."""
         table = forecast_table(self.counts[0].astype(np.int64))
         if not table.n:
             return float("nan")

@@ -8,8 +8,8 @@ segmentation. Weighted coverage averages J by size:
 Weighted coverage has three forms:
 
 ``objects`` (default)
-    Only objects are regions; label 0 is not. ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V_A and V_B are
-    the volumes of all objects. The form is symmetric. Missing, invented, split and merged objects reduce the quality.
+    Only objects are regions; label 0 is no region. ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V is the
+    volume of all objects. The form is symmetric. Missing, invented, split and merged objects reduce the quality.
 ``paper``
     The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
     Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.

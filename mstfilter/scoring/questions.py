@@ -174,7 +174,7 @@ def ask(recording: Recording, t: int, n: int = N_QUESTIONS) -> Questions:
     Returns
     -------
     Questions
-        Empty if fewer than two voxels are in question.
+        Empty if no two voxels in question are near each other.
     """
     check_integer("number of questions", n)
     if not 0 <= t < len(recording.pauses):
