@@ -1,7 +1,7 @@
 """Scores of forecasts: Brier score, log loss, calibration, recalibration.
 
-A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. The
-table has how often each value of p was given, and how often the event then occurred. Tables can be pooled.
+A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. For each
+value of p, the table has the numbers of forecasts without and with the event. Tables can be pooled.
 
 >>> import numpy as np
 >>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])
@@ -11,8 +11,8 @@ table has how often each value of p was given, and how often the event then occu
 >>> fit(np.array([0.2, 0.9])).tolist()
 [0.5, 0.999]
 
-A score is proper if no other forecast has a lower expected score than the true distribution. Brier score and log loss
-are proper.
+A score is proper if no forecast has a lower expected score than the true probability. Brier score and log loss are
+proper.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SOFTENING = 0.02  # e of p <- (1 - e) p + e / 2, so that a forecast of 0 or 1 ha
 
 @dataclass(frozen=True, eq=False)
 class ForecastTable:
-    """How often each forecast was given, and how often the event then occurred.
+    """A table of the numbers of outcomes 0 and 1 of each distinct forecast.
 
     Parameters
     ----------
@@ -86,9 +86,9 @@ class ForecastTable:
         return self._mean(self.no * self.p**2 + self.yes * (1 - self.p) ** 2)
 
     def log_loss(self, softening: float = 0.0) -> float:
-        """Mean of -log of the probability given to the outcome, in nats; infinite if an outcome had probability 0.
+        """Mean of -log of the forecast probability of the outcome, in nats; infinite if an outcome had probability 0.
 
-        With a softening e, p is replaced by (1 - e) p + e / 2.
+        A `softening` e replaces p by (1 - e) p + e / 2.
         """
         p = (1 - softening) * self.p + softening / 2
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -104,7 +104,7 @@ class ForecastTable:
     def reliability(self, n_bins: int = 10) -> Reliability:
         """The reliability diagram on bins of equal numbers of forecasts.
 
-        Equal forecasts stay in one bin, so the sizes of bins differ where a forecast is frequent.
+        Equal forecasts stay in one bin, so a frequent forecast makes bins of different sizes.
         """
         middle = np.cumsum(self.count) - self.count / 2  # rank of each forecast
         which = np.minimum((n_bins * middle / max(self.n, 1e-300)).astype(np.int64), n_bins - 1)
@@ -125,9 +125,9 @@ class Reliability:
     forecast : (b,) float
         Mean forecast of each bin.
     frequency : (b,) float
-        Share of the forecasts in the bin whose event occurred.
+        Share of the forecasts in the bin for which the event occurred.
     count : (b,) float
-        Number of forecasts.
+        Number of forecasts in each bin.
     """
 
     forecast: np.ndarray

@@ -1,4 +1,4 @@
-"""Files that are part of the package: presets, weights and their training (`models/`), example components.
+"""Files that are part of the package: presets, weights, training programs (`models/`) and example components.
 
 >>> models_folder() / "mst.toml"
 >>> examples_folder() / "resampler.py"
@@ -15,23 +15,23 @@ from types import ModuleType
 
 from mstfilter.errors import InputError, suggestion
 
-BASE = "base"  #: What `mst` and its baselines share; not a preset, since it has no update
+BASE = "base"  #: The common parts of `mst` and its baselines; not a preset, because `base` has no update
 
 
 def models_folder() -> Path:
-    """The folder that holds presets and weights."""
+    """The folder of presets and weights."""
     return _folder_with("mst.toml", "_models", "models")
 
 
 def examples_folder() -> Path:
-    """The folder that holds the example components of the documentation, and their tests."""
+    """The folder of the example components of the documentation, and of the tests of the example components."""
     return _folder_with("resampler.py", "_examples", "docs/examples")
 
 
 def training_program(name: str) -> ModuleType:
     """A module of `models/mst_training`, which contains the programs that trained the weights.
 
-    The folder stays in `sys.path`, so that processes which a training starts find the module.
+    The folder stays in `sys.path`, so that processes started by a training find the module.
     """
     folder = str(models_folder())
     if folder not in sys.path:
@@ -50,12 +50,12 @@ def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
 
 
 def preset_names() -> list[str]:
-    """Presets of the package, without `base`, which they extend."""
+    """Names of the presets of the package, without `base`."""
     return sorted({path.stem for path in models_folder().glob("*.toml")} - {BASE})
 
 
 def find_preset(name: str, to_extend: bool = False) -> Path:
-    """The TOML file of a preset, by name or path. `base` is found only if it is to be extended."""
+    """The TOML file of a preset, by name or path. `base` is found only with `to_extend`."""
     given = Path(name)
     if given.suffix == ".toml":
         if given.is_file():

@@ -1,4 +1,4 @@
-"""Trained networks on disk: a folder with weights (safetensors), their description (TOML) and a card.
+"""Trained networks on disk: a folder with weights (safetensors), a description (TOML) and a model card.
 
 >>> model = open_model("completion")              # of the package; or the path of a folder
 >>> model.description["network"], model.tensors["head.bias"].shape
@@ -51,7 +51,7 @@ class TrainedModel:
 
 
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
-    """The model of the package with this name, or else the model in this folder.
+    """The model of the package with this name, or else the model in the folder with this path.
 
     Raises InputError if the model is missing, damaged, or of another architecture.
     """
@@ -113,7 +113,7 @@ def calibrated_network(
 
 
 def write_model(folder: str | Path, description: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> None:
-    """Write weights in half precision, and their description with the hash."""
+    """Write weights in half precision, and the description with the hash of the weights."""
     from safetensors.numpy import save
 
     data = save({name: np.ascontiguousarray(value, dtype=np.float16) for name, value in tensors.items()})
@@ -124,7 +124,7 @@ def write_model(folder: str | Path, description: Mapping[str, Any], tensors: Map
 
 
 def _toml(values: Mapping[str, Any]) -> str:
-    """Plain values first, then one table for each mapping."""
+    """The text of a TOML file: plain values first, then one table for each mapping."""
     lines = [f"{key} = {_value(value)}" for key, value in values.items() if not isinstance(value, Mapping)]
     for key, table in values.items():
         if isinstance(table, Mapping):
@@ -133,5 +133,5 @@ def _toml(values: Mapping[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    """A value in TOML, whose strings, numbers, booleans and lists have the syntax of JSON."""
+    """The text of a value in TOML. Strings, numbers, booleans and lists have the same syntax in TOML and JSON."""
     return json.dumps(value, ensure_ascii=False, default=lambda number: number.item())

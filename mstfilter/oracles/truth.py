@@ -137,7 +137,7 @@ class UsesTruth:
 
 
 def uses_truth(component: Any) -> list[str]:
-    """Class names of all parts of a component that use the truth, in order; the component is one of its parts."""
+    """Class names of the component and its nested components, in order, without classes that use no truth."""
     return [type(part).__name__ for part in nested_components(component) if isinstance(part, UsesTruth)]
 
 

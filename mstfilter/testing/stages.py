@@ -117,7 +117,7 @@ class StageContract(Contract):
 
     @prerequisite
     def test_works_in_its_place(self) -> None:
-        """The filter step that uses the component returns hypotheses, also for hypotheses without objects."""
+        """The filter step that uses the component returns hypotheses, also if no hypothesis has objects."""
         inputs = self.inputs(2)
         grid = inputs["observation"].grid
         empty = Hypothesis.from_labels(np.zeros(grid.shape, np.uint16), grid)
