@@ -200,7 +200,7 @@ def exhausted(error: BaseException) -> InputError | None:
 
 
 def describe_error(error: BaseException) -> str:
-    """One line for an exception: type, message, and, if known, the line of a user's file that raised the exception."""
+    """One line for an exception: type, message, and, if known, the line of a user's file that raised the error."""
     if isinstance(error, InputError):
         return error.message
     place = place_in_user_file(error)

@@ -12,8 +12,8 @@
 Traceback (most recent call last):
 mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
 
-Fields with three kinds of annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded`,
-such as the interface of a component, alone or as ``Interface | None``. Other annotations are not checked.
+Fields with three kinds of annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of
+`Bounded`, such as the interface of a component, alone or as ``Interface | None``. Other annotations are not checked.
 
 After the checks of single fields, ``__post_init__`` is called and can check conditions on several fields.
 """

@@ -99,8 +99,8 @@ def _place(partial: Path, target: Path, existing: str) -> None:
 def locked(path: str | Path) -> Iterator[None]:
     """Reserve a file or folder, which need not exist, for this block. Removes temporary files of killed processes.
 
-    Raises InputError if another block or process has reserved `path`. The lock is a file ``.NAME.lock`` beside `path`.
-    The system releases the lock when the process ends. On file systems without locks, paths are not reserved.
+    Raises InputError if another block or process has reserved `path`. The lock is a file ``.NAME.lock`` beside
+    `path`. The system releases the lock when the process ends. On file systems without locks, paths are not reserved.
     """
     target = Path(os.path.realpath(path))
     if _is_temporary(target.absolute()):  # no other process knows the name
@@ -280,8 +280,8 @@ def writing(what: str, *hints: str) -> Iterator[None]:
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
-    An existing folder must be empty, unless `empty` is false. A file is made and removed for each missing name, because
-    permissions alone do not show read-only file systems, long names, or a full disk.
+    An existing folder must be empty, unless `empty` is false. A file is made and removed for each missing name,
+    because permissions alone do not show read-only file systems, long names, or a full disk.
     """
     if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")

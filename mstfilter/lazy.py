@@ -5,9 +5,9 @@ The ``__init__.py`` of a package has its documentation and two lines::
     from mstfilter.lazy import attach
     __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-The stub ``__init__.pyi`` lists the public names, with one ``from module import name as name`` statement per module. Type
-checkers read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera`` imports
-only the module of `Camera` (the scheme of Scientific Python's SPEC 1).
+The stub ``__init__.pyi`` lists the public names, with one ``from module import name as name`` statement per module.
+Type checkers read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera``
+imports only the module of `Camera` (the scheme of Scientific Python's SPEC 1).
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def _equal(a: Any, b: Any) -> bool:
 def late(location: str, summary: str) -> Callable[..., Any]:
     """A method that calls ``module:function`` and imports the module at the first call.
 
-    Methods that draw and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend on
-    `mstfilter.report` and `mstfilter.formats`.
+    Methods that draw and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend
+    on `mstfilter.report` and `mstfilter.formats`.
     """
     module, _, name = location.partition(":")
 

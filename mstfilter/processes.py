@@ -3,9 +3,9 @@
 >>> with environment(OMP_NUM_THREADS="1"):
 ...     pool = ProcessPoolExecutor(2)
 
-A new Python interpreter puts the working folder first in its module search path. So a file ``multiprocessing.py`` in a
-folder with unknown files would be executed. Processes that are started in the block do not search the working folder
-first. They find the modules of the caller, because `multiprocessing` and joblib pass on the search path.
+A new Python interpreter puts the working folder first in its module search path. So a file ``multiprocessing.py`` in
+a folder with unknown files would be executed. Processes that are started in the block do not search the working
+folder first. They find the modules of the caller, because `multiprocessing` and joblib pass on the search path.
 """
 
 from __future__ import annotations

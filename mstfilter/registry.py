@@ -1,7 +1,7 @@
 """Finds components by name, and builds components from a configuration.
 
-A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class that
-components of this kind inherit. ``__components__`` maps names to classes, or to ``/path/of/file.py:Class``::
+A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class
+that components of this kind inherit. ``__components__`` maps names to classes, or to ``/path/of/file.py:Class``::
 
     __interfaces__ = {"resampler": "Resampler"}
     __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
@@ -175,7 +175,6 @@ class Registry:
         """Build a dataclass from plain values and nested components.
 
         Fields that are not given have the values of `base`.
-
         Raises InputError if a field or a component is unknown, or a value does not fit its field.
         """
         prefix = f"{where}: " if where else ""
@@ -325,7 +324,7 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """Location ``package:Class`` or ``file.py:Class`` of a class. Classes of mstfilter belong to their top package."""
+    """Location ``package:Class`` or ``file.py:Class``. Classes of mstfilter belong to their top package."""
     if "__mst_file__" in vars(cls):
         return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
@@ -414,7 +413,7 @@ def _reduce(instance: object, protocol: Any) -> Any:
 
 
 def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """An instance, without its state, of a class in a user's file. The file must have the content with this digest."""
+    """An instance without its state of a class in a user's file. The content of the file must have the digest."""
     module = _MODULES.get((Path(path), digest)) or load_file(path)
     cls = getattr(module, name)
     if cls.__mst_source__ != digest:

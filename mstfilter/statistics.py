@@ -10,10 +10,10 @@
 Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent. So values of
 several filter seeds on one scene are averaged first. A difference has a t interval, a studentised bootstrap interval,
 and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume
-that the differences are symmetric about zero under the null hypothesis. Differences of squared errors are often skewed.
-So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is small. `p_claim` is the larger
-p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method. `experiments/comparison` has
-the error rates and the power of the rule for claims.
+that the differences are symmetric about zero under the null hypothesis. Differences of squared errors are often
+skewed. So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is small. `p_claim` is
+the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method.
+`experiments/comparison` has the error rates and the power of the rule for claims.
 """
 
 from __future__ import annotations

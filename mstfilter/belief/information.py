@@ -1,8 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
 An action has one outcome under each hypothesis. The expected information of an action is the mutual information
-between the hypothesis and the outcome. The hypothesis determines the outcome, so the mutual information is the entropy
-of the distribution of the outcomes. The entropy of the weights is an upper bound.
+between the hypothesis and the outcome. The hypothesis determines the outcome, so the mutual information is the
+entropy of the distribution of the outcomes. The entropy of the weights is an upper bound.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells

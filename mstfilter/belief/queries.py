@@ -172,10 +172,10 @@ class Belief:
     def same_object(self, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two voxels belong to the same object.
 
-        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object k_i(v)
-        at voxel v, with probability o_i(v) (`Hypothesis.shares`). An object with a voxel is assumed to contain all its
-        more probable voxels. `a` and `b` (..., 3) are broadcast against each other. If a = b, the result is the
-        occupancy. If b has all voxels, the result is the extent of the object at a.
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
+        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). An object with a voxel is assumed to contain
+        all its more probable voxels. `a` and `b` (..., 3) are broadcast against each other. If a = b, the result is
+        the occupancy. If b has all voxels, the result is the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -207,8 +207,8 @@ class Belief:
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
-        The entropy of a face is ``H(S | B) = P(B) h(P(S | B))`` with ``h(p) = -p log p - (1 - p) log(1 - p)``. B means
-        that both voxels at the face are occupied, and S that one object occupies both voxels. The entropy of
+        The entropy of a face is ``H(S | B) = P(B) h(P(S | B))`` with ``h(p) = -p log p - (1 - p) log(1 - p)``. B
+        means that both voxels at the face are occupied, and S that one object occupies both voxels. The entropy of
         occupancy, H(B), is not included: H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
@@ -251,8 +251,8 @@ class Belief:
         """Borders in the image across which the hypotheses disagree, the most uncertain one first.
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
-        between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label images.
-        Parts of less than 200 pixels (in an image of 640 x 480) belong to the nearest larger part.
+        between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label
+        images. Parts of less than 200 pixels (in an image of 640 x 480) belong to the nearest larger part.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
         refined = self._refined_image(camera)
@@ -403,7 +403,7 @@ def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Different cells a < b (m,) of pairs of neighbouring pixels of an image (H, W), and one pixel (m, 2) of a pair."""
+    """Different cells a < b (m,) at pairs of neighbouring pixels of an image (H, W), and one pixel (m, 2) of each."""
     found = []
     for axis in (0, 1):
         one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))

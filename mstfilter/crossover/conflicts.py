@@ -288,8 +288,8 @@ def merge_probability(
 ) -> np.ndarray:
     """Probability that a child object is merged into its parent, elementwise.
 
-    The docstring of the module has the formulas. `intersection`, `child` and `parent` are the numbers of voxels in the
-    intersection, in the child, and in the parent.
+    The docstring of the module has the formulas. `intersection`, `child` and `parent` are the numbers of voxels in
+    the intersection, in the child, and in the parent.
     """
     common, n1, n2 = (np.asarray(a, dtype=np.float64) for a in (intersection, child, parent))
     match rule:

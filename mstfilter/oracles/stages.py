@@ -10,8 +10,8 @@ The time of an observation is the index of its clip. A resampler gets no clip. S
 are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best candidates.
 
 Replacing one stage by its oracle shows the gain from a perfect stage in the present filter. Replacing all stages but
-one shows the loss from this stage in an otherwise perfect filter. The gain and the loss are not equal, because a stage
-can correct errors of another stage.
+one shows the loss from this stage in an otherwise perfect filter. The gain and the loss are not equal, because a
+stage can correct errors of another stage.
 """
 
 from __future__ import annotations

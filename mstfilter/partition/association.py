@@ -100,7 +100,7 @@ class Overlaps:
         return sorted(found)
 
     def tracks(self, component: ConflictComponent) -> dict[int, list[int]]:
-        """The predicted objects that each segment of a component continues, by decreasing number of shared readings."""
+        """The predicted objects that each segment of a component continues, by decreasing number of readings."""
         continued: dict[int, list[int]] = {segment: [] for segment in component.segments}
         for predicted in component.objects:
             segment = self.continued_by(predicted, component)

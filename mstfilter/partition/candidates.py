@@ -10,9 +10,9 @@ objects k of the prediction that stay (e_k = 1). The probability of a candidate 
 
     w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}.
 
-The components are independent given the prediction. Therefore the factors are multiplied one after the other, and only
-the n largest products are kept after each factor (`largest_products`). The probabilities of all candidates sum to 1.
-The total probability of the candidates that are left out is reported as the *discarded mass*.
+The components are independent given the prediction. Therefore the factors are multiplied one after the other, and
+only the n largest products are kept after each factor (`largest_products`). The probabilities of all candidates sum
+to 1. The total probability of the candidates that are left out is reported as the *discarded mass*.
 """
 
 from __future__ import annotations

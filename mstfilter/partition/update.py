@@ -16,22 +16,23 @@ frame. The voxels of an object are estimated again from all observations of the 
    at each reading. The samples and prediction j give the odds that two readings belong to one object. The odds
    determine the probabilities of the partitions of each part of the image (`mstfilter.partition.cells`). A candidate
    consists of a prediction j and one partition of each part. The weight of a candidate is w_j Q_j^lambda times the
-   probabilities of its partitions (`mstfilter.partition.candidates`). Only the most probable candidates are described.
-   The resampler of the filter selects some candidates, and only selected candidates are completed. In the paper, each
-   sample is crossed with each prediction.
+   probabilities of its partitions (`mstfilter.partition.candidates`). Only the most probable candidates are
+   described. The resampler of the filter selects some candidates, and only selected candidates are completed. In the
+   paper, each sample is crossed with each prediction.
 3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each *component* of the
-   graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. If an object is split,
-   at most one segment continues the object, and the other segments are new objects. In the paper, merges are drawn at
-   random. In this update, the partition determines the merges.
+   graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. If an object is
+   split, at most one segment continues the object, and the other segments are new objects. In the paper, merges are
+   drawn at random. In this update, the partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
    probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
-   the object's voxels that the frame does not observe as free. A_j tests the whole prediction, and q tests the object.
+   the object's voxels that the frame does not observe as free. A_j tests the whole prediction, and q tests the
+   object.
 5. **Completion.** An object keeps its views, which are its observations in earlier frames
-   (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the views
-   of the predicted objects that the visible object continues. An occluded object is completed from its views only. The
-   completer drops views that contradict the frame. An object without any voxel is removed. Completions of earlier
-   pauses are not used again, with one exception. If the completer does not use views, an occluded object has no views
-   and keeps its predicted voxels outside free space.
+   (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
+   views of the predicted objects that the visible object continues. An occluded object is completed from its views
+   only. The completer drops views that contradict the frame. An object without any voxel is removed. Completions of
+   earlier pauses are not used again, with one exception. If the completer does not use views, an occluded object has
+   no views and keeps its predicted voxels outside free space.
 
 At the first pause the candidates are the distinct samples, so every segment is a new object. A hypothesis contains
 only objects that some frame has shown.

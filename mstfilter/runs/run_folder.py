@@ -1,4 +1,4 @@
-"""The folder of a run, written pause by pause. Reports read the folder, and an interrupted run resumes from the folder.
+"""The folder of a run, written pause by pause. Reports and interrupted runs read the folder.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
@@ -290,10 +290,7 @@ class RunFolder:
             )
 
     def repair(self) -> None:
-        """Prepare the folder for resuming. Remove remains of a killed process, and damaged pauses with a warning.
-
-        All pauses after a damaged pause are removed.
-        """
+        """Prepare for resuming: remove temporary files, and with a warning the first damaged and all later pauses."""
         sweep(self.path)
         sweep(self.path / "pauses")
         good = 0

@@ -9,8 +9,8 @@ Unless stated otherwise, a metric is the unweighted mean over the hypotheses, me
 ``quality_paper``, ``quality_authors``: the other forms (see `mstfilter.scoring`). ``quality_top``,
 ``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean, and maximum.
 Maxima are comparable only for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least
-expected loss (`least_loss`). ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true objects
-that are visible at this pause, that were visible only at earlier pauses, and that never were visible
+expected loss (`least_loss`). ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true
+objects that are visible at this pause, that were visible only at earlier pauses, and that never were visible
 (`mstfilter.scoring.object_status`). ``quality_one_blob``, ``quality_components``: trivial baselines, with the
 occupied voxels as one object or as their connected components. ``occupancy``: intersection over union of the occupied
 voxels. ``volume_missed``, ``volume_invented``: volume that is occupied only in the truth, and only in the hypothesis,
@@ -132,8 +132,8 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
 def object_metrics(table: Overlap) -> dict[str, float]:
     """Metrics of the objects of one hypothesis against the truth, by name. Rows of `table` are the hypothesis.
 
-    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Each of these
-      objects has at least a tenth of the true object's size.
+    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. The objects
+      of the hypothesis have at least a tenth of the true object's size.
     - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
     - *missed*: true objects of which no hypothesis object contains more than half, and that contain more than half of
       no hypothesis object.

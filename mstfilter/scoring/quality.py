@@ -22,8 +22,8 @@ Weighted coverage has three forms:
 >>> weighted_coverage(a, b)
 0.5
 
-`one_blob` and `connected_components` are trivial baselines that are shown beside every quality. Trivial baselines keep
-the occupied voxels of a hypothesis and change only the object labels. A filter that is not better than a trivial
+`one_blob` and `connected_components` are trivial baselines that are shown beside every quality. Trivial baselines
+keep the occupied voxels of a hypothesis and change only the object labels. A filter that is not better than a trivial
 baseline detects occupied space but not objects.
 
 >>> object_status(recording, 2)  # doctest: +SKIP

@@ -9,10 +9,11 @@ answer has a better expected score than the true probabilities.
 >>> y = questions.outcomes(recording.truth(2))                 # bool
 >>> float(np.mean((p - y) ** 2))                               # Brier score
 
-**Distribution of the questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above the
-table. The depth images of pause t do not observe the voxel as free. The voxel is on a depth reading above the table, or
-up to 10 cm behind a reading along the camera's z axis, at pause t or earlier. The first voxel u of a question is
-uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels of u.
+**Distribution of the questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above
+the table. The depth images of pause t do not observe the voxel as free. The voxel is on a depth reading above the
+table, or up to 10 cm behind a reading along the camera's z axis, at pause t or earlier. The first voxel u of a
+question is uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels
+of u.
 
 **Noise at the border.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns the
 forecasts of the hypotheses with noise. With probability e, each voxel independently takes the label of one of its six
@@ -21,10 +22,10 @@ neighbours. Only voxels at a border change. The expectation over the noise is co
     p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]
 
 The voxel u' is u with probability 1 - e, and otherwise one of the six neighbours of u (u itself beyond the grid). The
-voxel v' is defined in the same way. o_i,v(k) is the probability that object k fills voxel v according to hypothesis i.
-The probability comes from the occupancy, or is 1 for the label of a hypothesis without probabilities. The minimum is
-the probability that the object fills both voxels if the object is a level set {v : o(v) >= U} with one uniform U. On
-six tuning scenes, the log loss with level sets is .004 nats lower than with independent voxels.
+voxel v' is defined in the same way. o_i,v(k) is the probability that object k fills voxel v according to hypothesis
+i. The probability comes from the occupancy, or is 1 for the label of a hypothesis without probabilities. The minimum
+is the probability that the object fills both voxels if the object is a level set {v : o(v) >= U} with one uniform U.
+On six tuning scenes, the log loss with level sets is .004 nats lower than with independent voxels.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ class Questions:
 
     @cached_property
     def _voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distinct voxels (k,), the index (2 m,) of each first and second voxel in this list, and neighbours (6, k)."""
+        """Distinct voxels (k,), the index (2 m,) of each first and second voxel in them, and neighbours (6, k)."""
         voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
         return voxels, place, _neighbours(voxels, self.shape)
 

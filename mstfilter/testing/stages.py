@@ -189,7 +189,7 @@ def _on_surface(filled: list[np.ndarray], seen: list[ObservedBox], axes: tuple[i
 
 
 def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool = False) -> list[ObservedBox]:
-    """The boxes of a hypothesis's objects in the first frame; with `cut`, of the half of each mask above a diagonal."""
+    """The boxes of the objects of a hypothesis in the first frame. `cut` keeps the half of a mask above a diagonal."""
     image, _ = render_hypothesis(hypothesis, clip.before.camera)
     masks = [image == k for k in np.unique(image[image > 0])]
     if cut:

@@ -28,10 +28,11 @@ def _folder(target: str) -> Path:
 
 
 def write_starter(kind: str, path: Path, target: str = "") -> list[str]:
-    """Write a working, commented component of one of `starter_kinds`. Returns commands that test and run the component.
+    """Write a working, commented component of a kind in `starter_kinds`. Returns commands that test and run it.
 
-    `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if a starting file
-    for scenes exists. Raises InputError if no starting file exists, the name cannot be imported, or `path` exists.
+    `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if a starting
+    file for scenes exists. Raises InputError if no starting file exists, the name cannot be imported, or `path`
+    exists.
     """
     check_choice("the target", target or "scenes", _TARGETS)
     kinds = starter_kinds(target)
