@@ -143,9 +143,9 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
 
 
 def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
-    """The error for a library that cannot be imported, with the part `what` that needs it and how to install it.
+    """The error for a library that cannot be imported, although `what` needs the library.
 
-    `library` is the name of the library. The default is the module in the exception.
+    `library` is the name of the library. By default, the library is the module in the exception.
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
@@ -171,7 +171,7 @@ _PACKAGES = {
 
 
 def place_in_user_file(error: BaseException) -> str | None:
-    """``FILE, line N: TEXT`` for the line of a user's file that raised an exception; None if there is no such line.
+    """``FILE, line N: text`` for the line of a user's file that raised an exception; None if there is no such line.
 
     The line is in the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this
     package nor to an installed library. For a syntax error, the line is in the file that the error names.
@@ -215,6 +215,6 @@ def _is_of_user(file: str) -> bool:
 
 
 def short_path(file: str | Path) -> str:
-    """A path relative to the working folder if it is inside this folder."""
+    """A path, relative to the working folder if the path is inside the working folder."""
     path = Path(file).resolve()
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

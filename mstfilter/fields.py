@@ -35,7 +35,7 @@ from mstfilter.errors import InputWarning, check_choice, check_component, check_
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. An int has only `at_least` and `at_most`."""
+    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. For an int, use only `at_least` and `at_most`."""
 
     above: float = -math.inf
     at_least: float = -math.inf

@@ -161,7 +161,7 @@ def _lock(path: Path, flags: int) -> int | None:
 def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> None:
     """Remove temporary files of ended processes in a folder, for the file `name` or for all files.
 
-    If a process was killed while it replaced a folder, the earlier folder gets its name back. Give a minimum age
+    If a process was killed while it replaced a folder, the earlier folder gets its name back. Give `older_than_s`
     unless the name is locked, because another process may just have made a temporary file.
     """
     for path in folder.iterdir() if folder.is_dir() else ():
@@ -209,7 +209,7 @@ def _make_folders(folder: Path) -> list[Path]:
 def _sync(target: Path, *paths: Path) -> None:
     """Wait until files, and the names in folders, are stored on the disk.
 
-    If `target`, the final place of the files, is in a temporary folder, that folder syncs the files when complete.
+    If the final place `target` of the files is in a temporary folder, the complete folder is synced instead.
     """
     if os.name != "posix" or _is_temporary(target.absolute()):
         return
@@ -249,7 +249,7 @@ def _fault(file: Path, digest: str) -> str:
 
 @contextmanager
 def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
-    """Convert errors in a block that reads a file to InputError. `kind` names the thing to which the file belongs."""
+    """Convert errors in a block that reads a file to InputError. `kind` names the data, such as "a run folder"."""
     try:
         with naming(str(path)):
             yield
@@ -321,7 +321,7 @@ def _try_to_write(folder: Path, temporary: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8) in one step."""
+    """Write a text file (UTF-8) atomically."""
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="")
 
@@ -332,7 +332,7 @@ def write_csv(
     columns: Iterable[str] | None = None,
     float_format: str = "",
 ) -> None:
-    """Write rows as CSV in one step. None and NaN are written as empty cells.
+    """Write rows as CSV atomically. None and NaN are written as empty cells.
 
     `columns` are written in the given order. The default is all columns in the order of first appearance. An example
     of `float_format` is ``.6g``. The default format writes all digits.

@@ -11,8 +11,7 @@ value of p, the table has the numbers of forecasts without and with the event. T
 >>> fit(np.array([0.2, 0.9])).tolist()
 [0.5, 0.999]
 
-A score is proper if no forecast has a lower expected score than the true probability. Brier score and log loss are
-proper.
+A score is proper if the true probability has the lowest expected score. Brier score and log loss are proper.
 """
 
 from __future__ import annotations
@@ -65,14 +64,14 @@ class ForecastTable:
 
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
-        """All forecasts of several tables."""
+        """A table of all forecasts of several tables."""
         p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
         count = no + yes
         return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)
 
     @cached_property
     def count(self) -> np.ndarray:
-        """(k,) number of forecasts of each value."""
+        """Number (k,) of times that each forecast was given."""
         return self.no + self.yes
 
     @property
@@ -97,7 +96,7 @@ class ForecastTable:
         return self._mean(loss)
 
     def with_forecasts(self, p: np.ndarray) -> ForecastTable:
-        """The same outcomes with other forecasts p (k,)."""
+        """A table of the same outcomes with other forecasts p (k,)."""
         share = np.divide(self.yes, self.count, out=np.zeros_like(self.yes), where=self.count > 0)
         return ForecastTable.of(p, share, self.count)
 

@@ -30,7 +30,7 @@ def exported(init: str | Path) -> dict[str, str]:
 
 
 def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose stub lists its public names."""
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package with a stub that lists the public names."""
     modules = exported(init)
     names = sorted(modules)
 
@@ -83,7 +83,7 @@ def late(location: str, summary: str) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> Iterator[Callable[..., None]]:
-    """The function to call with progress. If `progress` is True, it updates a bar of `mstfilter.report.progress`.
+    """The function that reports progress: of a bar of `mstfilter.report.progress` if `progress` is True.
 
     Otherwise the function is `progress` itself, or a function without effect if `progress` is False.
     """

@@ -1,17 +1,17 @@
-"""Presets, which are assembled filters with names.
+"""Presets, which are assembled filters that have names.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst")
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
-``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
-TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset, or
-``models/base.toml``, which has the common parts of `mst` and its baselines:
+``mst`` is the default, ``paper`` is the published algorithm, and ``authors`` is the program of its authors. A preset
+is a TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset,
+or ``models/base.toml``, which has the common parts of `mst` and its baselines:
 
     base = "base"                           # the base sets the fields that are not named in this file
 
     transition = "identity"                 # naming a component resets its fields
-    proposal.completer = "extrude"          # naming a field keeps the others
+    proposal.completer = "extrude"          # naming a field keeps the other fields
 
     wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
 

@@ -5,7 +5,7 @@
 
 A new Python interpreter puts the working folder first in its module search path. So a file ``multiprocessing.py`` in
 a folder with unknown files would be executed. Processes that are started in the block do not search the working
-folder first. They find the modules of the caller, because `multiprocessing` and joblib pass on the search path.
+folder first. New processes find the caller's modules, because `multiprocessing` and joblib pass on the search path.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def together(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]
 def each(function: Callable[[_A], _B], items: Iterable[_A]) -> list[_B]:
     """The results of a function for several items, computed two at a time in a block `parallel`.
 
-    The calls are independent and free of side effects.
+    The calls must be independent and free of side effects.
     """
     given = list(items)
     found: dict[int, _B] = {}

@@ -43,7 +43,7 @@ _Model = TypeVar("_Model", bound="BaseModel")
 def open_regular(path: str | Path, limit: int | None = None) -> Iterator[io.BufferedReader]:
     """A regular file of at most `limit` bytes, opened for reading. Raises InputError for other files.
 
-    The default of all limits is `MAX_FILE`.
+    The default of `limit` is `MAX_FILE`.
     """
     # Without O_NONBLOCK the call waits for the other end of a pipe.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))

@@ -1,7 +1,7 @@
 """Finds components by name, and builds components from a configuration.
 
 A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class
-that components of this kind inherit. ``__components__`` maps names to classes, or to ``/path/of/file.py:Class``::
+that the components inherit. ``__components__`` maps kinds to names, and names to classes or ``/a/file.py:Class``::
 
     __interfaces__ = {"resampler": "Resampler"}
     __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
@@ -413,7 +413,7 @@ def _reduce(instance: object, protocol: Any) -> Any:
 
 
 def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """An instance without its state of a class in a user's file. The content of the file must have the digest."""
+    """An instance without its state. The user's file of the class must have the hash `digest`."""
     module = _MODULES.get((Path(path), digest)) or load_file(path)
     cls = getattr(module, name)
     if cls.__mst_source__ != digest:

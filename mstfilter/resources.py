@@ -3,7 +3,8 @@
 >>> models_folder() / "mst.toml"
 >>> examples_folder() / "resampler.py"
 
-In a wheel, both folders are inside the package. In a checkout or an editable install, they are beside the package.
+In a wheel, the folders of models and examples are inside the package. In a checkout or an editable install, the
+folders of models and examples are beside the package.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def training_program(name: str) -> ModuleType:
 
 
 def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
-    """A folder inside the installed package, or beside it in a checkout."""
+    """A folder inside the installed package, or beside the package in a checkout."""
     package = Path(__file__).resolve().parent
     folders = (package / installed, package.parent / in_checkout)
     for folder in folders:

@@ -1,7 +1,7 @@
 """Checks of the results of components' methods.
 
-An interface states the check of a result beside the method. The check applies to every class that defines the method.
-The error of a failed check names the class, the file and the line of the method:
+An interface declares the check of a result beside the method. The check applies to every class that defines the
+method. The error of a failed check names the class, the file and the line of the method:
 
 >>> class Score(Checked):
 ...     @returns(lambda self, found, particles: check_array(found, (len(particles),)))
@@ -12,7 +12,7 @@ The error of a failed check names the class, the file and the line of the method
 >>> Mine().score((1, 2))                       # doctest: +SKIP
 InputError: Mine.score (mine.py, line 2) returns a list, expected an array of shape (2,)
 
-A method that changes its read-only input is reported in the same way.
+The error of a method that changes its read-only input has the same form.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ and the p values of a sign-flip test and of the studentised bootstrap. The t int
 that the differences are symmetric about zero under the null hypothesis. Differences of squared errors are often
 skewed. So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is small. `p_claim` is
 the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method.
-`experiments/comparison` has the error rates and the power of the rule for claims.
+`experiments/comparison` has the error rates and the power of this test procedure.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Difference:
     p : float
         Two-sided p value of the sign-flip test; NaN for one unit.
     n : int
-        Number of units that both arms have.
+        Number of units with a value in both arms.
     p_holm : float
         `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
@@ -72,7 +72,7 @@ class Difference:
         """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
         A small sample of skewed differences often has no values from the longer tail. The factor corrects the p value
-        for the missing tail and was chosen by simulation in `experiments/comparison`.
+        for this missing tail. The factor was chosen by simulation in `experiments/comparison`.
         """
         return float(np.minimum(1, np.fmax(self.p, self.p_bootstrap) * (1 + abs(self.skewness))))
 
@@ -226,7 +226,7 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
     Returns
     -------
     dict
-        Mapping from arms to `Difference`, without the reference.
+        Mapping from arms, without the reference, to `Difference`.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")

@@ -4,8 +4,8 @@
 >>> model.description["network"], model.tensors["head.bias"].shape
 >>> write_model(folder, {"architecture": "completion-unet", "network": {...}}, tensors)
 
-`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder whose files do not match
-is refused. Weights are stored in half precision. Nothing is unpickled.
+`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder is refused if its files
+do not match. Weights are stored in half precision. No file is unpickled.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
 def calibrated_network(
     model: TrainedModel, channels: Sequence[str], build: Callable[[Mapping[str, Any]], Any]
 ) -> tuple[Any, float, float]:
-    """The torch network of a model, ready for use, and the scale and shift of its logits.
+    """The torch network of a model with its weights, and the scale and shift of the network's logits.
 
     ``build(values)`` makes the network from the table ``network`` of the description. Raises InputError if the
     description is incomplete, was made for other input channels, or does not match the weights.

@@ -2,7 +2,7 @@
 
 An action has one outcome under each hypothesis. The expected information of an action is the mutual information
 between the hypothesis and the outcome. The hypothesis determines the outcome, so the mutual information is the
-entropy of the distribution of the outcomes. The entropy of the weights is an upper bound.
+entropy of the distribution of the outcomes. The information is at most the entropy of the weights.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -37,12 +37,12 @@ from mstfilter.smc import first_seen
 
 
 def entropy(probabilities: np.ndarray) -> float:
-    """``-sum p log p`` of probabilities (k,) that sum to one."""
+    """Entropy ``-sum p log p`` of probabilities (k,) that sum to one."""
     return max(0.0, float(entr(probabilities).sum()))
 
 
 def binary_entropy(p: np.ndarray) -> np.ndarray:
-    """``-p log p - (1 - p) log(1 - p)`` of each probability; at most log 2."""
+    """Entropy ``-p log p - (1 - p) log(1 - p)`` of each probability; at most log 2."""
     p = np.clip(p, 0.0, 1.0)  # sums of weights may exceed 1 by rounding
     return np.asarray(entr(p) + entr(1 - p))
 
@@ -54,7 +54,7 @@ def outcome_information(
     sizes: np.ndarray,
     tolerance: float = 0.0,
 ) -> float:
-    """Information of an outcome that each hypothesis determines.
+    """Information of an outcome that the hypothesis determines.
 
     Parameters
     ----------
@@ -63,11 +63,11 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. Not called if `tolerance` is 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells; not called if `tolerance` is 0.
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float
-        tau in cells (see the module).
+        Tolerance tau of the formula, in cells.
     """
     check_number("tolerance", tolerance, at_least=0, unit="number of voxels or pixels")
     which = first_seen(row.tobytes() for row in np.ascontiguousarray(outcomes))

@@ -17,7 +17,7 @@ shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 
 
 **Information.** Every action (look from a camera, push) has one outcome under each hypothesis. The expected
 information of an action is the mutual information of hypothesis and outcome. Without noise, the information is the
-entropy of the distribution of outcomes. This entropy is at most `partition_entropy()`, which is at most log n. Errors
+entropy of the distribution of outcomes. The entropy is at most `partition_entropy()`, which is at most log n. Errors
 that all hypotheses share do not change the information. Without tolerance, outcomes that differ in one voxel are
 different. With a `tolerance` in voxels or pixels, outcomes with a much smaller difference count as equal
 (`mstfilter.belief.information` has the formula).
@@ -145,7 +145,7 @@ class Belief:
     # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that contain world points (..., 3) in metres. Raises InputError if a point is outside."""
+        """Voxels (..., 3) that contain world points (..., 3) in metres. Raises InputError for points outside."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
@@ -173,9 +173,9 @@ class Belief:
         """Probability (...) that two voxels belong to the same object.
 
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
-        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). An object with a voxel is assumed to contain
-        all its more probable voxels. `a` and `b` (..., 3) are broadcast against each other. If a = b, the result is
-        the occupancy. If b has all voxels, the result is the extent of the object at a.
+        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
+        probabilities, the smaller probability is that of both voxels. `a` and `b` (..., 3) are broadcast against each
+        other. If a = b, the result is the occupancy. If b has all voxels, it is the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -191,7 +191,7 @@ class Belief:
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
 
-        R_i is the label image of hypothesis i. `a` and `b` (..., 2) are pixels (column, row) and are broadcast.
+        R_i is the label image of hypothesis i. `a` and `b` (..., 2) are pixels (column, row); they are broadcast.
         """
         images = self._images(camera)
         a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
@@ -233,7 +233,8 @@ class Belief:
         """Expected difference (H, W) of the objects that two hypotheses, drawn by weight, show at a pixel.
 
         ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the object that hypothesis i shows at
-        the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an object, and 0 if only one does.
+        the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an object at the pixel, and 0 if
+        only one hypothesis shows an object.
         """
         refined = self._refined_image(camera)
         shared = refined.overlaps()
@@ -248,7 +249,7 @@ class Belief:
         return np.clip(1 - same, 0, 1)[refined.cells]
 
     def open_borders(self, camera: Camera, at_least: float = 0.05) -> list[Border]:
-        """Borders in the image across which the hypotheses disagree, the most uncertain one first.
+        """Borders in the image across which the hypotheses disagree, with the most uncertain borders first.
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
         between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label
@@ -284,7 +285,7 @@ class Belief:
     # Expected information of actions --------------------------------------------------------------------------
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
-        """Information of an image from a camera; `tolerance` in pixels. To save time, use ``camera.scaled(0.25)``.
+        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` saves time.
 
         The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
         """
@@ -298,8 +299,8 @@ class Belief:
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        The outcome ``{v: L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of all objects with a voxel in the
-        region. Other objects that these objects would push are ignored.
+        The outcome ``{v | L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of all objects with a voxel in the
+        region. Other objects that the pushed objects would move are ignored.
         """
         cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
         moved = self._refined.objects_in(cells)[self._refined.objects]
@@ -322,7 +323,7 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information in nats; the first one if several are equal.
+        """The action of largest expected information in nats; of equal actions, the first action.
 
         The result is None if no action has `at_least` nats, for example if the hypotheses agree on all outcomes.
         """

@@ -1,7 +1,7 @@
 """The command line, which parses arguments, calls the package and prints results.
 
 ``mstfilter demo`` makes a simulated recording, filters it and writes a report. ``mstfilter --help`` lists the other
-commands. Each module has one group of commands. Importing a module adds its commands to `mstfilter.cli.root.app`.
+commands. Each module has one group of commands. The import of a module adds its commands to `mstfilter.cli.root.app`.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="New folder for recording, run and report.")] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
-    """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
+    """Simulate a robot at a cluttered table, filter with and without predictions, and write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
     from mstfilter.report import read_numbers, write_report

@@ -83,7 +83,7 @@ def train(
     workers: Annotated[int, typer.Option(min=1, help="Processes that make samples.")] = 1,
     device: Annotated[str, typer.Option(help="Device of torch. Default: a GPU if there is one.")] = "",
 ) -> None:
-    """Train a learned part on simulated scenes; the same command resumes a training that was stopped."""
+    """Train a network on simulated scenes; the same command resumes a training that was stopped."""
     from mstfilter.errors import check_choice
 
     check_choice("part", part, ("completion", "border"))

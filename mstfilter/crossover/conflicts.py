@@ -8,8 +8,8 @@ A vertex is an object of one of the two hypotheses. An edge joins a proposed and
 graph is bipartite, because objects of one hypothesis never overlap.
 
 For each connected component of the conflict graph, a `Structure` draws the order in which objects are painted, and
-directed edges from a child to its parent. The parent is painted later than the child. `merge_probability` is the
-probability that a child with n1 voxels is merged into its parent with n2 voxels. They share I voxels:
+directed edges from a child to its parent. The parent is painted later than the child. The table has the probability
+that a child with n1 voxels is merged into a parent with n2 voxels and I common voxels (`merge_probability`):
 
 =============  =============================  ========================================================
 rule           probability                    source
@@ -69,8 +69,8 @@ class ConflictGraph:
     def networkx(self) -> nx.Graph:
         """The graph as a networkx graph.
 
-        Vertices have the attributes ``side``, ``label`` and ``size``. Edges have ``intersection``, in voxels.
-        Neighbours are in ascending order.
+        Vertices have the attributes ``side``, ``label`` and ``size``. Edges have the attribute ``intersection``, in
+        voxels. Neighbours are in ascending order.
         """
         graph = nx.Graph()
         objects = zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)
@@ -94,13 +94,13 @@ class ConflictGraph:
 
 
 def components_in_conflict(graph: nx.Graph) -> list[list[int]]:
-    """Connected components of a graph with at least one edge, as ascending vertices."""
+    """Connected components of a graph with at least one edge, as ascending lists of vertices."""
     return sorted(sorted(c) for c in nx.connected_components(graph) if len(c) > 1)
 
 
 @dataclass(frozen=True, eq=False)
 class OccupiedVoxels:
-    """The voxels that a proposed or a predicted hypothesis occupies, which are a few percent of a grid."""
+    """The voxels that are occupied in a proposed or a predicted hypothesis, usually a few percent of a grid."""
 
     at: np.ndarray  #: (n,) flat indices
     labels: tuple[np.ndarray, np.ndarray]  #: (n,) uint16 of the proposed and of the predicted hypothesis, 0 free
@@ -203,14 +203,14 @@ class Structure(Checked, ABC):
         Parameters
         ----------
         graph : networkx.Graph
-            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` of a vertex ascend.
+            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` are in ascending order.
         component : sequence of int
             Vertices of one connected component, ascending.
 
         Returns
         -------
         order : list of int
-            All vertices of the component in painting order. Later vertices are painted over earlier ones.
+            All vertices of the component in painting order. Later vertices are painted over earlier vertices.
         edges : list of (child, parent)
             Edges of the graph along which a child may be merged into its parent. Parents are painted after children.
         """
@@ -220,7 +220,7 @@ class Structure(Checked, ABC):
 class RandomOrder(Structure):
     """The paper's text: edges get a random acyclic orientation, and vertices get a topological order of these edges.
 
-    A uniformly random order of the vertices determines both. Objects may be merged along every edge.
+    A uniformly random order of the vertices determines the orientation. Objects may be merged along every edge.
     """
 
     def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
@@ -233,7 +233,7 @@ class RandomOrder(Structure):
 class SpanningTree(Structure):
     """The authors' program: a uniform random spanning tree from a uniform random root.
 
-    Objects are merged only along edges of the tree. Children are painted before their parent, and the root last.
+    Objects are merged only along edges of the tree. Children are painted before their parent.
     """
 
     def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:

@@ -30,12 +30,12 @@ class ModeFilter(Bounded):
     Parameters
     ----------
     window : int
-        Edge of the cubic window in voxels, an odd number. With 1 the filter has no effect.
+        Edge of the cubic window in voxels, an odd number. A window of 1 has no effect.
     margin : float
         Least difference between the count of the other label and the count of the voxel's label.
     isolation : int
-        Largest number of free voxels in the window of an occupied voxel. With more free voxels, the voxel becomes
-        free. A value of at least ``window**3`` has no effect.
+        Largest number of free voxels in the window of an occupied voxel. With more free voxels, the occupied voxel
+        becomes free. An isolation of at least ``window**3`` has no effect.
     max_sweeps : int
         Largest number of sweeps.
     """

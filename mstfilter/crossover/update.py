@@ -2,17 +2,18 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. Free-space projection clears voxels of every predicted hypothesis j. The hypothesis keeps the share Q_j.
-2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
+1. Free-space projection clears voxels of every predicted hypothesis j, which keeps the share Q_j of its voxels.
+2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate
+   depends only on its parents (section IV-E):
 
-       log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
+       log w = log w_i + log w_j + lambda log Q_j
 
-   depends only on its parents. w_i and w_j are the weights of the parents, and lambda is `quality_exponent`. So
-   candidates are resampled before they are built, and only selected candidates are built.
+   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. Candidates are therefore resampled
+   before they are built, and only selected candidates are built.
 
-Without a proposal, the update only projects and weights the predictions. If few states agree with an observation, few
-predictions are among these states. So every particle is projected onto the set of these states. The method is the
-manifold filter of Koval, Pollard and Srinivasa (2015).
+Without a proposal, the update only projects and weights the predictions. The projection follows the manifold filter
+of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, few predicted states agree. So every
+particle is projected onto the set of states that agree with the observation.
 
 One crossover has four steps (paper, figure 5):
 
@@ -71,7 +72,7 @@ class Crossover(Bounded):
     Parameters
     ----------
     structure : Structure
-        Draws the painting order and the candidate merges.
+        Draws the painting order and the edges along which objects may be merged.
     merge : {"share", "printed", "always", "never"}
         Probability of a merge along a directed edge (`mstfilter.crossover.conflicts`).
     mode_filter : ModeFilter
@@ -124,11 +125,11 @@ class CrossoverUpdate(Update):
     Parameters
     ----------
     free_space : Projection
-        Projects the predicted hypotheses onto those that agree with the latest frame.
+        Projects predicted hypotheses onto hypotheses that agree with the latest frame.
     crossover : Crossover
-        Makes one hypothesis from two.
+        Makes one hypothesis from two hypotheses.
     eta : int
-        Number of candidates that are made from each pair.
+        Number of candidates of each pair of a sample and a prediction.
     quality_exponent : float
         Exponent lambda of Q in the weight.
     """
@@ -198,7 +199,7 @@ def assign_labels(
 
 
 def _painted(graph: ConflictGraph, resolution: ConflictResolution, voxels: OccupiedVoxels) -> np.ndarray:
-    """Group + 1 of each occupied voxel (n,); 0 if its object was dropped. Later objects cover earlier objects."""
+    """Group number + 1 of each occupied voxel (n,); 0 for dropped objects. Later objects cover earlier objects."""
     rank = np.zeros(len(graph), np.int64)
     rank[resolution.order] = np.arange(1, len(resolution.order) + 1)
     groups, ranks = (
@@ -216,7 +217,7 @@ def _renumbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Child:
-    """The labels of a child, and the objects of the parents from which they come."""
+    """The labels of a child, and the objects of the parents from which the labels come."""
 
     voxels: OccupiedVoxels
     graph: ConflictGraph
@@ -233,7 +234,7 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The record of each object, from its head vertex. The motion history ends if the voxels have changed."""
+        """The record of each object's head (`_heads`). The motion history ends if the voxels have changed."""
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)

@@ -106,9 +106,9 @@ _WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
 class TrueCompletion(UsesTruth, Completer):
     """The true voxels of the objects that a mask shows. A mask without true objects keeps its visible surface.
 
-    `objects` determines which pixels can belong to an object. True voxels are assigned to these pixels. A mask with
-    75 % of an object's pixels gets all voxels of the object. An object is ignored if it has less than 10 % of a mask
-    and if less than half of the object is in the mask.
+    `objects` determines which pixels can belong to an object. True voxels are assigned to pixels of their object. A
+    mask with 75 % of an object's pixels gets all voxels of the object. An object is ignored if it covers less than
+    10 % of a mask and the mask covers less than half of the object.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)

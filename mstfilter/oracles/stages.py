@@ -6,11 +6,11 @@
 >>> PartitionUpdate(pairs=TruePairs())                             # the best of the partitions that it considers
 >>> filter = mstfilter.preset("mst", *STAGES["selection"])         # the n best of the candidates
 
-The time of an observation is the index of its clip. A resampler gets no clip. So for true selection, the candidates
-are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best candidates.
+Oracles find the time of an observation from the index of its clip. A resampler gets no clip. So for true selection,
+`TrueQuality` weights the candidates by their true quality, and `LargestWeights` selects the n best candidates.
 
-Replacing one stage by its oracle shows the gain from a perfect stage in the present filter. Replacing all stages but
-one shows the loss from this stage in an otherwise perfect filter. The gain and the loss are not equal, because a
+Replacing one stage by its oracle shows the gain from a perfect stage in the present filter. Replacing all other
+stages shows the loss from the remaining stage in an otherwise perfect filter. Gain and loss are not equal, because a
 stage can correct errors of another stage.
 """
 
@@ -37,7 +37,7 @@ _NATS = 1e4  # log score of a true quality of 1
 class TrueMotions(UsesTruth, Transition):
     """Moves the objects of hypotheses by the true motions.
 
-    Only the motion is true. The objects come from the hypothesis and are moved by the ordinary warp. An object that
+    Only the motions are true. The objects come from the hypothesis and are moved by the ordinary warp. An object that
     covers two true objects moves like the true object with which it shares more voxels.
     """
 
@@ -108,7 +108,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Almost certain odds of the truth, so that draws are as near to the truth as possible.
+    """Nearly certain log odds of the truth, so that probable partitions are as near to the truth as possible.
 
     A cell belongs to the true object of most of its readings.
     """

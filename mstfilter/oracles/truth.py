@@ -7,8 +7,8 @@ before a run. `bind_truth` binds all components of a filter that use the truth, 
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies bind these components automatically. The truth is not a field of the component, so
-binding changes neither the description nor the equality of a component. Binding changes the `component_key`.
+``mstfilter run`` and studies bind the components automatically. The truth is not a field of the component, so binding
+changes neither the description nor the equality of a component. Binding changes the `component_key` of a component.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class RecordingTruth:
         return np.unique([k for t in range(len(self.recording.pauses)) for k in np.unique(self.labels(t))])
 
     def motions(self, t: int) -> dict[int, np.ndarray]:
-        """(4, 4) motion in world metres of each object from pause `t` - 1 to pause `t`, by label."""
+        """Motion (4, 4) of each object in the world, in metres, from pause `t` - 1 to pause `t`, by label."""
         pauses = self.recording.pauses
         before, after = (self.recording.poses(pauses[k]) for k in (t - 1, t))
         assert before is not None and after is not None
@@ -109,7 +109,7 @@ class RecordingTruth:
 
 
 class UsesTruth:
-    """A component that uses the truth. Inherit this class together with the interface of the component."""
+    """A component that uses the truth. A component inherits `UsesTruth` together with its interface."""
 
     #: Data that the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
@@ -126,7 +126,7 @@ class UsesTruth:
 
     @property
     def truth(self) -> RecordingTruth:
-        """The truth; raises InputError if the component is not bound."""
+        """The truth of the bound recording. Raises InputError if the component is not bound."""
         truth = self.__dict__.get("_truth")
         if truth is None:
             raise InputError(

@@ -4,24 +4,24 @@
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
-A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller of
-the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects that share
-voxels.) The *main object* of a segment is the predicted object with which it shares most readings. An object that is
-the main object of no segment and has fewer than about 60 readings is in no conflict. Such an object is hidden, and
-its few readings measure objects nearby.
+A segment and a predicted object are *in conflict* if they share more than a tenth of the depth readings of the
+smaller of the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects
+that share voxels.) The *main object* of a segment is the predicted object that shares most readings with the segment.
+An object that is the main object of no segment and has fewer than about 60 readings is in no conflict. The few
+readings of a hidden object measure objects nearby.
 
-In each connected component, at most one segment continues a predicted object. Two rules are applied in order:
+A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
-1. The first rule uses only segments whose main object is the predicted object. The object is continued by the segment
-   with more than 80 % of the readings that these segments share with the object. The rule does not count readings at
-   which another object now occludes the predicted object.
-2. The second rule uses all segments. The object is continued by the segment with more than 80 % of the readings that
-   all segments share with the object.
+1. The first rule considers only segments whose main object is the predicted object. A considered segment continues
+   the object if it has more than 80 % of the object's readings in all considered segments. The first rule ignores
+   readings at which another object now occludes the predicted object.
+2. The second rule considers all segments. A segment continues the object if it has more than 80 % of the object's
+   readings in all segments.
 
 In a component of one segment and one object, more than 50 % of the readings is enough. The rules have consequences:
 
 - If a predicted object is *split* and no segment has enough readings of the object, no segment continues the object.
-  The track of the object ends, the views of the object are deleted, and the segments are new objects.
+  The track of a split object then ends, its views are deleted, and the segments are new objects.
 - If several objects are *merged* into one segment, the segment continues all these objects.
 - A segment that continues no object is a new object.
 

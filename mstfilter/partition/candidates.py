@@ -6,13 +6,13 @@
 >>> choices.log_weights, choices.occluded[0]                 # log probability, occluded objects of j that stay
 
 A candidate consists of a prediction j, an alternative a_c for each component c of the cells, and the set of occluded
-objects k of the prediction that stay (e_k = 1). The probability of a candidate is
+objects k that stay (e_k = 1). Object k stays with probability r_k. A candidate has the probability
 
     w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}.
 
 The components are independent given the prediction. Therefore the factors are multiplied one after the other, and
 only the n largest products are kept after each factor (`largest_products`). The probabilities of all candidates sum
-to 1. The total probability of the candidates that are left out is reported as the *discarded mass*.
+to 1. The total probability of the omitted candidates is reported as the *discarded mass*.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Choices:
     def described(self, projected: Population) -> Population:
         """The candidates as a population. The particles are indices. The parents come from the predictions.
 
-        `projected` are the predictions. The notes have the total probability of the candidates that are left out.
+        `projected` are the projected predictions. The notes have the total probability of the omitted candidates.
         """
         previous = projected.parents.get("previous", np.full(len(projected), -1))
         discarded = max(0.0, 1 - float(np.exp(self.log_weights).sum()))
@@ -127,7 +127,7 @@ def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndar
     Returns
     -------
     chosen : (m, C) int
-        Index of the entry of each factor, with m <= n.
+        Index of the chosen entry of each factor; m is at most n.
     log_products : (m,) float
         Descending.
     """
@@ -149,7 +149,7 @@ def tempered(p: np.ndarray, temperature: float) -> np.ndarray:
 def stays(probabilities: dict[int, float], n: int) -> list[tuple[tuple[int, ...], float]]:
     """The n most probable sets of occluded objects that stay, and their log probabilities.
 
-    `probabilities` maps labels to the probability that the object stays. Objects are independent.
+    `probabilities` maps labels to the probability that the object stays. Objects stay independently.
     """
     p = np.array([*probabilities.values()])
     p = np.where(p < _CERTAIN, 0, np.where(p > 1 - _CERTAIN, 1, p))

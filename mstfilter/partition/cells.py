@@ -11,15 +11,15 @@ reading. A cell is a set of readings that no sample and no prediction separates:
 of all partitions. Two cells are connected if they belong to one object in a sample or a prediction. A component is a
 connected set of cells.
 
-For two cells, f_image is the share of the samples in which the cells belong to one object. f_prediction is the
-corresponding weighted share of the predictions. The log odds of "one object" are
+For two cells, f_image is the share of the samples in which the cells belong to one object. The share
+f_prediction is the corresponding weighted share of the predictions. The log odds of "one object" are
 
     l = (1 - R) (image_only_constant + image_only logit(f_image))
         + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
 
 R is the probability that a prediction is valid. W <= R is the total weight of the predictions with an object at both
-cells. 0.02 is added to each share f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default, the
-odds of the image are not scaled. The coefficients of the predictions were fitted in `experiments/partition_fit`.
+cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,
+logit(f_image) is not scaled. The coefficients of the predictions were fitted in `experiments/partition_fit`.
 
 The alternatives of a component are its partitions in the samples and in the predictions. If a prediction has no
 object at a cell, each sample in turn determines which predicted object the cell joins. A mixture of the alternatives
@@ -128,7 +128,7 @@ class Cells:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """Readings (K,) of each cell."""
+        """Number (K,) of readings of each cell."""
         return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
 
     @cached_property
@@ -280,10 +280,10 @@ class PairOdds(Checked, ABC):
         cells : Cells
             The common refinement of the samples and predictions, with the label of every cell in every partition.
         weights : (n,) ndarray
-            Weight of each prediction times the probability that the prediction is valid. One minus the sum is the
-            probability that no prediction is valid.
+            Weight of each prediction times the probability that the prediction is valid. One minus the sum of these
+            is the probability that no prediction is valid.
         clip : Clip
-            The last frame of the clip is the image.
+            Clip whose last frame is the image.
         """
 
 

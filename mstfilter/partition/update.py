@@ -25,8 +25,7 @@ frame. The voxels of an object are estimated again from all observations of the 
    drawn at random. In this update, the partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
    probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
-   the object's voxels that the frame does not observe as free. A_j tests the whole prediction, and q tests the
-   object.
+   the object's voxels that the frame does not observe as free. A_j rates the whole prediction, q the object.
 5. **Completion.** An object keeps its views, which are its observations in earlier frames
    (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
    views of the predicted objects that the visible object continues. An occluded object is completed from its views
@@ -114,7 +113,7 @@ class PartitionUpdate(Update):
     Parameters
     ----------
     completer : Completer
-        Completes the objects. Completions by the proposal are not used, so its completer may be `SurfaceOnly`.
+        Completes the objects. The completions of the proposal are not used, so `SurfaceOnly` suffices there.
     free_space : Projection
         Computes the share Q of a prediction that the frame does not observe as free, and the remaining voxels.
     pairs : PairOdds
@@ -123,19 +122,19 @@ class PartitionUpdate(Update):
         T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
         cells. A higher T makes the probabilities more even.
     occupied_log_odds : float
-        Added to the log odds of every uncertain voxel. The default was fitted in `experiments/partition_fit`, because
-        the network is calibrated only for its training scenes.
+        Added to the log odds of every uncertain voxel. The completion network is calibrated only for its training
+        scenes, so the default was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
     quality_exponent : float
-        lambda, the exponent of Q, A and q. With 0, every prediction is valid, and every occluded object is kept.
+        Exponent lambda of Q, A and q. If lambda is 0, every prediction is valid, and every occluded object is kept.
     n_candidates : int
         Largest number of candidates after the first pause. 0 means 20 for each predicted hypothesis.
     n_scored : int
         Number of candidates that are built and scored by `evidence`.
     reach : float
-        Largest distance in voxels between a reading and the predicted object that explains it.
+        Largest distance in voxels between a reading and the predicted object to which the reading belongs.
     n_views : int
         Number of latest views that an object keeps.
     threshold : float
@@ -143,7 +142,7 @@ class PartitionUpdate(Update):
     mend : bool
         Whether missing readings of objects are estimated, as in `ObjectRule`.
     least_agreement : float
-        Least share of the visible surface of a predicted object with which the depth readings must agree. With 0,
+        Least share of the visible surface of a predicted object with which the depth readings must agree. At 0,
         surfaces are not tested: no object is refuted, and Q replaces A.
     """
 
@@ -197,7 +196,7 @@ class PartitionUpdate(Update):
         return self._scored(candidates, observation) if self.evidence else candidates
 
     def _mended(self, clip: Clip) -> Clip:
-        """The last frame, with missing readings of objects estimated. Free-space projection uses no estimates."""
+        """The last frame, with estimates of missing readings. Free-space projection does not use estimates."""
         return Clip((foreground(clip.after, clip.grid).frame,), clip.grid, clip.index) if self.mend else clip
 
     # 1. Free-space projection -----------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
 All input is checked before the folder is made. An interrupted run is resumed by the same call with the same
-configuration, seed and recording. An uninterrupted run has the same result.
+configuration, seed and recording. A resumed run and an uninterrupted run have the same result.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Configurations of the filters with which a run is compared. These filters keep the completer of the run."""
+    """Configurations of the filters with which a run is compared. Compared filters keep the completer of the run."""
     parts = (config.get(slot) or {} for slot in ("proposal", "update"))
     proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
     proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
@@ -73,7 +73,7 @@ def filter_recording(
         True shows a progress bar. A function is called before the first step and after every step, with the number
         of finished pauses and the number of all pauses.
     n_threads : int
-        Number of threads of one step. The result does not depend on the number.
+        Number of threads of one step. The result does not depend on the number of threads.
 
     Raises
     ------

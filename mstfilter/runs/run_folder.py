@@ -87,7 +87,7 @@ def as_json(value: Any) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON in one step."""
+    """Write a JSON file atomically."""
     write_text(path, json.dumps(as_json(value), indent=1) + "\n")
 
 
@@ -167,14 +167,14 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """An existing run folder."""
+        """Open an existing run folder."""
         folder = cls(Path(path))
         _ = folder.description
         return folder
 
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
-        """A new run folder that contains only its description."""
+        """Make a run folder that contains only its description."""
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
@@ -349,7 +349,7 @@ class RunFolder:
         return {"labels": labels, "questions": pairs}
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
-        """The particles after the step."""
+        """The hypotheses after the step that ended at pause `t`."""
         population = self.state(t).population
         assert population is not None
         return tuple(population.particles)

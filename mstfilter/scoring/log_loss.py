@@ -51,7 +51,7 @@ class BeliefScore(NamedTuple):
 
     @property
     def base_rate_loss(self) -> float:
-        """Log loss, in nats, of a constant forecast that equals the share of answers yes."""
+        """Log loss, in nats, of a constant forecast, the share of questions with the answer yes."""
         table = forecast_table(self.counts[0].astype(np.int64))
         if not table.n:
             return float("nan")
@@ -117,7 +117,7 @@ class FittedForecasts:
 
     @classmethod
     def fit(cls, counts: np.ndarray) -> FittedForecasts:
-        """Fit to counts (r, 1001, 2). The rate has the least log loss after recalibration."""
+        """Fit the noise rate and the recalibration to counts (r, 1001, 2), by least log loss."""
         tables = [forecast_table(one) for one in counts]
         fits = [Recalibration.fit(table) for table in tables]
         best = int(np.argmin([fit.log_loss(table) for fit, table in zip(fits, tables, strict=True)]))

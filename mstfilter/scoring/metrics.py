@@ -130,14 +130,15 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
 
 
 def object_metrics(table: Overlap) -> dict[str, float]:
-    """Metrics of the objects of one hypothesis against the truth, by name. Rows of `table` are the hypothesis.
+    """Metrics of the objects of one hypothesis against the truth, by name. Labels a of `table` are the hypothesis.
 
-    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. The objects
-      of the hypothesis have at least a tenth of the true object's size.
+    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Only
+      hypothesis objects with at least a tenth of the true object's size count.
     - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
     - *missed*: true objects of which no hypothesis object contains more than half, and that contain more than half of
       no hypothesis object.
-    - *invented*: hypothesis objects with the same property against true objects (as in Hoover et al. 1996).
+    - *invented*: hypothesis objects of which no true object contains more than half, and that contain more than half
+      of no true object (as in Hoover et al. 1996).
 
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
     (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if neither the truth nor the hypothesis has objects.

@@ -3,9 +3,9 @@
 >>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(open_recording("recordings/mine")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). A row has the mean over
-the hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of the
-hypothesis of least expected loss. A row also has the values of two trivial baselines: the occupied voxels as one
+`score_pauses` makes one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). A row has the
+mean over the hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of
+the hypothesis of least expected loss. A row also has the values of two trivial baselines: the occupied voxels as one
 object, and as connected components. If the ground truth has instance images but no volumes, hypotheses are rendered
 and compared in the image. Pixels of the robot (255) are ignored. For a recording with volumes, rows also have the
 scores of the forecasts: Brier score, log loss, log loss of the base rate and calibration error (`score_belief`). The
@@ -39,7 +39,7 @@ class PauseEstimate:
     Parameters
     ----------
     hypotheses : sequence of Hypothesis or of (X, Y, Z) arrays
-        A `Hypothesis` also has probabilities of its voxels.
+        A `Hypothesis` also has probabilities of its voxels, and an array has only labels.
     weights : (n,) array
         The sum of the weights is 1.
     frame : int
@@ -86,7 +86,7 @@ class PauseTruth:
 
 @dataclass(frozen=True)
 class PauseScore:
-    """Quality at one pause, measured by one variant of weighted coverage."""
+    """Quality at one pause, measured by one form of weighted coverage."""
 
     pause: int
     where: str

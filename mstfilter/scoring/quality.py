@@ -1,18 +1,18 @@
 """Quality of a segmentation, trivial baselines, and the visibility of objects.
 
 For every region of a segmentation, weighted coverage takes the largest Jaccard index J with a region of another
-segmentation. Weighted coverage averages J by size:
+segmentation. Weighted coverage is the mean of J, weighted by the sizes of regions:
 
     side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
 
 Weighted coverage has three forms:
 
 ``objects`` (default)
-    Only objects are regions; label 0 is no region. ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V is the
-    volume of all objects. The form is symmetric. Missing, invented, split and merged objects reduce the quality.
+    Only objects are regions; label 0 is no region. ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V_A is
+    the volume of all objects of A. The form is symmetric. Missing, invented, split and merged objects reduce q.
 ``paper``
     The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
-    Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.
+    Both sides are divided by the size of the grid. Free space is the largest region, so the result is nearly 1.
 ``authors``
     The formula of the authors' program. Only objects are regions, and both sides are divided by the volume of the
     FIRST argument. The form is not symmetric. The result is too high if the first segmentation is too small.
@@ -29,8 +29,8 @@ baseline detects occupied space but not objects.
 >>> object_status(recording, 2)  # doctest: +SKIP
 {1: 'visible', 2: 'hidden', 3: 'unseen'}
 
-Quality is also computed separately for each status of objects. No method can represent an object that was never seen.
-The quality of hidden objects shows the contribution of tracking.
+Quality is also computed for visible, hidden and unseen objects. No method can represent an object that was never
+seen. The quality of hidden objects shows the contribution of tracking.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     Raises
     ------
     InputError
-        If the recording has no true voxels at pause `t`, or no instance image at this or an earlier pause.
+        If the recording has no true voxels at pause `t`, or no instance image at pause `t` or at an earlier pause.
     """
     if not 0 <= t < len(recording.pauses):
         raise InputError(f"recording {recording.name} has no pause {t}, it has {len(recording.pauses)}")

@@ -12,8 +12,7 @@ answer has a better expected score than the true probabilities.
 **Distribution of the questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above
 the table. The depth images of pause t do not observe the voxel as free. The voxel is on a depth reading above the
 table, or up to 10 cm behind a reading along the camera's z axis, at pause t or earlier. The first voxel u of a
-question is uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels
-of u.
+question is uniform among the voxels in question. The second voxel v is uniform among the others within 8 voxels.
 
 **Noise at the border.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns the
 forecasts of the hypotheses with noise. With probability e, each voxel independently takes the label of one of its six
@@ -22,10 +21,10 @@ neighbours. Only voxels at a border change. The expectation over the noise is co
     p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]
 
 The voxel u' is u with probability 1 - e, and otherwise one of the six neighbours of u (u itself beyond the grid). The
-voxel v' is defined in the same way. o_i,v(k) is the probability that object k fills voxel v according to hypothesis
-i. The probability comes from the occupancy, or is 1 for the label of a hypothesis without probabilities. The minimum
-is the probability that the object fills both voxels if the object is a level set {v : o(v) >= U} with one uniform U.
-On six tuning scenes, the log loss with level sets is .004 nats lower than with independent voxels.
+voxel v' is defined in the same way. The number o_i,v(k) is the probability that object k fills voxel v according to
+hypothesis i. The probability comes from the occupancy, or is 1 for the label of a hypothesis without probabilities.
+The minimum in the formula is the probability of both voxels if the object is a level set {v | o(v) >= U} with one
+uniform U. On six tuning scenes, the log loss with level sets is .004 nats lower than with independent voxels.
 """
 
 from __future__ import annotations
@@ -128,7 +127,7 @@ class Questions:
 
     @cached_property
     def _voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distinct voxels (k,), the index (2 m,) of each first and second voxel in them, and neighbours (6, k)."""
+        """Distinct voxels (k,), the index (2 m,) of each first and second voxel, and the neighbours (6, k)."""
         voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
         return voxels, place, _neighbours(voxels, self.shape)
 
@@ -170,7 +169,7 @@ def ask(recording: Recording, t: int, n: int = N_QUESTIONS) -> Questions:
     t : int
         Number of the pause.
     n : int
-        Number of questions. The seed of the draw of the questions depends only on the depth images of the pause.
+        Number of questions. The seed for drawing the questions depends only on the depth images of the pause.
 
     Returns
     -------
@@ -202,7 +201,7 @@ def _margin(depth: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 
 
 def _seen_free(frame: Frame, grid: VoxelGrid) -> np.ndarray:
-    """(X, Y, Z) bool: a view measures a surface behind the voxel."""
+    """(X, Y, Z) bool: whether a view measures a surface behind the voxel."""
     free = np.zeros(grid.shape, bool)
     for view in frame.all_views:
         geometry = frame_geometry(view, grid)
@@ -211,7 +210,7 @@ def _seen_free(frame: Frame, grid: VoxelGrid) -> np.ndarray:
 
 
 def _behind_readings(frame: Frame, grid: VoxelGrid) -> np.ndarray:
-    """(X, Y, Z) bool: the voxel is on a depth reading above the table, or up to `DEPTH_BEHIND` behind the reading."""
+    """(X, Y, Z) bool: whether the voxel is on a depth reading above the table, or up to `DEPTH_BEHIND` behind it."""
     found = np.zeros(grid.shape, bool)
     for view in frame.all_views:
         geometry = frame_geometry(view, grid)
@@ -224,7 +223,7 @@ def _behind_readings(frame: Frame, grid: VoxelGrid) -> np.ndarray:
 
 
 def draw_questions(where: np.ndarray, n: int, rng: np.random.Generator) -> Questions:
-    """Draw n pairs of voxels of `where` (X, Y, Z) bool, as the module says; none if no two voxels are near."""
+    """Draw n pairs of near voxels of `where` (X, Y, Z) bool; none if no two voxels are near each other."""
     where = np.asarray(where, dtype=bool)
     voxels = np.argwhere(where)
     axis = np.arange(-REACH, REACH + 1)
@@ -234,7 +233,7 @@ def draw_questions(where: np.ndarray, n: int, rng: np.random.Generator) -> Quest
     padded = np.pad(where, REACH)
 
     def partners(u: np.ndarray) -> np.ndarray:
-        """(m, 3) uniform partners of voxels u (m, 3); -1 where there is none."""
+        """Uniformly drawn partners (m, 3) of voxels u (m, 3); -1 for a voxel without a partner."""
         v, left = np.full(u.shape, -1), np.arange(len(u))
         for _ in range(32):  # rejection first: most voxels have many partners
             proposed = u[left] + offsets[rng.integers(len(offsets), size=len(left))]

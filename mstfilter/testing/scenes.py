@@ -4,8 +4,8 @@
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
-Return the example from the method `example` of a contract, or define ``example = scene_example`` in a component's
-file.
+To use the scene in a contract, return the scene from the method `example`, or define ``example = scene_example`` in
+the file of a component.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _clip() -> Clip:
 
 
 def scene_example(rng: np.random.Generator, n: int) -> tuple[Population, Clip]:
-    """`n` hypotheses before the push, with unequal weights, and the clip of the push.
+    """`n` hypotheses with unequal weights before a box is pushed, and the clip of the push.
 
     Some hypotheses are correct. In other hypotheses two boxes are merged, a box is missing, or a box is split.
     """

@@ -68,7 +68,7 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
 
 
 class EvidenceContract(ScoreContract):
-    """The contract of every `Evidence`. The default example is a scene."""
+    """The contract of every `Evidence`. The default example is `scene_example`."""
 
     example = staticmethod(scene_example)
 
@@ -78,7 +78,7 @@ class EvidenceContract(ScoreContract):
         return np.round(component.log_score(hypotheses, inputs["observation"]), 9)
 
     def test_copies_score_the_same(self) -> None:
-        """Equal hypotheses have equal scores, also if the numbers of the labels differ."""
+        """Equal hypotheses have equal scores, also if their labels have other numbers."""
         inputs, rng = self.inputs(9), seeded(2)
         hypotheses = tuple(inputs["population"].realised().particles)
 
@@ -101,7 +101,7 @@ class StageContract(Contract):
     example = staticmethod(scene_example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        """The result of the step of a filter that uses the component."""
+        """The result of the filter step that uses the component."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
         if isinstance(owner, Proposal):
@@ -117,7 +117,7 @@ class StageContract(Contract):
 
     @prerequisite
     def test_works_in_its_place(self) -> None:
-        """The filter step that uses the component returns hypotheses, also if no hypothesis has objects."""
+        """The filter step that uses the component returns hypotheses, also if no hypothesis has an object."""
         inputs = self.inputs(2)
         grid = inputs["observation"].grid
         empty = Hypothesis.from_labels(np.zeros(grid.shape, np.uint16), grid)
@@ -152,7 +152,7 @@ class CompleterContract(StageContract):
             _estimated(self.make(), seeded(0), odd, clip)
 
     def test_follows_what_is_seen(self) -> None:
-        """The probabilities are not constant, and they are high on the visible surface."""
+        """The probabilities are not constant, and the visible surface is probably occupied."""
         seen, clip = self._seen()
         fault = fault_of(seen, self._filled(seen, clip))
         assert fault is None, f"{type(self.make()).__name__}.fill {fault}"
@@ -179,7 +179,7 @@ class CompleterContract(StageContract):
 
 
 def _correct(inputs: dict[str, Any]) -> Hypothesis:
-    """The hypothesis with most objects."""
+    """The hypothesis with the largest number of objects."""
     return max(inputs["population"].particles, key=lambda h: h.n_objects)
 
 
@@ -189,7 +189,7 @@ def _on_surface(filled: list[np.ndarray], seen: list[ObservedBox], axes: tuple[i
 
 
 def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool = False) -> list[ObservedBox]:
-    """The boxes of the objects of a hypothesis in the first frame. `cut` keeps the half of a mask above a diagonal."""
+    """The boxes of the objects of a hypothesis in the first frame. `cut` keeps half of each mask."""
     image, _ = render_hypothesis(hypothesis, clip.before.camera)
     masks = [image == k for k in np.unique(image[image > 0])]
     if cut:
@@ -201,14 +201,14 @@ def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool =
 def _estimated(
     completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
 ) -> list[np.ndarray]:
-    """The probabilities of boxes. Box k uses the stream `first` + k."""
+    """The probabilities of boxes. Box k uses the random stream `first` + k."""
     bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     with _quiet():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
-    """The box reduced to its first voxels."""
+    """The first ``a x b x c`` voxels of a box."""
     parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name != "height"}
     return ObservedBox(**parts, height=box.height[:c])
 
@@ -271,7 +271,7 @@ def run_contract(
     """Test all properties of a component whose interface has a contract.
 
     ``example(rng, n)`` returns a population and an observation that the component can process. The default is the
-    function ``example`` in the module of the component's class. If the module has none, components that use images
+    function ``example`` in the module of the component's class. Without such a function, components that use images
     get a scene, and other components get numbers.
 
     ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the

@@ -28,11 +28,10 @@ def _folder(target: str) -> Path:
 
 
 def write_starter(kind: str, path: Path, target: str = "") -> list[str]:
-    """Write a working, commented component of a kind in `starter_kinds`. Returns commands that test and run it.
+    """Write a working component of one of `starter_kinds`, and return the commands that test and run the component.
 
     `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if a starting
-    file for scenes exists. Raises InputError if no starting file exists, the name cannot be imported, or `path`
-    exists.
+    file for scenes exists. Raises InputError if no starting file exists, the name is invalid, or `path` exists.
     """
     check_choice("the target", target or "scenes", _TARGETS)
     kinds = starter_kinds(target)
