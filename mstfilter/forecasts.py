@@ -1,7 +1,7 @@
 """Scores of forecasts: Brier score, log loss, calibration, recalibration.
 
 A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. For each
-value of p, the table has the numbers of forecasts without and with the event. Tables can be pooled.
+value of p, the table has the numbers of outcomes 0 and 1. Tables can be pooled.
 
 >>> import numpy as np
 >>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])

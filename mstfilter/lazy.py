@@ -1,9 +1,9 @@
 """Lazy imports: names of a package are imported at their first use, and methods import drawing code when called.
 
-The ``__init__.py`` of a package has its documentation and two lines::
+The ``__init__.py`` of a package has its documentation and two lines:
 
-    from mstfilter.lazy import attach
-    __getattr__, __dir__, __all__ = attach(__name__, __file__)
+>>> from mstfilter.lazy import attach
+>>> __getattr__, __dir__, __all__ = attach(__name__, __file__)      # doctest: +SKIP
 
 The stub ``__init__.pyi`` lists the public names, with one ``from module import name as name`` statement per module.
 Type checkers read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera``

@@ -8,12 +8,12 @@
 is a TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset,
 or ``models/base.toml``, which has the common parts of `mst` and its baselines:
 
-    base = "base"                           # the base sets the fields that are not named in this file
-
-    transition = "identity"                 # naming a component resets its fields
-    proposal.completer = "extrude"          # naming a field keeps the other fields
-
-    wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
+=======================================  =============================================================================
+``base = "base"``                        fields that are not named in the file are those of the base
+``transition = "identity"``              naming a component resets its fields
+``proposal.completer = "extrude"``       naming a field keeps the other fields
+``wrap = { proposal = "first_pause" }``  the base's proposal becomes the field `proposal` of this component
+=======================================  =============================================================================
 
 ``base`` has no update. ``base`` can be extended but is not a preset.
 """

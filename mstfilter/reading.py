@@ -59,25 +59,25 @@ def open_regular(path: str | Path, limit: int | None = None) -> Iterator[io.Buff
 
 
 def read_bytes(path: Path, kind: str, *hints: str, limit: int | None = None) -> bytes:
-    """The content of a regular file of at most `limit` bytes. `reading` describes other parameters and errors."""
+    """The content of a regular file of at most `limit` bytes. See `reading` for the other parameters."""
     with reading(path, kind, *hints), open_regular(path, limit) as file:
         return file.read()
 
 
 def read_text(path: Path, kind: str, *hints: str, limit: int = MAX_TEXT) -> str:
-    """The content of a UTF-8 text file of at most `limit` bytes. `reading` describes other parameters and errors."""
+    """The content of a UTF-8 text file of at most `limit` bytes. See `reading` for the other parameters."""
     with reading(path, kind, *hints):
         return read_bytes(path, kind, *hints, limit=limit).decode("utf-8-sig")
 
 
 def read_json(path: Path, kind: str, *hints: str) -> Any:
-    """The content of a JSON file. `reading` describes the parameters and errors."""
+    """The content of a JSON file. See `reading` for the parameters."""
     with reading(path, kind, *hints):
         return json.loads(read_text(path, kind, *hints))
 
 
 def read_toml(path: Path, kind: str, *hints: str) -> dict[str, Any]:
-    """The content of a TOML file. `reading` describes the parameters and errors."""
+    """The content of a TOML file. See `reading` for the parameters."""
     text = read_text(path, kind, *hints, limit=MAX_TOML)
     try:
         return tomllib.loads(text)
@@ -88,7 +88,7 @@ def read_toml(path: Path, kind: str, *hints: str) -> dict[str, Any]:
 def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple[_Model, dict[str, Any]]:
     """Read a JSON file and check it with a pydantic model. Returns the model, and the stored values.
 
-    `reading` describes other parameters and errors. An error names the first wrong entry and the value found.
+    See `reading` for the other parameters. An error names the first wrong entry and the value found.
     """
     from pydantic import ValidationError
 
@@ -106,7 +106,7 @@ def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple
 def read_arrays(path: Path, kind: str, *hints: str, limit: int | None = None) -> dict[str, np.ndarray]:
     """All arrays of an .npz file that needs at most `limit` bytes of memory.
 
-    The array of an .npy file has the name "". `reading` describes the other parameters and the errors.
+    The array of an .npy file has the name "". See `reading` for the other parameters.
     """
     with reading(path, kind, *hints), open_regular(path, limit) as file:
         if file.peek(6).startswith(b"\x93NUMPY"):

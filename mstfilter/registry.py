@@ -1,10 +1,10 @@
 """Finds components by name, and builds components from a configuration.
 
 A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class
-that the components inherit. ``__components__`` maps kinds to names, and names to classes or ``/a/file.py:Class``::
+that the components inherit. ``__components__`` maps kinds to names, and names to classes or ``/a/file.py:Class``:
 
-    __interfaces__ = {"resampler": "Resampler"}
-    __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
+>>> __interfaces__ = {"resampler": "Resampler"}
+>>> __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
 
 A `Registry` joins the declarations of several packages. `mstfilter.presets.REGISTRY` joins all packages:
 

@@ -309,8 +309,8 @@ def resolve(
 ) -> ConflictResolution:
     """Draw a resolution of all conflicts. Objects without conflict are painted first.
 
-    `drop_rule` reproduces a fault of the authors' program: an object without conflict is lost if its vertex number is
-    larger than the vertex numbers of all objects in conflict.
+    `drop_rule` reproduces a fault of the authors' program: an object without conflict is lost if it has a larger
+    vertex number than all objects in conflict.
     """
     links = graph.networkx()
     components = components_in_conflict(links)
@@ -341,7 +341,7 @@ def _merged(
 
 
 def _unite(group: np.ndarray, merged: list[tuple[int, int]], order: list[int]) -> None:
-    """Merge groups along edges, in place. The vertex that is painted last represents its group."""
+    """Merge groups of objects along edges, in place. The vertex that is painted last represents its group."""
     place = {v: k for k, v in enumerate(order)}
     for edge in merged:
         first, last = sorted((int(group[v]) for v in edge), key=place.__getitem__)

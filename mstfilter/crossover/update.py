@@ -78,8 +78,7 @@ class Crossover(Bounded):
     mode_filter : ModeFilter
         Smooths the painted labels.
     drop_rule : bool
-        Reproduces a fault of the authors' program: an object without conflict is lost if its vertex number is larger
-        than the vertex numbers of all objects in conflict.
+        Reproduces a fault of the authors' program, which `mstfilter.crossover.conflicts.resolve` describes.
     """
 
     structure: Structure = SpanningTree()  # noqa: RUF009 (frozen)

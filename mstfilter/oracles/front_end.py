@@ -7,7 +7,7 @@
 A mask that shows exactly one object is completed to all voxels of the object, including hidden voxels. In general, a
 true voxel belongs to the mask that contains its pixel. The pixel of a voxel is the pixel nearest to the projection of
 the voxel, among all pixels that show the object. So a mask of a part of an object is completed to this part, and a
-mask of two objects is completed to both objects.
+mask of two objects to both objects.
 """
 
 from __future__ import annotations

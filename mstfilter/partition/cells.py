@@ -212,7 +212,7 @@ def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> np.ndarray:
-    """Cells of the kept readings. Readings of small cells join the nearest large cell, if a large cell is near."""
+    """Cells of the kept readings, where readings of a small cell join the nearest large cell, if one is near."""
     pixels, least = readings.pixels[kept], readings.smallest_region
     large = np.bincount(cell, minlength=1)[cell] >= least
     if not large.any():
@@ -278,10 +278,10 @@ class PairOdds(Checked, ABC):
         Parameters
         ----------
         cells : Cells
-            The common refinement of the samples and predictions, with the label of every cell in every partition.
+            The common refinement of the samples and the predictions.
         weights : (n,) ndarray
-            Weight of each prediction times the probability that the prediction is valid. One minus the sum of these
-            is the probability that no prediction is valid.
+            Weight of each prediction times the probability that the prediction is valid. One minus the sum of the
+            weights is the probability that no prediction is valid.
         clip : Clip
             Clip whose last frame is the image.
         """

@@ -3,9 +3,9 @@
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # weighted candidates, built on access
 
-The update replaces section IV-D of the paper. In the paper, a sample of the image and a prediction are two sets of
-voxels, which are crossed. In this update, samples and predictions are partitions of the depth readings of the last
-frame. The voxels of an object are estimated again from all observations of the object.
+The update replaces section IV-D of the paper. In the paper, each sample of the image and each prediction are sets of
+voxels, and all pairs are crossed. In this update, samples and predictions are partitions of the depth readings of the
+last frame. The voxels of an object are estimated again from all observations of the object.
 
 1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j with which
@@ -17,8 +17,7 @@ frame. The voxels of an object are estimated again from all observations of the 
    determine the probabilities of the partitions of each part of the image (`mstfilter.partition.cells`). A candidate
    consists of a prediction j and one partition of each part. The weight of a candidate is w_j Q_j^lambda times the
    probabilities of its partitions (`mstfilter.partition.candidates`). Only the most probable candidates are
-   described. The resampler of the filter selects some candidates, and only selected candidates are completed. In the
-   paper, each sample is crossed with each prediction.
+   described. The resampler of the filter selects some candidates, and only selected candidates are completed.
 3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each *component* of the
    graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. If an object is
    split, at most one segment continues the object, and the other segments are new objects. In the paper, merges are

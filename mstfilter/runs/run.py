@@ -139,7 +139,7 @@ def first_pause(path: Path, description: dict[str, Any], replace: bool, *step: A
 def describe_run(
     recording: Mapping[str, Any], config: Mapping[str, Any], filter: ParticleFilter, seed: int
 ) -> dict[str, Any]:
-    """The content of run.json except its format and status. `recording` is the entry that describes the recording."""
+    """The content of run.json except its format and status. `recording` is the description of the recording."""
     description: dict[str, Any] = as_json(
         {
             "seed": seed,

@@ -186,7 +186,7 @@ def ask(recording: Recording, t: int, n: int = N_QUESTIONS) -> Questions:
 
 
 def in_question(recording: Recording, t: int) -> np.ndarray:
-    """(X, Y, Z) bool: voxels about which questions are asked at pause t."""
+    """(X, Y, Z) bool: whether a voxel is in question at pause t."""
     grid, now = recording.grid, recording.frames[recording.pauses[t]]
     near = np.zeros(grid.shape, bool)
     for pause in recording.pauses[: t + 1]:
