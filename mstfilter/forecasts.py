@@ -103,7 +103,7 @@ class ForecastTable:
     def reliability(self, n_bins: int = 10) -> Reliability:
         """The reliability diagram on bins of equal numbers of forecasts.
 
-        Equal forecasts stay in one bin, so a frequent forecast makes bins of different sizes.
+        Equal forecasts stay in one bin, so bins can have different sizes.
         """
         middle = np.cumsum(self.count) - self.count / 2  # rank of each forecast
         which = np.minimum((n_bins * middle / max(self.n, 1e-300)).astype(np.int64), n_bins - 1)

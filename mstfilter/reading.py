@@ -4,8 +4,8 @@
 >>> arrays = read_arrays(folder / "truth.npz", "true volumes")
 
 All readers use `open_regular`, which opens only regular files, because reading a pipe or a device might never end.
-The file size is compared with a limit. The unpacked size is read from headers before memory is allocated. All errors
-are `InputError` with the name of the file.
+The file size is compared with a limit. The unpacked size of arrays is read from headers before memory is allocated.
+All errors are `InputError` with the name of the file.
 """
 
 from __future__ import annotations

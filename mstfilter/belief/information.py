@@ -10,10 +10,10 @@ entropy of the distribution of the outcomes. The information is at most the entr
 >>> bool(np.isclose(outcome_information(weights, rows, hamming, sizes), np.log(2)))
 True
 
-**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. With a `tolerance` tau,
-the information is
+**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. A `tolerance` tau
+replaces the information by I_tau, where outcomes i and j differ in d_ij cells:
 
-    I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ.
+    ``I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau)``
 
 Outcomes that differ in far fewer than tau cells count as equal. Outcomes that differ in far more cells count as
 different.
@@ -67,7 +67,7 @@ def outcome_information(
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float
-        Tolerance tau of the formula, in cells.
+        Tolerance tau in the formula of the module, in cells.
     """
     check_number("tolerance", tolerance, at_least=0, unit="number of voxels or pixels")
     which = first_seen(row.tobytes() for row in np.ascontiguousarray(outcomes))

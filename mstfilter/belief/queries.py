@@ -404,7 +404,7 @@ def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Different cells a < b (m,) at pairs of neighbouring pixels of an image (H, W), and one pixel (m, 2) of each."""
+    """Different cells a < b (m,) of pairs of neighbouring pixels of an image (H, W), and a pixel (m, 2) of a pair."""
     found = []
     for axis in (0, 1):
         one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))

@@ -79,7 +79,7 @@ class ModeFilter(Bounded):
         return tuple(slice(max(s.start - half, 0), min(s.stop + half, n)) for s, n in zip(box, shape, strict=True))
 
     def _swept(self, labels: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Labels after one sweep. `cells` is the number of grid cells in the window of each voxel."""
+        """Labels after one sweep of the filter. `cells` is the number of grid cells in the window of each voxel."""
         own, best = np.zeros(labels.shape, np.int32), np.zeros(labels.shape, np.int32)
         winner = np.zeros_like(labels)
         for label, box in enumerate(ndimage.find_objects(labels), start=1):

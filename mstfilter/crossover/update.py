@@ -6,7 +6,7 @@
 2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate
    depends only on its parents (section IV-E):
 
-       log w = log w_i + log w_j + lambda log Q_j
+       ``log w = log w_i + log w_j + lambda log Q_j``
 
    The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. Candidates are therefore resampled
    before they are built, and only selected candidates are built.
@@ -22,7 +22,7 @@ One crossover has four steps (paper, figure 5):
 1. `graph_of` builds the conflict graph, in which two objects that share voxels are in conflict.
 2. `resolve` draws, for each connected component of the graph, which objects are merged, and the painting order of all
    objects. Objects that are painted later cover earlier objects.
-3. `assign_labels` paints the objects. Objects without conflict are copied.
+3. `assign_labels` paints the objects into one label grid. Objects without conflict are copied.
 4. `mstfilter.crossover.ModeFilter` removes speckle from the painted labels.
 """
 
@@ -233,7 +233,7 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The record of each object's head (`_heads`). The motion history ends if the voxels have changed."""
+        """The record of the head of each object (`_heads`). The motion history ends if the voxels have changed."""
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)

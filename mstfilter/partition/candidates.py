@@ -6,9 +6,9 @@
 >>> choices.log_weights, choices.occluded[0]                 # log probability, occluded objects of j that stay
 
 A candidate consists of a prediction j, an alternative a_c for each component c of the cells, and the set of occluded
-objects k that stay (e_k = 1). Object k stays with probability r_k. A candidate has the probability
+objects k that stay (e_k = 1). Object k stays with probability r_k. The probability of a candidate is a product:
 
-    w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}.
+    ``w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}``
 
 The components are independent given the prediction. Therefore the factors are multiplied one after the other, and
 only the n largest products are kept after each factor (`largest_products`). The probabilities of all candidates sum
@@ -100,7 +100,7 @@ class Choices:
         return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], occluded)
 
     def described(self, projected: Population) -> Population:
-        """The candidates as a population. The particles are indices. The parents come from the predictions.
+        """The candidates as a population. The particles are indices with the parents of their predictions.
 
         `projected` are the projected predictions. The notes have the total probability of the omitted candidates.
         """

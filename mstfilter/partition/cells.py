@@ -12,10 +12,10 @@ of all partitions. Two cells are connected if they belong to one object in a sam
 connected set of cells.
 
 For two cells, f_image is the share of the samples in which the cells belong to one object. The share
-f_prediction is the corresponding weighted share of the predictions. The log odds of "one object" are
+f_prediction is the corresponding weighted share of the predictions. The log odds l of "one object" are a sum:
 
-    l = (1 - R) (image_only_constant + image_only logit(f_image))
-        + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
+    ``l = (1 - R) (image_only_constant + image_only logit(f_image))
+    + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant)``
 
 R is the probability that a prediction is valid. W <= R is the total weight of the predictions with an object at both
 cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,

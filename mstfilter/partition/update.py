@@ -7,7 +7,7 @@ The update replaces section IV-D of the paper. In the paper, each sample of the 
 voxels, and all pairs are crossed. In this update, samples and predictions are partitions of the depth readings of the
 last frame. The voxels of an object are estimated again from all observations of the object.
 
-1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
+1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j with which
    the depth readings agree. A_j^lambda is used as the probability that prediction j is valid, which means that the
    prediction shows the present scene. A predicted object is *refuted* and removed from the prediction if the readings
@@ -112,7 +112,7 @@ class PartitionUpdate(Update):
     Parameters
     ----------
     completer : Completer
-        Completes the objects. The completions of the proposal are not used, so `SurfaceOnly` suffices there.
+        Completes the objects. The completions of the proposal are not used, so the proposal can use `SurfaceOnly`.
     free_space : Projection
         Computes the share Q of a prediction that the frame does not observe as free, and the remaining voxels.
     pairs : PairOdds

@@ -5,7 +5,7 @@
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-**Log loss (recalibrated).** A proper score without recalibration rewards noise. Hypotheses that consist only of
+**Log loss.** A proper score without recalibration rewards noise. Hypotheses that consist only of
 labels have no uncertainty of shape, and noise at the borders makes wrong forecasts less certain. Forecasts are
 therefore recalibrated by isotonic regression, fitted to other scenes. The score is the mean log loss in nats; lower
 is better. Before recalibration, the score itself adds noise at the borders if noise lowers the loss on the other

@@ -3,7 +3,7 @@
 For every region of a segmentation, weighted coverage takes the largest Jaccard index J with a region of another
 segmentation. Weighted coverage is the mean of J, weighted by the sizes of regions:
 
-    side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
+    ``side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)``
 
 Weighted coverage has three forms:
 
@@ -169,7 +169,8 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     t : int
         Number of the pause.
     min_pixels : float
-        Least number of pixels of a shown object in an image of 640 x 480 pixels. The number scales with the area.
+        Least number of pixels of a shown object in an image of 640 x 480 pixels. The least number scales with the
+        area of the image.
 
     Raises
     ------

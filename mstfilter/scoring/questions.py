@@ -9,16 +9,17 @@ answer has a better expected score than the true probabilities.
 >>> y = questions.outcomes(recording.truth(2))                 # bool
 >>> float(np.mean((p - y) ** 2))                               # Brier score
 
-**Distribution of the questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above
+**Questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above
 the table. The depth images of pause t do not observe the voxel as free. The voxel is on a depth reading above the
 table, or up to 10 cm behind a reading along the camera's z axis, at pause t or earlier. The first voxel u of a
-question is uniform among the voxels in question. The second voxel v is uniform among the others within 8 voxels.
+question is uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels
+of u.
 
-**Noise at the border.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns the
+**Noise.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns the
 forecasts of the hypotheses with noise. With probability e, each voxel independently takes the label of one of its six
 neighbours. Only voxels at a border change. The expectation over the noise is computed exactly:
 
-    p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]
+    ``p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]``
 
 The voxel u' is u with probability 1 - e, and otherwise one of the six neighbours of u (u itself beyond the grid). The
 voxel v' is defined in the same way. The number o_i,v(k) is the probability that object k fills voxel v according to

@@ -189,7 +189,7 @@ def _on_surface(filled: list[np.ndarray], seen: list[ObservedBox], axes: tuple[i
 
 
 def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool = False) -> list[ObservedBox]:
-    """The boxes of the objects of a hypothesis in the first frame. `cut` keeps half of each mask."""
+    """The boxes of the objects of a hypothesis in the first frame. With `cut`, half of each mask is removed."""
     image, _ = render_hypothesis(hypothesis, clip.before.camera)
     masks = [image == k for k in np.unique(image[image > 0])]
     if cut:
