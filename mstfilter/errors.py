@@ -45,7 +45,7 @@ class MissingLibraryError(InputError):
 
 
 class LostRunError(InputError):
-    """No particle explains an observation. The estimate of the evidence is 0, and the run cannot continue."""
+    """All particles have weight 0 after an observation. The estimated evidence is 0, and the run cannot continue."""
 
 
 class InputWarning(_WithHints, UserWarning):

@@ -145,7 +145,7 @@ class Belief:
     # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that contain world points (..., 3) in metres. Raises InputError for points outside."""
+        """Voxels (..., 3) that contain world points (..., 3) in metres. A point outside raises InputError."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
@@ -175,7 +175,8 @@ class Belief:
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
         k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
         probabilities, the smaller probability is that of both voxels. `a` and `b` (..., 3) are broadcast against each
-        other. If a = b, the result is the occupancy. If b has all voxels, it is the extent of the object at a.
+        other. If a = b, the result is the occupancy. If b has all voxels, the result is the extent of the object at
+        a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)

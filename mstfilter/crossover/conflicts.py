@@ -53,8 +53,8 @@ class ConflictGraph:
 
     Notes
     -----
-    Vertices are numbered by the first voxel of each object in a scan with x fastest. If two objects begin at the same
-    voxel, the proposed object is first. The authors' program uses the same numbering.
+    Vertices are numbered by the first voxel of each object in Fortran order (x fastest). If two objects begin at the
+    same voxel, the proposed object is first. The authors' program uses the same numbering.
     """
 
     side: np.ndarray  #: (n,) int 0 proposed, 1 predicted
@@ -125,7 +125,7 @@ class OccupiedVoxels:
         return out
 
     def objects(self, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Labels, sizes and positions of the first voxels (k,) of the objects of `side`, in a scan with x fastest."""
+        """Labels, sizes and positions (Fortran order) of the first voxels (k,) of the objects of `side`."""
         position = np.ravel_multi_index(np.unravel_index(self.at, self.shape), self.shape, order="F")
         labels = self.labels[side]
         sizes = np.bincount(labels, minlength=1)

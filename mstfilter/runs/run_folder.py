@@ -377,7 +377,7 @@ class RunFolder:
         return found
 
     def write_metrics(self) -> None:
-        """Write metrics.csv from the pauses."""
+        """Write metrics.csv, with one row per pause and hypothesis."""
         rows = []
         for t in range(self.n_pauses):
             info = self.info(t)
