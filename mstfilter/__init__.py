@@ -5,8 +5,8 @@
 >>> state, infos = mstfilter.preset("mst").run(recording.clips(), seed=0)
 >>> state.population.best.volumes()
 
-See `mstfilter.presets` for the assembled filters, `mstfilter.smc` for the filter itself, `mstfilter.scene`
-for cameras, recordings and hypotheses.
+`mstfilter.presets` has the assembled filters, `mstfilter.smc` the filter itself, and `mstfilter.scene` cameras,
+recordings and hypotheses.
 """
 
 from mstfilter.lazy import attach

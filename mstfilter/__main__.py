@@ -1,4 +1,4 @@
-"""``python -m mstfilter``: the command line."""
+"""Run the command line by ``python -m mstfilter``."""
 
 from mstfilter.cli import main
 

@@ -1,6 +1,6 @@
 """Errors and warnings that a user can correct.
 
-The messages state what is wrong, where, and the value found, and then what to do.
+A message states the error, its place and the value found. Hints state how to correct the error.
 
 >>> from mstfilter.errors import InputError
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
@@ -35,8 +35,8 @@ class _WithHints(Exception):
 class InputError(_WithHints, ValueError):
     """Input that cannot be used.
 
-    `message` is one line that states what is wrong, where, and the value found. A hint is one line that states what
-    to do.
+    `message` is one line that states the error, its place and the value found. A hint is one line that states how to
+    correct the error.
     """
 
 
@@ -45,11 +45,11 @@ class MissingLibraryError(InputError):
 
 
 class LostRunError(InputError):
-    """No particle explains an observation. The estimate of the evidence is 0, and the run cannot continue."""
+    """All particles have weight 0 after an observation. The estimated evidence is 0, and the run cannot continue."""
 
 
 class InputWarning(_WithHints, UserWarning):
-    """Input that can be used but is probably not what was intended. Message and hints are as for `InputError`.
+    """Input that can be used but is probably not intended. `InputError` describes the message and the hints.
 
     The command line shows the warning as one ``warning:`` line.
     """
@@ -69,7 +69,7 @@ def naming(where: str) -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """The message of an exception, or its name; of a KeyError, which has the name alone, that the name is missing."""
+    """The message of an exception, or its class name; ``NAME is missing`` for a KeyError."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
@@ -78,7 +78,7 @@ def reason(error: BaseException) -> str:
 def printable(text: str) -> str:
     """One line of at most 1500 characters, in which control characters of a terminal are escape sequences.
 
-    Names and values in files of unknown origin may contain them.
+    Names and values in files of unknown origin may contain control characters.
     """
     line = " ".join(part.strip() for part in text.split("\n"))
     line = line if len(line) <= 1500 else f"{line[:1400]} ... {line[-80:]}"
@@ -86,7 +86,7 @@ def printable(text: str) -> str:
 
 
 def suggestion(name: str, names: Iterable[str]) -> list[str]:
-    """A hint with the known name that is closest to an unknown name; no hint if none is close."""
+    """A hint with the known name that is closest to an unknown name; no hint if no known name is close."""
     return [f"did you mean {close}?" for close in difflib.get_close_matches(name, list(names), n=1)]
 
 
@@ -129,7 +129,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
 
 
 def check_component(name: str, value: Any, interface: type, optional: bool = False) -> None:
-    """Raise InputError unless `value` is an instance of `interface`, or None if it is optional."""
+    """Raise InputError unless `value` is an instance of `interface`. With `optional`, None is also accepted."""
     if isinstance(value, interface) or (optional and value is None):
         return
     hints = []
@@ -143,9 +143,9 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
 
 
 def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
-    """The error for a library that cannot be imported: it states what needs the library, and how to install it.
+    """The error for a library that cannot be imported, although `what` needs the library.
 
-    `library` is its name. By default the library is the module in the exception.
+    `library` is the name of the library. By default, the library is the module in the exception.
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
@@ -156,7 +156,7 @@ def missing_library(error: ImportError, what: str, *hints: str, library: str = "
 
 
 def install_hint(library: str) -> str:
-    """How to install a library, by the name of its module."""
+    """The command that installs a library, by the name of the library's module."""
     return f"pip install {_PACKAGES.get(library, library)}"
 
 
@@ -171,10 +171,10 @@ _PACKAGES = {
 
 
 def place_in_user_file(error: BaseException) -> str | None:
-    """``FILE, line N: TEXT`` for the line of a user's file in which an exception was raised; None if there is none.
+    """``FILE, line N: text`` for the line of a user's file that raised an exception; None if there is no such line.
 
     The line is in the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this
-    package nor to an installed library. For a syntax error, the place is in the file that the error names.
+    package nor to an installed library. For a syntax error, the line is in the file that the error names.
     """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{short_path(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"
@@ -200,7 +200,7 @@ def exhausted(error: BaseException) -> InputError | None:
 
 
 def describe_error(error: BaseException) -> str:
-    """One line for an exception: type, message, and the line of a user's file in which it was raised, if any."""
+    """One line for an exception: type, message, and, if known, the line of a user's file that raised the error."""
     if isinstance(error, InputError):
         return error.message
     place = place_in_user_file(error)
@@ -215,6 +215,6 @@ def _is_of_user(file: str) -> bool:
 
 
 def short_path(file: str | Path) -> str:
-    """A path relative to the working folder if it is inside this folder."""
+    """A path, relative to the working folder if the path is inside the working folder."""
     path = Path(file).resolve()
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

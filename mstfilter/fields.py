@@ -12,10 +12,10 @@
 Traceback (most recent call last):
 mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
 
-Three annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded`. An example of such
-a subclass is the interface of a component, alone or as ``Interface | None``. Other annotations are documentation.
+Fields with three kinds of annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of
+`Bounded`, such as the interface of a component, alone or as ``Interface | None``. Other annotations are not checked.
 
-After these checks, a ``__post_init__`` is called for conditions on several fields.
+After the checks of single fields, ``__post_init__`` is called and can check conditions on several fields.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from mstfilter.errors import InputWarning, check_choice, check_component, check_
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. An int has only `at_least` and `at_most`."""
+    """Bounds of a number, for ``Annotated[float, Bounds(...)]``. For an int, use only `at_least` and `at_most`."""
 
     above: float = -math.inf
     at_least: float = -math.inf
     at_most: float = math.inf
     below: float = math.inf
-    unit: str = "number"  #: what the error calls a float: "expected a finite distance above 0"
-    hint: str = ""  #: what the user can do about a wrong value
+    unit: str = "number"  #: name of a float in the error, as in "expected a finite distance above 0"
+    hint: str = ""  #: hint for the user about a wrong value
 
 
 PositiveInt = Annotated[int, Bounds(at_least=1)]
@@ -94,7 +94,7 @@ def _checks(cls: Any) -> tuple[tuple[str, _Check], ...]:
 
 
 def _check_of(annotation: Any) -> _Check | None:
-    """The check of a field with this annotation, ``check(name, value)``; None if it has no bounds."""
+    """The check ``check(name, value)`` of a field with this annotation; None if the annotation has no bounds."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Literal:
         return functools.partial(check_choice, choices=parts)
@@ -120,7 +120,7 @@ _Component = TypeVar("_Component")
 
 
 def bound_to(component: _Component, **attributes: Any) -> _Component:
-    """A copy of a frozen component with further attributes, such as the files of a pause; they are no fields."""
+    """A copy of a frozen component with further attributes that are not fields, such as the files of a pause."""
     bound = copy.copy(component)
     for name, value in attributes.items():
         object.__setattr__(bound, name, value)

@@ -1,4 +1,4 @@
-"""Writing of files and folders such that a kill, a power failure or a second process cannot damage them.
+"""Writes files and folders safely: a kill, a power failure or a second process leaves no damaged file.
 
 >>> with atomic_path(folder / "metrics.csv") as path:
 ...     path.write_text(text, encoding="utf-8")
@@ -7,7 +7,7 @@
 
 A file or folder is written under a temporary name in the same folder, synced with the disk, and renamed when it is
 complete. If the block raises an error, the temporary file is removed and an earlier file is left unchanged. The next
-`locked` of the same name removes the remains of a killed process.
+call of `locked` with the same name removes the temporary files of a killed process.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep"] = "refuse") -> Iterator[Path]:
     """An empty temporary folder beside `path`, which is renamed to `path` at the end of the block.
 
-    `existing` determines what happens if `path` then has a folder with content: InputError is raised, the new folder
-    replaces it, or it is kept and the new folder is removed. An empty folder is always replaced.
+    `existing` determines the action if `path` then has a folder with content. "refuse" raises InputError, "replace"
+    removes the earlier folder, and "keep" removes the new folder. An empty folder is always replaced.
     """
     target = Path(os.path.realpath(path))
     _make_folders(target.parent)
@@ -97,10 +97,10 @@ def _place(partial: Path, target: Path, existing: str) -> None:
 
 @contextmanager
 def locked(path: str | Path) -> Iterator[None]:
-    """Reserve a file or folder, which need not exist, for this block. Removes the remains of a killed process.
+    """Reserve a file or folder, which need not exist, for this block. Removes temporary files of killed processes.
 
-    Raises InputError if another block of this or another process has reserved it. The lock is a file ``.NAME.lock``
-    beside `path`. The system releases the lock when the process ends. File systems without locks do not prevent it.
+    Raises InputError if another block or process has reserved `path`. The lock is a file ``.NAME.lock`` beside
+    `path`. The system releases the lock when the process ends. On file systems without locks, paths are not reserved.
     """
     target = Path(os.path.realpath(path))
     if _is_temporary(target.absolute()):  # no other process knows the name
@@ -127,7 +127,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def _reserve(file: Path, target: Path) -> int:
-    """Open and lock a lock file. If it is locked, raise InputError with the other process."""
+    """Open and lock a lock file. If the file is locked, raise InputError that names the other process."""
     while True:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
         with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file
@@ -144,7 +144,7 @@ def _reserve(file: Path, target: Path) -> int:
 
 
 def _lock(path: Path, flags: int) -> int | None:
-    """Open and lock a file or folder; None if it is already locked. Systems without locks only open the file."""
+    """Open and lock a file or folder; None if it is already locked. On systems without locks, only open the file."""
     descriptor = os.open(path, flags, 0o666)
     try:
         import fcntl
@@ -159,10 +159,10 @@ def _lock(path: Path, flags: int) -> int | None:
 
 
 def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> None:
-    """Remove temporary files in a folder, of all names or of one, whose process has ended.
+    """Remove temporary files of ended processes in a folder, for the file `name` or for all files.
 
-    If a process was killed while it replaced a folder, the earlier folder gets its name back. Give a minimum age
-    unless the name is locked, since another process may just have made a temporary file.
+    If a process was killed while it replaced a folder, the earlier folder gets its name back. Give `older_than_s`
+    unless the name is locked, because another process may just have made a temporary file.
     """
     for path in folder.iterdir() if folder.is_dir() else ():
         match = _TEMPORARY.fullmatch(path.name)
@@ -199,7 +199,7 @@ def _is_temporary(path: Path) -> bool:
 
 
 def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and its parents. Returns the folders that were missing, with the deepest first."""
+    """Make a folder and its parents. Returns the folders that were missing, the deepest folder first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     _sync(folder, *(path.parent for path in missing))
@@ -209,7 +209,7 @@ def _make_folders(folder: Path) -> list[Path]:
 def _sync(target: Path, *paths: Path) -> None:
     """Wait until files, and the names in folders, are stored on the disk.
 
-    If `target`, where they are or will be, is in a temporary folder, they are synced when that folder is complete.
+    If the final place `target` of the files is in a temporary folder, the complete folder is synced instead.
     """
     if os.name != "posix" or _is_temporary(target.absolute()):
         return
@@ -231,7 +231,7 @@ def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """Differences from the SHA256SUMS of a folder: ``state.npz has changed``, ``rgb.png is missing``."""
+    """Differences of a folder from its SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
     lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -249,7 +249,7 @@ def _fault(file: Path, digest: str) -> str:
 
 @contextmanager
 def reading(path: Path, kind: str, *hints: str) -> Iterator[None]:
-    """Convert errors in a block that reads a file to InputError. `kind` is what is missing without the file."""
+    """Convert errors in a block that reads a file to InputError. `kind` names the data, such as "a run folder"."""
     try:
         with naming(str(path)):
             yield
@@ -280,8 +280,8 @@ def writing(what: str, *hints: str) -> Iterator[None]:
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
-    An existing folder must be empty, unless `empty` is false. A file is made and removed for each name that does not
-    exist. Permissions alone do not show read-only file systems, long names, or a full disk.
+    An existing folder must be empty, unless `empty` is false. A file is made and removed for each missing name,
+    because permissions alone do not show read-only file systems, long names, or a full disk.
     """
     if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
@@ -308,7 +308,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
 
 
 def _try_to_write(folder: Path, temporary: Path) -> None:
-    """Make a file in a folder and remove it. Where possible the file has no name, so that a kill leaves nothing."""
+    """Make a file in a folder and remove it. If possible the file has no name, so that a kill leaves no file."""
     if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:
@@ -321,7 +321,7 @@ def _try_to_write(folder: Path, temporary: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8) in one step."""
+    """Write a text file (UTF-8) atomically."""
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="")
 
@@ -332,10 +332,10 @@ def write_csv(
     columns: Iterable[str] | None = None,
     float_format: str = "",
 ) -> None:
-    """Write rows as CSV in one step. None and NaN are written as empty cells.
+    """Write rows as CSV atomically. None and NaN are written as empty cells.
 
-    `columns` are written in this order. The default is all columns in the order of first appearance. `float_format`
-    is for example ``.6g``. The default writes all digits.
+    `columns` are written in the given order. The default is all columns in the order of first appearance. An example
+    of `float_format` is ``.6g``. The default format writes all digits.
     """
     rows = [{name: _cell(value, float_format) for name, value in row.items()} for row in rows]
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
@@ -360,7 +360,7 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
 def weights_file(given: str, name: str, where: str) -> tuple[str, str]:
     """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
 
-    Raises InputError if it is not given or does not exist; `where` is an address for the hint. The hash of an
+    Raises InputError if the file is not given or does not exist; `where` is an address for the hint. The hash of an
     unchanged file is computed once.
     """
     path = Path(given)

@@ -1,7 +1,7 @@
 """Scores of forecasts: Brier score, log loss, calibration, recalibration.
 
-A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. The
-table has how often each value of p was given, and how often the event then occurred. Tables can be pooled.
+A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. For each
+value of p, the table has the numbers of outcomes 0 and 1. Tables can be pooled.
 
 >>> import numpy as np
 >>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])
@@ -11,8 +11,7 @@ table has how often each value of p was given, and how often the event then occu
 >>> fit(np.array([0.2, 0.9])).tolist()
 [0.5, 0.999]
 
-A score is proper if no other forecast has a lower expected score than the true distribution. Brier score and log loss
-are proper.
+A score is proper if the true probability has the lowest expected score. Brier score and log loss are proper.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ SOFTENING = 0.02  # e of p <- (1 - e) p + e / 2, so that a forecast of 0 or 1 ha
 
 @dataclass(frozen=True, eq=False)
 class ForecastTable:
-    """How often each forecast was given, and how often the event then occurred.
+    """A table of the numbers of outcomes 0 and 1 of each distinct forecast.
 
     Parameters
     ----------
@@ -65,14 +64,14 @@ class ForecastTable:
 
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
-        """All forecasts of several tables."""
+        """A table of all forecasts of several tables."""
         p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
         count = no + yes
         return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)
 
     @cached_property
     def count(self) -> np.ndarray:
-        """(k,) number of forecasts of each value."""
+        """Number (k,) of times that each forecast was given."""
         return self.no + self.yes
 
     @property
@@ -86,9 +85,9 @@ class ForecastTable:
         return self._mean(self.no * self.p**2 + self.yes * (1 - self.p) ** 2)
 
     def log_loss(self, softening: float = 0.0) -> float:
-        """Mean of -log of the probability given to the outcome, in nats; infinite if an outcome had probability 0.
+        """Mean of -log of the forecast probability of the outcome, in nats; infinite if an outcome had probability 0.
 
-        With a softening e, p is replaced by (1 - e) p + e / 2.
+        A `softening` e replaces p by (1 - e) p + e / 2.
         """
         p = (1 - softening) * self.p + softening / 2
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -97,14 +96,14 @@ class ForecastTable:
         return self._mean(loss)
 
     def with_forecasts(self, p: np.ndarray) -> ForecastTable:
-        """The same outcomes with other forecasts p (k,)."""
+        """A table of the same outcomes with other forecasts p (k,)."""
         share = np.divide(self.yes, self.count, out=np.zeros_like(self.yes), where=self.count > 0)
         return ForecastTable.of(p, share, self.count)
 
     def reliability(self, n_bins: int = 10) -> Reliability:
         """The reliability diagram on bins of equal numbers of forecasts.
 
-        Equal forecasts stay in one bin, so the sizes of bins differ where a forecast is frequent.
+        Equal forecasts stay in one bin, so bins can have different sizes.
         """
         middle = np.cumsum(self.count) - self.count / 2  # rank of each forecast
         which = np.minimum((n_bins * middle / max(self.n, 1e-300)).astype(np.int64), n_bins - 1)
@@ -125,9 +124,9 @@ class Reliability:
     forecast : (b,) float
         Mean forecast of each bin.
     frequency : (b,) float
-        Share of the forecasts in the bin whose event occurred.
+        Share of the forecasts in the bin for which the event occurred.
     count : (b,) float
-        Number of forecasts.
+        Number of forecasts in each bin.
     """
 
     forecast: np.ndarray

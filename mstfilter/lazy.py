@@ -1,13 +1,13 @@
-"""Lazy imports: names of packages that are imported when they are first used, and methods that import drawing code.
+"""Lazy imports: names of a package are imported at their first use, and methods import drawing code when called.
 
-A package's ``__init__.py`` has its documentation and two lines::
+The ``__init__.py`` of a package has its documentation and two lines:
 
-    from mstfilter.lazy import attach
-    __getattr__, __dir__, __all__ = attach(__name__, __file__)
+>>> from mstfilter.lazy import attach
+>>> __getattr__, __dir__, __all__ = attach(__name__, __file__)      # doctest: +SKIP
 
-The ``__init__.pyi`` lists the names, with one ``from module import name as name`` statement per module. Type checkers
-read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera`` imports only the
-module of `Camera` (the scheme of Scientific Python's SPEC 1).
+The stub ``__init__.pyi`` lists the public names, with one ``from module import name as name`` statement per module.
+Type checkers read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera``
+imports only the module of `Camera` (the scheme of Scientific Python's SPEC 1).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from typing import Any
 
 
 def exported(init: str | Path) -> dict[str, str]:
-    """Mapping from names to modules, as the stub beside an ``__init__.py`` lists them."""
+    """Mapping from public names to modules, from the stub beside an ``__init__.py``."""
     tree = ast.parse(Path(init).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [statement for statement in tree.body if isinstance(statement, ast.ImportFrom)]
     return {alias.name: str(statement.module) for statement in imports for alias in statement.names}
 
 
 def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose stub lists its public names."""
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package with a stub that lists the public names."""
     modules = exported(init)
     names = sorted(modules)
 
@@ -45,7 +45,7 @@ def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], 
 
 
 def short_repr(component: Any) -> str:
-    """The text of a dataclass with the fields that differ from their defaults; for another class, its name."""
+    """The text of a dataclass with the fields that differ from their defaults; the class name for other objects."""
     parts = []
     for field in dataclasses.fields(component) if dataclasses.is_dataclass(component) else ():
         value = getattr(component, field.name, None)
@@ -66,10 +66,10 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def late(location: str, summary: str) -> Callable[..., Any]:
-    """A method that calls ``module:function``, which is imported at the first call.
+    """A method that calls ``module:function`` and imports the module at the first call.
 
-    `late` is used for methods that draw, and for the rules of pauses. So `mstfilter.scene` and `mstfilter.smc` do not
-    depend on `mstfilter.report` and `mstfilter.formats`.
+    Methods that draw and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend
+    on `mstfilter.report` and `mstfilter.formats`.
     """
     module, _, name = location.partition(":")
 
@@ -83,9 +83,9 @@ def late(location: str, summary: str) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> Iterator[Callable[..., None]]:
-    """The function to call for progress: of a bar of `mstfilter.report.progress` if `progress` is True.
+    """The function that reports progress: of a bar of `mstfilter.report.progress` if `progress` is True.
 
-    In other cases the function is `progress` itself, or a function that does nothing if `progress` is False.
+    Otherwise the function is `progress` itself, or a function without effect if `progress` is False.
     """
     if progress is True:
         with getattr(import_module("mstfilter.report.progress"), bars)(*([what] if what else [])) as advance:

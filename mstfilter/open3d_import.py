@@ -1,10 +1,10 @@
-"""The only place that imports open3d, which is large and needs system libraries.
+"""The only module that imports open3d, which is large and needs system libraries.
 
 >>> from mstfilter.open3d_import import import_open3d
 >>> o3d = import_open3d()                            # doctest: +SKIP
 >>> o3d.geometry.PointCloud()                        # doctest: +SKIP
 
-Components call this function when they need open3d. No default component needs open3d.
+Components call `import_open3d` when they need open3d. No default component needs open3d.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def import_open3d() -> ModuleType:
     """Import open3d, limited to one thread.
 
     With several threads the order of a parallel sum varies, so the last digits of results vary. Raises
-    MissingLibraryError if the package or a system library that it needs is missing.
+    MissingLibraryError if the package or a required system library is missing.
     """
     try:
         open3d = import_module("open3d")

@@ -1,21 +1,21 @@
-"""Assembled filters by name.
+"""Presets, which are assembled filters that have names.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst")
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
-``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
-TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset, or
-``models/base.toml``, which has the common parts of `mst` and its baselines:
+``mst`` is the default, ``paper`` is the published algorithm, and ``authors`` is the program of its authors. A preset
+is a TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset,
+or ``models/base.toml``, which has the common parts of `mst` and its baselines:
 
-    base = "base"                           # fields that are not named here are those of the base
+=======================================  =============================================================================
+``base = "base"``                        fields that are not named in the file are those of the base
+``transition = "identity"``              naming a component resets its fields
+``proposal.completer = "extrude"``       naming a field keeps the other fields
+``wrap = { proposal = "first_pause" }``  the base's proposal becomes the field `proposal` of this component
+=======================================  =============================================================================
 
-    transition = "identity"                 # naming a component resets its fields
-    proposal.completer = "extrude"          # naming a field keeps the others
-
-    wrap = { proposal = "first_pause" }     # the base's proposal becomes the field `proposal` of this component
-
-``base`` itself has no update. `base` can be extended but is not a preset.
+``base`` has no update. ``base`` can be extended but is not a preset.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ _FIELDS = (
 
 
 def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> ParticleFilter:
-    """The filter of a preset, by name or path of a TOML file, with overrides ``path=value``."""
+    """The filter of a preset, by its name or by the path of a TOML file, with overrides ``path=value``."""
     return build_filter(load_config(name, overrides, allow_files=allow_files), allow_files=allow_files)
 
 
 def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool = True) -> dict[str, Any]:
-    """The configuration of a preset with overrides. Unknown names raise InputError; no component is imported."""
+    """The configuration of a preset with overrides. Unknown names raise InputError. No component is imported."""
     config = settings(overrides, _read(name))
     unknown = set(config) - {*_META, *_FIELDS}
     if unknown:
@@ -100,7 +100,7 @@ def build_filter(config: Mapping[str, Any], *, allow_files: bool = False) -> Par
 
 
 def describe_filter(filter: ParticleFilter) -> dict[str, Any]:
-    """The configuration that builds a filter again, defaults included."""
+    """The configuration that builds an equal filter, including defaults."""
     config = REGISTRY.describe(filter)
     config.pop("component")
     return config

@@ -1,11 +1,11 @@
-"""Processes that this package starts, and the machine on which they run.
+"""Processes and threads that this package starts, and the machine on which they run.
 
 >>> with environment(OMP_NUM_THREADS="1"):
 ...     pool = ProcessPoolExecutor(2)
 
-New interpreters put the working folder first in the path of modules. In a folder with unknown files, a file
-``multiprocessing.py`` would then be executed. Processes that are started in the block do not search the working
-folder first. The modules of the caller are found, because `multiprocessing` and joblib pass on the path of modules.
+A new Python interpreter puts the working folder first in its module search path. So a file ``multiprocessing.py`` in
+a folder with unknown files would be executed. Processes that are started in the block do not search the working
+folder first. New processes find the caller's modules, because `multiprocessing` and joblib pass on the search path.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _B = TypeVar("_B")
 
 @contextmanager
 def environment(**variables: str) -> Iterator[None]:
-    """Set environment variables in the block, and PYTHONSAFEPATH for the processes that are started there."""
+    """Set environment variables in the block, and PYTHONSAFEPATH for the processes that the block starts."""
     variables = {"PYTHONSAFEPATH": "1", **variables}
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
@@ -70,7 +70,7 @@ def check_main_guard(what: str) -> None:
 
 @functools.cache
 def machine() -> dict[str, Any]:
-    """Properties that affect the last bits of results besides versions: CPU model and BLAS library of numpy."""
+    """Properties of the machine that affect the last bits of results, such as CPU model and BLAS library of numpy."""
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     return {"cpu": _cpu(), "system": platform.system(), "blas": f"{blas.get('name')} {blas.get('version')}"}
 
@@ -91,7 +91,7 @@ _pools: list[ThreadPoolExecutor] = []  # of the blocks `parallel`, innermost las
 
 @contextmanager
 def parallel(n_threads: int) -> Iterator[None]:
-    """In the block, `together` uses up to `n_threads` threads of this process. The results are the same."""
+    """In the block, `together` uses up to `n_threads` threads of this process. The threads do not change results."""
     if n_threads < 2:
         yield
         return
@@ -121,7 +121,7 @@ def together(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]
 def each(function: Callable[[_A], _B], items: Iterable[_A]) -> list[_B]:
     """The results of a function for several items, computed two at a time in a block `parallel`.
 
-    The calls are independent and free of side effects.
+    The calls must be independent and free of side effects.
     """
     given = list(items)
     found: dict[int, _B] = {}

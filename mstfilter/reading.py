@@ -1,11 +1,11 @@
-"""Reading files of unknown origin.
+"""Reads files of unknown origin safely.
 
 >>> info = read_json(folder / "info.json", "a run folder")
 >>> arrays = read_arrays(folder / "truth.npz", "true volumes")
 
-All readers use `open_regular`, which opens only regular files. Reading a pipe or a device might never end. The file
-size is compared with a limit. The unpacked size is read from headers before memory is allocated. All errors are
-`InputError` with the name of the file.
+All readers use `open_regular`, which opens only regular files, because reading a pipe or a device might never end.
+The file size is compared with a limit. The unpacked size of arrays is read from headers before memory is allocated.
+All errors are `InputError` with the name of the file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _Model = TypeVar("_Model", bound="BaseModel")
 def open_regular(path: str | Path, limit: int | None = None) -> Iterator[io.BufferedReader]:
     """A regular file of at most `limit` bytes, opened for reading. Raises InputError for other files.
 
-    The default of all limits is `MAX_FILE`.
+    The default of `limit` is `MAX_FILE`.
     """
     # Without O_NONBLOCK the call waits for the other end of a pipe.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -59,25 +59,25 @@ def open_regular(path: str | Path, limit: int | None = None) -> Iterator[io.Buff
 
 
 def read_bytes(path: Path, kind: str, *hints: str, limit: int | None = None) -> bytes:
-    """The content of a regular file of at most `limit` bytes. Other parameters and errors: `reading`."""
+    """The content of a regular file of at most `limit` bytes. See `reading` for the other parameters."""
     with reading(path, kind, *hints), open_regular(path, limit) as file:
         return file.read()
 
 
 def read_text(path: Path, kind: str, *hints: str, limit: int = MAX_TEXT) -> str:
-    """The content of a text file (UTF-8) of at most `limit` bytes. Other parameters and errors: `reading`."""
+    """The content of a UTF-8 text file of at most `limit` bytes. See `reading` for the other parameters."""
     with reading(path, kind, *hints):
         return read_bytes(path, kind, *hints, limit=limit).decode("utf-8-sig")
 
 
 def read_json(path: Path, kind: str, *hints: str) -> Any:
-    """The content of a JSON file. Parameters and errors: `reading`."""
+    """The content of a JSON file. See `reading` for the parameters."""
     with reading(path, kind, *hints):
         return json.loads(read_text(path, kind, *hints))
 
 
 def read_toml(path: Path, kind: str, *hints: str) -> dict[str, Any]:
-    """The content of a TOML file. Parameters and errors: `reading`."""
+    """The content of a TOML file. See `reading` for the parameters."""
     text = read_text(path, kind, *hints, limit=MAX_TOML)
     try:
         return tomllib.loads(text)
@@ -86,9 +86,9 @@ def read_toml(path: Path, kind: str, *hints: str) -> dict[str, Any]:
 
 
 def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple[_Model, dict[str, Any]]:
-    """A JSON file checked by a pydantic model. Returns the model, and the values as they are stored.
+    """Read a JSON file and check it with a pydantic model. Returns the model, and the stored values.
 
-    Other parameters and errors: `reading`. An error names the first wrong entry and the value found.
+    See `reading` for the other parameters. An error names the first wrong entry and the value found.
     """
     from pydantic import ValidationError
 
@@ -106,9 +106,7 @@ def read_model(path: Path, model: type[_Model], kind: str, *hints: str) -> tuple
 def read_arrays(path: Path, kind: str, *hints: str, limit: int | None = None) -> dict[str, np.ndarray]:
     """All arrays of an .npz file that needs at most `limit` bytes of memory.
 
-    The array of an .npy file has the name "".
-
-    Other parameters and errors: `reading`.
+    The array of an .npy file has the name "". See `reading` for the other parameters.
     """
     with reading(path, kind, *hints), open_regular(path, limit) as file:
         if file.peek(6).startswith(b"\x93NUMPY"):
@@ -134,7 +132,7 @@ def unpack_arrays(file: IO[bytes], limit: int | None = None) -> dict[str, np.nda
 
 
 def _check_array(file: IO[bytes], size: int) -> None:
-    """Raise ValueError unless the array of a .npy file of `size` bytes fits into it and has no objects."""
+    """Raise ValueError unless the array of a .npy file needs at most the `size` of the file and has no objects."""
     first = np.lib.format.read_magic(file) == (1, 0)
     shape, _, dtype = (np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0)(file)
     if dtype.hasobject:

@@ -1,10 +1,10 @@
-"""Components by name, and components from configuration.
+"""Finds components by name, and builds components from a configuration.
 
-A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind to the class that components
-of this kind inherit. ``__components__`` maps the names of a kind to classes, or to ``/path/of/file.py:Class``::
+A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class
+that the components inherit. ``__components__`` maps kinds to names, and names to classes or ``/a/file.py:Class``:
 
-    __interfaces__ = {"resampler": "Resampler"}
-    __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
+>>> __interfaces__ = {"resampler": "Resampler"}
+>>> __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
 
 A `Registry` joins the declarations of several packages. `mstfilter.presets.REGISTRY` joins all packages:
 
@@ -14,11 +14,11 @@ Systematic()
 >>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
 A configuration is a nested mapping. A component in a configuration is a name, or a mapping with ``component`` and
-fields. The kind of a field follows from its annotation. A field of type ``Resampler`` or ``Resampler | None`` holds a
-resampler, and one of type ``tuple[Evidence, ...]`` a list of evidence.
+fields. The annotation of a field determines its kind. A field of type ``Resampler`` or ``Resampler | None`` holds a
+resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
 
-A component is imported when it is first built. Looking up a name imports nothing. Users name their own class as
-``./file.py:Class`` (if `allow_files` is True), or add it by an entry point ``kind.name`` of the group
+A component is imported when it is first built. Looking up a name imports no component. Users name their own class as
+``./file.py:Class`` (if `allow_files` is True), or add the class by an entry point ``kind.name`` of the group
 ``mstfilter.components``. A relative path is relative to the working folder. A file is executed once per process, and
 again if its content has changed.
 """
@@ -49,7 +49,7 @@ _ENTRY_POINTS = "mstfilter.components"
 
 @functools.cache
 def _installed_components() -> tuple[tuple[str, str], ...]:
-    """Name and location of each entry point. The search reads the metadata of all installed packages (15 ms)."""
+    """Name and location of each entry point. The search reads the metadata of all installed packages in 15 ms."""
     return tuple((entry.name, entry.value) for entry in entry_points(group=_ENTRY_POINTS))
 
 
@@ -74,7 +74,7 @@ class Registry:
         return tuple(self._components)
 
     def known(self, kind: str) -> dict[str, str]:
-        """Mapping from names of a kind to locations ``package:Class``, including entry points."""
+        """Mapping from the names of components of a kind to locations ``package:Class``, including entry points."""
         names = dict(self._components[kind])
         for full_name, location in _installed_components():
             entry_kind, _, name = full_name.partition(".")
@@ -83,11 +83,11 @@ class Registry:
         return names
 
     def interface(self, kind: str) -> type:
-        """The class that components of a kind inherit; imports it."""
+        """Import the class that components of a kind inherit."""
         return _import(next(where for where, other in self._interfaces.items() if other == kind))
 
     def kind_of(self, annotation: Any) -> str | None:
-        """The kind of component that a field with this annotation holds; None if it holds a plain value."""
+        """The kind of component that a field with this annotation holds; None if the field holds a plain value."""
         for part in typing.get_args(annotation) or (annotation,):
             for base in getattr(part, "__mro__", ()):
                 kind = self._interfaces.get(_location_of(base))
@@ -96,9 +96,9 @@ class Registry:
         return None
 
     def check_names(self, cls: type, config: Mapping[str, Any], allow_files: bool = False) -> None:
-        """Raise InputError if a field of `cls` names an unknown component; imports no component.
+        """Raise InputError if a field of `cls` names an unknown component, without importing components.
 
-        `make` checks names deeper in the configuration, since it imports what it builds.
+        `make` checks names in nested components, because `make` imports components.
         """
         hints = typing.get_type_hints(cls)
         for field, value in config.items():
@@ -108,7 +108,7 @@ class Registry:
                 self._locate(kind, name, field, allow_files)
 
     def find_class(self, kind: str, name: str, where: str | None = None, allow_files: bool = False) -> type:
-        """The class of a component name, which is imported."""
+        """Import the class of a component, by name."""
         location = self._locate(kind, name, where or kind, allow_files)
         path, _, attribute = location.partition(":")
         if path.endswith(".py"):
@@ -152,8 +152,8 @@ class Registry:
     ) -> Any:
         """A component from its name, or from a mapping with ``component`` and fields.
 
-        A mapping without ``component`` changes fields of `default`. `where` is the path in the configuration, for
-        messages. With `allow_files`, ``./file.py:Class`` is loaded.
+        A mapping without ``component`` changes fields of `default`. Messages name `where`, the path in the
+        configuration. With `allow_files`, ``./file.py:Class`` is loaded.
         """
         where = where or kind
         if isinstance(spec, str):
@@ -175,7 +175,6 @@ class Registry:
         """Build a dataclass from plain values and nested components.
 
         Fields that are not given have the values of `base`.
-
         Raises InputError if a field or a component is unknown, or a value does not fit its field.
         """
         prefix = f"{where}: " if where else ""
@@ -214,7 +213,7 @@ class Registry:
             raise InputError(f"{prefix}{cls.__name__} cannot be made: {error}") from error
 
     def _value(self, hint: Any, value: Any, current: Any, path: str, allow_files: bool) -> Any:
-        """The value of a field with annotation `hint`. `current` is its default or its value in `base`."""
+        """The value of a field with annotation `hint`. `current` is the field's default or its value in `base`."""
         kind = self.kind_of(hint)
         default = current if dataclasses.is_dataclass(current) else None
         if kind is not None and typing.get_origin(hint) is tuple and isinstance(value, str):
@@ -232,7 +231,7 @@ class Registry:
         return _plain(hint, value, path)
 
     def describe(self, component: Any) -> dict[str, Any]:
-        """The configuration that builds a component again."""
+        """The configuration that builds an equal component."""
         out: dict[str, Any] = {"component": self.name_of(type(component))}
         for field in dataclasses.fields(component):
             value = getattr(component, field.name)
@@ -257,7 +256,7 @@ class Registry:
 
 
 def settings(overrides: Iterable[str], config: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Apply changes (``path=value``) to a configuration. Without one, return them as a nested dictionary."""
+    """Apply changes (``path=value``) to a configuration. The default configuration is empty."""
     return merged(config or {}, *map(_nested, overrides))
 
 
@@ -306,7 +305,7 @@ def nested_components(component: Any) -> Iterator[Any]:
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """The default of a dataclass field, from its factory if it has one; MISSING if there is no default."""
+    """The default of a dataclass field, from its default factory if it has one; MISSING if there is no default."""
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
@@ -325,7 +324,7 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """``package:Class``, where classes of mstfilter belong to their top package, or ``file.py:Class``."""
+    """Location ``package:Class`` or ``file.py:Class``. Classes of mstfilter belong to their top package."""
     if "__mst_file__" in vars(cls):
         return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
@@ -354,7 +353,7 @@ def load_file(path: str | Path) -> ModuleType:
     """The module of a Python file of the user.
 
     A file is executed once per process for any spelling of its path, and again if its content has changed. Instances
-    of its classes can be pickled, since the process that reads them loads the file.
+    of its classes can be pickled, because unpickling loads the file.
 
     Raises InputError if the file cannot be read or executed.
     """
@@ -403,7 +402,7 @@ def _classes_of(module: ModuleType) -> list[type]:
 
 
 def _reduce(instance: object, protocol: Any) -> Any:
-    """As `object.__reduce_ex__`, with the path of the file, since other processes cannot import its module."""
+    """Pickle an instance with the path of its file, because other processes cannot import the module by name."""
     reduced: Any = object.__reduce_ex__(instance, max(int(protocol), 2))
     how, arguments, *state = reduced
     cls = type(instance)
@@ -414,7 +413,7 @@ def _reduce(instance: object, protocol: Any) -> Any:
 
 
 def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """An instance without its state, of a class of a user's file with this content."""
+    """An instance without its state. The user's file of the class must have the hash `digest`."""
     module = _MODULES.get((Path(path), digest)) or load_file(path)
     cls = getattr(module, name)
     if cls.__mst_source__ != digest:
@@ -423,7 +422,7 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:
-    """A plain value checked against a field's annotation. A single value of a ``tuple[X, ...]`` needs no list."""
+    """A plain value, checked against a field's annotation. A single value of a ``tuple[X, ...]`` needs no list."""
     from pydantic import TypeAdapter, ValidationError
 
     if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):

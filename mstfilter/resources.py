@@ -1,9 +1,10 @@
-"""Files that are part of the package: presets, weights and their training (`models/`), example components.
+"""Files that are part of the package: presets, weights, training programs (`models/`) and example components.
 
 >>> models_folder() / "mst.toml"
 >>> examples_folder() / "resampler.py"
 
-In a wheel, both folders are inside the package. In a checkout or an editable install, they are beside the package.
+In a wheel, the folders of models and examples are inside the package. In a checkout or an editable install, the
+folders of models and examples are beside the package.
 """
 
 from __future__ import annotations
@@ -15,23 +16,23 @@ from types import ModuleType
 
 from mstfilter.errors import InputError, suggestion
 
-BASE = "base"  #: What `mst` and its baselines share; not a preset, since it has no update
+BASE = "base"  #: The common parts of `mst` and its baselines; not a preset, because `base` has no update
 
 
 def models_folder() -> Path:
-    """The folder that holds presets and weights."""
+    """The folder of presets and weights."""
     return _folder_with("mst.toml", "_models", "models")
 
 
 def examples_folder() -> Path:
-    """The folder that holds the example components of the documentation, and their tests."""
+    """The folder of the example components of the documentation, and of the tests of the example components."""
     return _folder_with("resampler.py", "_examples", "docs/examples")
 
 
 def training_program(name: str) -> ModuleType:
     """A module of `models/mst_training`, which contains the programs that trained the weights.
 
-    The folder stays in `sys.path`, so that processes which a training starts find the module.
+    The folder stays in `sys.path`, so that processes started by a training find the module.
     """
     folder = str(models_folder())
     if folder not in sys.path:
@@ -40,7 +41,7 @@ def training_program(name: str) -> ModuleType:
 
 
 def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
-    """A folder inside the installed package, or beside it in a checkout."""
+    """A folder inside the installed package, or beside the package in a checkout."""
     package = Path(__file__).resolve().parent
     folders = (package / installed, package.parent / in_checkout)
     for folder in folders:
@@ -50,12 +51,12 @@ def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
 
 
 def preset_names() -> list[str]:
-    """Presets of the package, without `base`, which they extend."""
+    """Names of the presets of the package, without `base`."""
     return sorted({path.stem for path in models_folder().glob("*.toml")} - {BASE})
 
 
 def find_preset(name: str, to_extend: bool = False) -> Path:
-    """The TOML file of a preset, by name or path. `base` is found only if it is to be extended."""
+    """The TOML file of a preset, by name or path. `base` is found only with `to_extend`."""
     given = Path(name)
     if given.suffix == ".toml":
         if given.is_file():

@@ -1,7 +1,7 @@
 """Checks of the results of components' methods.
 
-An interface states the check of a result beside the method. The check applies to every class that defines the method.
-The error names the class, the file and the line of the method:
+An interface declares the check of a result beside the method. The check applies to every class that defines the
+method. The error of a failed check names the class, the file and the line of the method:
 
 >>> class Score(Checked):
 ...     @returns(lambda self, found, particles: check_array(found, (len(particles),)))
@@ -12,7 +12,7 @@ The error names the class, the file and the line of the method:
 >>> Mine().score((1, 2))                       # doctest: +SKIP
 InputError: Mine.score (mine.py, line 2) returns a list, expected an array of shape (2,)
 
-A method that changes its read-only input is reported in the same way.
+The error of a method that changes its read-only input has the same form.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Checked(Bounded):
 
 
 def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
-    """A method whose result is checked, unless the method of a subclass calls it, which is checked itself."""
+    """A method with a checked result. A call by an overriding method of a subclass is not checked again."""
 
     @functools.wraps(method)
     def call(self: Any, *arguments: Any, **named: Any) -> Any:
@@ -87,7 +87,7 @@ def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
 
 
 def warn_once(component: Any, method: str, message: str, *hints: str) -> None:
-    """Warn of an unusual result of a method. Each message appears once per class and process."""
+    """Warn about an unusual result of a method. Each message appears once per class and process."""
     key = type(component), method, message.split(":")[0]
     if key not in _WARNED:
         _WARNED.add(key)
@@ -98,7 +98,7 @@ _WARNED: set[tuple[type, str, str]] = set()
 
 
 def _name_of(component: Any, method: str) -> str:
-    """``Class.method (file, line n)``; without the place for methods of this package."""
+    """The text ``Class.method (file, line n)``, or ``Class.method`` for methods of this package."""
     code = getattr(inspect.unwrap(getattr(type(component), method)), "__code__", None)
     name = f"{type(component).__name__}.{method}"
     if code is None or not Path(code.co_filename).is_file() or Path(code.co_filename).is_relative_to(_PACKAGE):
@@ -107,7 +107,7 @@ def _name_of(component: Any, method: str) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """A value in an error message: its type, and the type and shape of an array."""
+    """The text of a value in an error message: its type, and for an array also the type and shape."""
     if value is None or isinstance(value, (bool, int, float)):
         return repr(value)
     if isinstance(value, type):
@@ -121,7 +121,7 @@ def describe_value(value: Any) -> str:
 
 
 def check_type(found: Any, kind: type | tuple[type, ...], expected: str, *hints: str) -> Any:
-    """A result; InputError unless it is an instance of a type."""
+    """Return a result; raise InputError unless the result is an instance of a type."""
     if not isinstance(found, kind):
         why = ("does every branch of the method return it?",) if found is None else hints
         raise InputError(f"returns {describe_value(found)}, expected {expected}", *why)
@@ -129,7 +129,7 @@ def check_type(found: Any, kind: type | tuple[type, ...], expected: str, *hints:
 
 
 def check_list(found: Any, n: int, kind: type | tuple[type, ...], expected: str) -> list[Any]:
-    """A result as a list; InputError unless it is a list or tuple of `n` instances of a type."""
+    """Return a result as a list; raise InputError unless it is a list or tuple of `n` instances of a type."""
     check_type(found, (list, tuple), f"a list of {expected}")
     if len(found) != n:
         raise InputError(f"returns {len(found)} results, expected {n}, one for each input")
@@ -140,7 +140,7 @@ def check_list(found: Any, n: int, kind: type | tuple[type, ...], expected: str)
 
 
 def check_pair(found: Any, first: str, second: str) -> tuple[Any, Any]:
-    """A result of two values; InputError unless it is a tuple or list of two."""
+    """Return a result of two values; raise InputError unless it is a tuple or list of two values."""
     check_type(found, (tuple, list), f"{first} and {second}")
     if len(found) != 2:
         raise InputError(f"returns {len(found)} values, expected {first} and {second}")
@@ -155,7 +155,7 @@ def check_array(
     at_most: float = math.inf,
     finite: bool = True,
 ) -> np.ndarray:
-    """A result as an array; InputError unless its type, shape and values are as expected.
+    """Return a result as an array; raise InputError unless its type, shape and values are as expected.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def check_array(
 
 
 def check_probabilities(found: Any, shape: Sequence[int]) -> np.ndarray:
-    """A result as an array of probabilities or bool; InputError unless it is one of this shape."""
+    """Return a result as an array of probabilities or bool; raise InputError unless the result has this shape."""
     return check_array(found, shape, "biuf", 0, 1)
 
 
@@ -216,7 +216,7 @@ def check_rigid(T: np.ndarray, name: str) -> None:
 
 
 def _conversion(found: Any) -> list[str]:
-    """How to convert an array to another type."""
+    """Hints for converting a result to an array."""
     if found is None:
         return ["does every branch of the method return it?"]
     if hasattr(found, "detach"):
@@ -238,7 +238,7 @@ _BOUND = ("a score of -inf rules a hypothesis out: bound it from below",)
 
 
 def _scaling(low: float, high: float) -> list[str]:
-    """How to convert other numbers to probabilities."""
+    """Hints for converting other numbers to probabilities."""
     if high <= _TOLERANCE:
         return ["of log probabilities: np.exp(values)"]
     if low < 0:

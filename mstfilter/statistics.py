@@ -1,4 +1,4 @@
-"""Paired differences between methods (arms), and the conclusions that they allow.
+"""Paired differences between methods (arms), and the conclusions from such differences.
 
 >>> difference = compare([0.9, 0.8, 0.8], [0.7, 0.7, 0.6])
 >>> round(difference.mean, 3), difference.n
@@ -10,10 +10,10 @@
 Values are paired by unit: a scene, a data set, or a seed that all arms share. Units must be independent. So values of
 several filter seeds on one scene are averaged first. A difference has a t interval, a studentised bootstrap interval,
 and the p values of a sign-flip test and of the studentised bootstrap. The t interval and the sign-flip test assume
-that the differences are symmetric about zero under the null hypothesis. Squared errors are skewed, and differences of
-them often are too. So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is small.
-`p_claim` is the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method.
-`experiments/comparison` has the error rates and the power of this rule.
+that the differences are symmetric about zero under the null hypothesis. Differences of squared errors are often
+skewed. So a difference is claimed only if both intervals exclude 0 and `Difference.p_claim` is small. `p_claim` is
+the larger p value times 1 + abs(skewness). The p values of one table are adjusted by Holm's method.
+`experiments/comparison` has the error rates and the power of this test procedure.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class Difference:
     p : float
         Two-sided p value of the sign-flip test; NaN for one unit.
     n : int
-        Number of units that both arms have.
+        Number of units with a value in both arms.
     p_holm : float
         `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
         Two-sided p value of the studentised bootstrap, see `studentised_bootstrap`; NaN for fewer than five units.
     skewness : float
-        Sample skewness of the differences; 0 if they are equal.
+        Sample skewness of the differences; 0 if all differences are equal.
     """
 
     mean: float
@@ -71,8 +71,8 @@ class Difference:
     def p_claim(self) -> float:
         """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
-        The factor accounts for the tail that a small sample of skewed differences often lacks. The factor was chosen
-        by simulation and is not derived; see `experiments/comparison`.
+        A small sample of skewed differences often has no values from the longer tail. The factor corrects the p value
+        for this missing tail. The factor was chosen by simulation in `experiments/comparison`.
         """
         return float(np.minimum(1, np.fmax(self.p, self.p_bootstrap) * (1 + abs(self.skewness))))
 
@@ -88,7 +88,7 @@ Values = Mapping[Any, float] | Sequence[float] | np.ndarray
 
 
 def compare(first: Values, second: Values) -> Difference:
-    """First minus second over the units that both have.
+    """The difference `first` minus `second` over the units that have values in `first` and in `second`.
 
     Parameters
     ----------
@@ -136,12 +136,12 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
-    NaN for fewer than five values. The random generator is fixed, so the same values give the same result. A resample
-    of equal values has an infinite t ratio. So a limit is infinite if most values are equal.
+    The results are NaN for fewer than five values. The seed is fixed, so the same values give the same result. A
+    resample of equal values has an infinite t ratio. So a limit of the interval is infinite if most values are equal.
 
-    The p value is the larger of two. The equal-tailed p value follows the skewness like the interval (Efron,
-    Tibshirani 1993, section 12.5). The p value of the absolute t ratio is larger for symmetric values with heavy
-    tails (Hall 1992, section 3.6).
+    The p value is the larger of two p values. The equal-tailed p value adapts to the skewness like the interval
+    (Efron, Tibshirani 1993, section 12.5). The p value of the absolute t ratio is larger for symmetric values with
+    heavy tails (Hall 1992, section 3.6).
     """
     n, mean = len(values), float(values.mean())
     if n < 5:
@@ -157,9 +157,9 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
 
 
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
-    """(mean of a resample - mean) / standard deviation of the resample.
+    """Ratios (mean of a resample - mean) / (standard deviation of the resample) of all resamples.
 
-    The ratios of resamples of equal values are infinite. Infinite ratios are +-1e200, since quantiles interpolate.
+    The ratio of a resample of equal values is infinite. Quantiles interpolate, so infinite ratios are set to +-1e200.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]
@@ -202,7 +202,7 @@ def sign_flip(values: np.ndarray) -> float:
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """p values adjusted by Holm's method (1979). NaN marks a missing comparison and stays NaN."""
+    """p values, adjusted by Holm's method (1979). NaN marks a missing comparison and is not changed."""
     values = np.asarray(p, dtype=float)
     out = np.full(len(values), np.nan)
     order = [k for k in np.argsort(values) if np.isfinite(values[k])]
@@ -214,19 +214,19 @@ def holm(p: Sequence[float]) -> np.ndarray:
 
 
 def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Difference]:
-    """Every arm minus the reference, with p values adjusted together.
+    """Differences of every arm from the reference, with p values adjusted for all comparisons.
 
     Parameters
     ----------
     table : mapping
         Arm -> values, as for `compare`.
     reference : str
-        The arm with which the others are compared.
+        The arm with which the other arms are compared.
 
     Returns
     -------
     dict
-        Mapping from arms to `Difference`, without the reference.
+        Mapping from arms, without the reference, to `Difference`.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")
@@ -236,7 +236,7 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
 
 
 def slope(times: np.ndarray, values: np.ndarray) -> float:
-    """Least-squares slope of values over times; NaN for fewer than two."""
+    """Least-squares slope of values over times; NaN for fewer than two times."""
     return float(np.polyfit(times, values, 1)[0]) if len(times) > 1 else float("nan")
 
 

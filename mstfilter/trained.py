@@ -1,11 +1,11 @@
-"""Trained networks on disk: a folder with weights (safetensors), their description (TOML) and a card.
+"""Trained networks on disk: a folder with weights (safetensors), a description (TOML) and a model card.
 
 >>> model = open_model("completion")              # of the package; or the path of a folder
 >>> model.description["network"], model.tensors["head.bias"].shape
 >>> write_model(folder, {"architecture": "completion-unet", "network": {...}}, tensors)
 
-`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder whose files do not match
-is refused. Weights are stored in half precision. Nothing is unpickled.
+`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder is refused if its files
+do not match. Weights are stored in half precision. No file is unpickled.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class TrainedModel:
 
 
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
-    """The model of the package with this name, or else the model in this folder.
+    """The model of the package with this name, or else the model in the folder with this path.
 
     Raises InputError if the model is missing, damaged, or of another architecture.
     """
@@ -91,7 +91,7 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
 def calibrated_network(
     model: TrainedModel, channels: Sequence[str], build: Callable[[Mapping[str, Any]], Any]
 ) -> tuple[Any, float, float]:
-    """The torch network of a model, ready for use, and the scale and shift of its logits.
+    """The torch network of a model with its weights, and the scale and shift of the network's logits.
 
     ``build(values)`` makes the network from the table ``network`` of the description. Raises InputError if the
     description is incomplete, was made for other input channels, or does not match the weights.
@@ -113,7 +113,7 @@ def calibrated_network(
 
 
 def write_model(folder: str | Path, description: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> None:
-    """Write weights in half precision, and their description with the hash."""
+    """Write weights in half precision, and the description with the hash of the weights."""
     from safetensors.numpy import save
 
     data = save({name: np.ascontiguousarray(value, dtype=np.float16) for name, value in tensors.items()})
@@ -124,7 +124,7 @@ def write_model(folder: str | Path, description: Mapping[str, Any], tensors: Map
 
 
 def _toml(values: Mapping[str, Any]) -> str:
-    """Plain values first, then one table for each mapping."""
+    """The text of a TOML file: plain values first, then one table for each mapping."""
     lines = [f"{key} = {_value(value)}" for key, value in values.items() if not isinstance(value, Mapping)]
     for key, table in values.items():
         if isinstance(table, Mapping):
@@ -133,5 +133,5 @@ def _toml(values: Mapping[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    """A value in TOML, whose strings, numbers, booleans and lists have the syntax of JSON."""
+    """The text of a value in TOML. Strings, numbers, booleans and lists have the same syntax in TOML and JSON."""
     return json.dumps(value, ensure_ascii=False, default=lambda number: number.item())

@@ -1,8 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
 An action has one outcome under each hypothesis. The expected information of an action is the mutual information
-between the hypothesis and the outcome. The hypothesis determines the outcome. So this is the entropy of the weights
-summed over equal outcomes, which is at most the entropy of the weights.
+between the hypothesis and the outcome. The hypothesis determines the outcome, so the mutual information is the
+entropy of the distribution of the outcomes. The information is at most the entropy of the weights.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -10,16 +10,17 @@ summed over equal outcomes, which is at most the entropy of the weights.
 >>> bool(np.isclose(outcome_information(weights, rows, hamming, sizes), np.log(2)))
 True
 
-**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. With a `tolerance` tau,
-the information is
+**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. A `tolerance` tau
+replaces the information by I_tau, where outcomes i and j differ in d_ij cells:
 
-    I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau),      d_ij = number of cells in which outcomes i and j differ.
+    ``I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau)``
 
-Outcomes that differ in far fewer than tau cells count as one. Outcomes that differ in far more cells count as two.
+Outcomes that differ in far fewer than tau cells count as equal. Outcomes that differ in far more cells count as
+different.
 I_0 is the information without noise. I_tau decreases to 0 as tau grows. Suppose that every cell is measured with an
 independent error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual
-information with the measurement. The bound is by Kolchinsky, Tracey (2017), *Estimating mixture entropy with pairwise
-distances*, with the Bhattacharyya distance.
+information of hypothesis and measurement. Kolchinsky and Tracey (2017), *Estimating mixture entropy with pairwise
+distances*, derive the bound with the Bhattacharyya distance.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from mstfilter.smc import first_seen
 
 
 def entropy(probabilities: np.ndarray) -> float:
-    """``-sum p log p`` of probabilities (k,) that sum to one."""
+    """Entropy ``-sum p log p`` of probabilities (k,) that sum to one."""
     return max(0.0, float(entr(probabilities).sum()))
 
 
 def binary_entropy(p: np.ndarray) -> np.ndarray:
-    """``-p log p - (1 - p) log(1 - p)`` of each probability; at most log 2."""
+    """Entropy ``-p log p - (1 - p) log(1 - p)`` of each probability; at most log 2."""
     p = np.clip(p, 0.0, 1.0)  # sums of weights may exceed 1 by rounding
     return np.asarray(entr(p) + entr(1 - p))
 
@@ -53,7 +54,7 @@ def outcome_information(
     sizes: np.ndarray,
     tolerance: float = 0.0,
 ) -> float:
-    """Information of an outcome that each hypothesis determines.
+    """Information of an outcome that the hypothesis determines.
 
     Parameters
     ----------
@@ -62,11 +63,11 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells. Called only if `tolerance` > 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells; not called if `tolerance` is 0.
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float
-        tau in cells (see the module).
+        Tolerance tau in the formula of the module, in cells.
     """
     check_number("tolerance", tolerance, at_least=0, unit="number of voxels or pixels")
     which = first_seen(row.tobytes() for row in np.ascontiguousarray(outcomes))
@@ -79,7 +80,7 @@ def outcome_information(
 
 
 def hamming(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Number (n, n) of cells in which outcomes (n, k) differ, for k groups of `sizes` cells."""
+    """Number (n, n) of cells in which pairs of outcomes (n, k) differ, for k groups of `sizes` cells."""
     return np.stack([(rows != row) @ sizes.astype(np.float64) for row in rows])
 
 
@@ -91,9 +92,9 @@ def canonical_rows(rows: np.ndarray) -> np.ndarray:
 def partition_distance(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Least number (n, n) of cells that must change their object to make two partitions equal.
 
-    ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``. A and B are the objects of i and
-    j, and the maximum is over one-to-one matchings m (Gusfield 2002, *Partition-distance*; free space matches free
-    space only). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
+    ``d_ij = sum_c size_c [c is occupied in i or j] - max sum_k |A_k cap B_m(k)|``. A_k are the objects of partition i
+    and B_k the objects of partition j. The maximum is over one-to-one matchings m of objects (Gusfield 2002,
+    *Partition-distance*). `rows` (n, k) are `canonical_rows` of k groups of `sizes` cells.
     """
     n, width = len(rows), int(rows.max(initial=0)) + 1
     distance = np.zeros((n, n))

@@ -9,18 +9,18 @@
 >>> belief.estimate()                                             # the hypothesis of least expected loss
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
-Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so no query
-compares them, and renaming them changes no result. Probabilities of voxels also use how sure a hypothesis is of each
-(`Hypothesis.occupancy`); queries of segmentations and actions use the labels. Voxels are integer indices (x, y, z);
-`Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
+Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so renaming
+the labels of a hypothesis changes no result. Probabilities of voxels also use the occupancy probabilities of each
+hypothesis (`Hypothesis.occupancy`). Queries about segmentations and actions use only the labels. Voxels are integer
+indices (x, y, z); `Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
 shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
 
-**Information.** Every action (look from a camera, push) has one outcome under each hypothesis. Its
-expected information is the mutual information of hypothesis and outcome. Without noise this is the entropy of the
-weights summed over equal outcomes, at most `partition_entropy()`, which is at most log n. It measures only what the
-hypotheses disagree on; errors that all of them share do not appear. Outcomes that differ in one voxel are different.
-With `tolerance` (in voxels or pixels), outcomes that differ by much less than it count as equal (formula in
-`mstfilter.belief.information`).
+**Information.** Every action (look from a camera, push) has one outcome under each hypothesis. The expected
+information of an action is the mutual information of hypothesis and outcome. Without noise, the information is the
+entropy of the distribution of outcomes. The entropy is at most `partition_entropy()`, which is at most log n. Errors
+that all hypotheses share do not change the information. Without tolerance, outcomes that differ in one voxel are
+different. With a `tolerance` in voxels or pixels, outcomes with a much smaller difference count as equal
+(`mstfilter.belief.information` has the formula).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 
 
 
 class Border(NamedTuple):
-    """A border in an image across which hypotheses disagree: one object, or two?"""
+    """A border in an image. The hypotheses disagree whether both sides of the border are one object."""
 
     one_object: float  #: probability that both sides are one object, if both are objects
     pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
@@ -85,7 +85,6 @@ class Belief:
     population : Population
         Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Equal hypotheses are
         merged, and hypotheses of weight 0 are ignored.
-
     """
 
     population: Population
@@ -146,7 +145,7 @@ class Belief:
     # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that contain world points (..., 3) in metres. Raises InputError if a point is outside."""
+        """Voxels (..., 3) that contain world points (..., 3) in metres. A point outside raises InputError."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
@@ -165,7 +164,7 @@ class Belief:
     def occupancy(self) -> np.ndarray:
         """Probability (X, Y, Z) that a voxel is occupied: ``p(v) = sum_i w_i o_i(v)``.
 
-        o_i(v) is the probability of hypothesis i that v belongs to its most probable object (`Hypothesis.shares`).
+        o_i(v) is the probability, in hypothesis i, of the most probable object at voxel v (`Hypothesis.shares`).
         """
         shares = [h.shares.probability for h in self._merged[0]]
         return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
@@ -173,10 +172,11 @@ class Belief:
     def same_object(self, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two voxels belong to the same object.
 
-        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where k_i is the most probable object of a voxel in
-        hypothesis i and o_i its probability (`Hypothesis.shares`). An object is a level set of its probabilities, so
-        it contains a voxel whenever it contains a less probable one. `a` and `b` (..., 3) are broadcast against each
-        other. For a = b the result is the occupancy. For all voxels b the result is the extent of the object at a.
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
+        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
+        probabilities, the smaller probability is that of both voxels. `a` and `b` (..., 3) are broadcast against each
+        other. If a = b, the result is the occupancy. If b has all voxels, the result is the extent of the object at
+        a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -192,7 +192,7 @@ class Belief:
     def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
         """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
 
-        R_i = Project(h_i). `a` and `b` (..., 2) are pixels (column, row), broadcast against each other.
+        R_i is the label image of hypothesis i. `a` and `b` (..., 2) are pixels (column, row); they are broadcast.
         """
         images = self._images(camera)
         a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
@@ -208,9 +208,9 @@ class Belief:
     def boundary_entropy(self) -> np.ndarray:
         """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
 
-        A face between v and v' has ``H(S | B) = P(B) h(P(S | B))`` with B: both voxels are occupied, S: by the same
-        object, ``h(p) = -p log p - (1 - p) log(1 - p)``. The entropy of occupancy, H(B), is not included:
-        H(B, S) = H(B) + H(S | B).
+        The entropy of a face is ``H(S | B) = P(B) h(P(S | B))`` with ``h(p) = -p log p - (1 - p) log(1 - p)``. B
+        means that both voxels at the face are occupied, and S that one object occupies both voxels. The entropy of
+        occupancy, H(B), is not included: H(B, S) = H(B) + H(S | B).
         """
         largest = np.zeros(self.grid.shape)
         for axis in range(3):
@@ -220,7 +220,7 @@ class Belief:
         return largest
 
     def _entropy_of_faces(self, axis: int) -> np.ndarray:
-        """H(S | B) of the faces between voxels and the next ones along an axis. The chosen axis comes first."""
+        """H(S | B) of the faces between neighbouring voxels along `axis`, which is the first axis of the result."""
         cells = np.moveaxis(self._refined.cells, axis, 0)
         lower, upper = cells[:-1], cells[1:]
         differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
@@ -234,7 +234,8 @@ class Belief:
         """Expected difference (H, W) of the objects that two hypotheses, drawn by weight, show at a pixel.
 
         ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the object that hypothesis i shows at
-        the pixel, and J the Jaccard index. J is 1 if both show no object, and 0 if only one of them does.
+        the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an object at the pixel, and 0 if
+        only one hypothesis shows an object.
         """
         refined = self._refined_image(camera)
         shared = refined.overlaps()
@@ -249,11 +250,11 @@ class Belief:
         return np.clip(1 - same, 0, 1)[refined.cells]
 
     def open_borders(self, camera: Camera, at_least: float = 0.05) -> list[Border]:
-        """Borders in the image across which the hypotheses disagree, the most uncertain one first.
+        """Borders in the image across which the hypotheses disagree, with the most uncertain borders first.
 
-        A border is open if both sides are one object with a probability between `at_least` and 1 - `at_least`, given
-        that both are objects. The parts beside a border look the same in every hypothesis. Parts of less than 200
-        pixels (in an image of 640 x 480) belong to the nearest larger part.
+        A border is open if the probability that both sides are one object, given that both sides are objects, is
+        between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label
+        images. Parts of less than 200 pixels (in an image of 640 x 480) belong to the nearest larger part.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
         refined = self._refined_image(camera)
@@ -275,9 +276,9 @@ class Belief:
     def partition_entropy(self, tolerance: float = 0.0) -> float:
         """Entropy of the segmentation.
 
-        ``-sum_s P(s) log P(s)``, P(s) the weight of the hypotheses with segmentation s. This is also the information
-        of the true segmentation. Without tolerance it is an upper bound of the information of every outcome that the
-        labels determine. The distance for the tolerance is `information.partition_distance`.
+        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. The entropy is the
+        information of the true segmentation. Without tolerance, the entropy is an upper bound of the information of
+        every outcome that the labels determine. The distance for the tolerance is `information.partition_distance`.
         """
         rows = canonical_rows(self._refined.objects)
         return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
@@ -285,7 +286,7 @@ class Belief:
     # Expected information of actions --------------------------------------------------------------------------
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
-        """Information of an image from a camera; `tolerance` in pixels. To save time, use ``camera.scaled(0.25)``.
+        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` saves time.
 
         The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
         """
@@ -299,8 +300,8 @@ class Belief:
     def push_information(self, region: Any, tolerance: float = 0.0) -> float:
         """Information of a push at a voxel or a region, if the moved voxels are observed.
 
-        Outcome: ``{v: L_i(v) = L_i(u) > 0 for a u in region}``. The moved voxels are all voxels of all objects with a
-        voxel in the region. Other objects that these objects would push are ignored.
+        The outcome ``{v | L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of all objects with a voxel in the
+        region. Other objects that the pushed objects would move are ignored.
         """
         cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
         moved = self._refined.objects_in(cells)[self._refined.objects]
@@ -323,9 +324,9 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information in nats; the first one if several are equal.
+        """The action of largest expected information in nats; of equal actions, the first action.
 
-        None if no action has `at_least` nats. In this case the hypotheses agree on all outcomes.
+        The result is None if no action has `at_least` nats, for example if the hypotheses agree on all outcomes.
         """
         values = [information(action) for action in actions]
         if np.isnan(values).any():
@@ -338,8 +339,8 @@ class Belief:
     def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
         """Information of an action whose outcome is determined by the hypothesis.
 
-        ``H(O)``, ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain labels, which are
-        arbitrary in each hypothesis.
+        The information is ``H(O)`` with ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain
+        labels, because labels are arbitrary in each hypothesis.
         """
         outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
         try:
@@ -352,7 +353,7 @@ class Belief:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
         The loss is 1 - quality (weighted coverage in the form ``objects``). The result is the best single answer
-        among the hypotheses, if the true scene is distributed as they are.
+        among the hypotheses if the true scene has their distribution.
         """
         hypotheses, mass = self._merged
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
@@ -404,7 +405,7 @@ def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Different cells a < b (m,) of neighbouring pixels of an image (H, W), and the pixel (m, 2) of the first."""
+    """Different cells a < b (m,) of pairs of neighbouring pixels of an image (H, W), and a pixel (m, 2) of a pair."""
     found = []
     for axis in (0, 1):
         one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))

@@ -3,7 +3,7 @@
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
-The components are for the resamplers of `mstfilter.smc` that compare particles:
+The resamplers of `mstfilter.smc` that compare particles use these components:
 ``Clusters(similarity=WeightedCoverage())``, ``Coalesced(equivalence=SameSegmentation())``.
 """
 
@@ -36,7 +36,7 @@ class SameSegmentation(Equivalence):
 class WeightedCoverage(Similarity):
     """Weighted coverage (form ``objects`` of `mstfilter.scoring.quality`) of all pairs of hypotheses.
 
-    `stride` is the step between the voxels that are used, along each axis. The time decreases with stride^3.
+    `stride` is the step between the voxels that are used, along each axis. The time is proportional to 1 / stride^3.
     """
 
     stride: PositiveInt = 1

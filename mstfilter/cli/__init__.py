@@ -1,7 +1,7 @@
 """The command line, which parses arguments, calls the package and prints results.
 
 ``mstfilter demo`` makes a simulated recording, filters it and writes a report. ``mstfilter --help`` lists the other
-commands. Each module has one group of commands. The import registers them with `mstfilter.cli.root.app`.
+commands. Each module has one group of commands. The import of a module adds its commands to `mstfilter.cli.root.app`.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _print(kind: str, message: str, *hints: str) -> None:
 
 
 def _interrupted(given: list[str]) -> str:
-    """Message about what an interrupted command leaves behind."""
+    """Message that states how to continue an interrupted command."""
     if given[:1] in (["run"], ["study"]):
         return "interrupted: repeat the command to resume"
     return "interrupted: the command starts anew if it is repeated"

@@ -1,4 +1,4 @@
-"""What ``mstfilter list`` prints. The command needs only numpy and scipy."""
+"""The output of ``mstfilter list``. The command needs only numpy and scipy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def print_list(kind: str) -> None:
 
 
 def _lines(kind: str) -> Iterator[str]:
-    """One line per preset, family or component."""
+    """One line per preset, scene family or component."""
     if kind == "presets":
         for name in preset_names():
             yield f"{name:<20}{read_toml(find_preset(name), 'a preset').get('description', '')}"

@@ -1,4 +1,4 @@
-"""The typer application with which the commands register, and common functions of several commands."""
+"""The typer application to which modules add commands, and functions that several commands use."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _root(
 
 
 def safe_name(name: str) -> str:
-    """A name without characters that have a meaning in paths."""
+    """The name without characters that have a meaning in paths."""
     return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "recording"
 
 
@@ -76,7 +76,7 @@ def read_source(path: Path, format: str, options: list[str] | None, pauses: str)
 
 
 def print_summary(numbers: RunNumbers) -> None:
-    """Print the gain by earlier images, and one line per pause: hypotheses, objects, sample size, quality."""
+    """Print the gain from earlier images, and one line per pause: hypotheses, objects, sample size, quality."""
     for sentence in numbers.value_of_the_past:
         print(sentence)
     for t, step in enumerate(numbers.steps):

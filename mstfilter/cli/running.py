@@ -119,7 +119,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="New folder for recording, run and report.")] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
-    """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
+    """Simulate a robot at a cluttered table, filter with and without predictions, and write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
     from mstfilter.report import read_numbers, write_report
@@ -284,7 +284,7 @@ def _execute_all(
     replace: bool = False,
     threads: int = 1,
 ) -> None:
-    """Run the filter without a name in `folder`, and the filters for comparison in its folder ``compare``."""
+    """Run the filter with the empty name in `folder`, and the filters for comparison in the subfolder ``compare``."""
     from mstfilter.runs import filter_recording
 
     for name, config in configs.items():
@@ -302,5 +302,5 @@ def _execute_all(
 
 
 def _compared(folder: Path, name: str) -> Path:
-    """The folder of a comparison run of the run in `folder`; `folder` itself for the empty name."""
+    """The folder of the comparison run `name` of the run in `folder`; `folder` itself for the empty name."""
     return folder / "compare" / name.replace(" ", "-") if name else folder

@@ -1,4 +1,4 @@
-"""Commands of many runs: study, train."""
+"""Commands that make many runs or train networks: study, train."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def study(
 
 
 def _print_summary(summary: Any) -> None:
-    """Print the primary endpoints by family and arm, and arm minus reference."""
+    """Print the primary endpoints by scene family and arm, and the differences from the reference arm."""
     from rich.console import Console
     from rich.table import Table
 
@@ -68,7 +68,7 @@ def _print_summary(summary: Any) -> None:
 
 
 def _range(low: float, high: float, sign: str = "") -> str:
-    """An interval; a dash if there is none."""
+    """The text of an interval; a dash for NaN."""
     return "–" if low != low else f"{low:{sign}.3f} .. {high:{sign}.3f}"
 
 
@@ -83,7 +83,7 @@ def train(
     workers: Annotated[int, typer.Option(min=1, help="Processes that make samples.")] = 1,
     device: Annotated[str, typer.Option(help="Device of torch. Default: a GPU if there is one.")] = "",
 ) -> None:
-    """Train a learned part on simulated scenes; the same command resumes a training that was stopped."""
+    """Train a network on simulated scenes; the same command resumes a training that was stopped."""
     from mstfilter.errors import check_choice
 
     check_choice("part", part, ("completion", "border"))

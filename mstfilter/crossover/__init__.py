@@ -3,7 +3,7 @@
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)     # candidates, with weights
 
 =============  =========================================================================================
-`update`       `CrossoverUpdate`: all pairs, with weights; `Crossover`: makes one hypothesis of two
+`update`       `CrossoverUpdate`: all pairs, with weights; `Crossover`: makes one hypothesis from two
 `conflicts`    the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
 `mode_filter`  `ModeFilter`: smooths the result
 =============  =========================================================================================

@@ -7,9 +7,9 @@
 A vertex is an object of one of the two hypotheses. An edge joins a proposed and a predicted object that overlap. The
 graph is bipartite, because objects of one hypothesis never overlap.
 
-For each connected component of the conflict graph, a `Structure` draws a painting order, and directed edges from a
-child to its parent. The parent is painted later. `merge_probability` is the probability that a child with n1 voxels
-is merged into its parent with n2 voxels, with I voxels in common:
+For each connected component of the conflict graph, a `Structure` draws the order in which objects are painted, and
+directed edges from a child to its parent. The parent is painted later than the child. The table has the probability
+that a child with n1 voxels is merged into a parent with n2 voxels and I common voxels (`merge_probability`):
 
 =============  =============================  ========================================================
 rule           probability                    source
@@ -53,8 +53,8 @@ class ConflictGraph:
 
     Notes
     -----
-    Vertices are numbered by their first voxel in a scan with x fastest. If two objects begin at the same voxel, the
-    proposed object is first. The numbering is the authors' numbering.
+    Vertices are numbered by the first voxel of each object in Fortran order (x fastest). If two objects begin at the
+    same voxel, the proposed object is first. The authors' program uses the same numbering.
     """
 
     side: np.ndarray  #: (n,) int 0 proposed, 1 predicted
@@ -69,8 +69,8 @@ class ConflictGraph:
     def networkx(self) -> nx.Graph:
         """The graph as a networkx graph.
 
-        Vertices have the attributes ``side``, ``label`` and ``size``. Edges have ``intersection``, in voxels.
-        Neighbours are in ascending order.
+        Vertices have the attributes ``side``, ``label`` and ``size``. Edges have the attribute ``intersection``, in
+        voxels. Neighbours are in ascending order.
         """
         graph = nx.Graph()
         objects = zip(self.side.tolist(), self.label.tolist(), self.size.tolist(), strict=True)
@@ -86,7 +86,7 @@ class ConflictGraph:
         return components_in_conflict(self.networkx())
 
     def by_label(self, side: int, values: np.ndarray) -> np.ndarray:
-        """Values (n,) of the vertices as a table (65536,) over the labels of a side; 0 for labels without object."""
+        """Values (n,) of the vertices as a table (65536,) by the labels of `side`; 0 for labels without an object."""
         table = np.zeros(MAX_LABEL + 1, values.dtype)
         of_side = self.side == side
         table[self.label[of_side]] = values[of_side]
@@ -94,13 +94,13 @@ class ConflictGraph:
 
 
 def components_in_conflict(graph: nx.Graph) -> list[list[int]]:
-    """Connected components of a graph with at least one edge, as ascending vertices."""
+    """Connected components of a graph with at least one edge, as ascending lists of vertices."""
     return sorted(sorted(c) for c in nx.connected_components(graph) if len(c) > 1)
 
 
 @dataclass(frozen=True, eq=False)
 class OccupiedVoxels:
-    """The voxels that a proposed or a predicted hypothesis occupies: a few percent of a grid."""
+    """The voxels that are occupied in a proposed or a predicted hypothesis, usually a few percent of a grid."""
 
     at: np.ndarray  #: (n,) flat indices
     labels: tuple[np.ndarray, np.ndarray]  #: (n,) uint16 of the proposed and of the predicted hypothesis, 0 free
@@ -108,7 +108,7 @@ class OccupiedVoxels:
 
     @classmethod
     def of(cls, proposed: np.ndarray, predicted: np.ndarray) -> OccupiedVoxels:
-        """From two label grids (X, Y, Z) of one shape."""
+        """The occupied voxels of two label grids (X, Y, Z) of one shape."""
         a, b = as_labels(proposed, "proposed label grid"), as_labels(predicted, "predicted label grid")
         if a.shape != b.shape:
             raise InputError(
@@ -125,7 +125,7 @@ class OccupiedVoxels:
         return out
 
     def objects(self, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Label, voxels and position of the first voxel (k,) of the objects of a side; x is fastest in a position."""
+        """Labels, sizes and positions (Fortran order) of the first voxels (k,) of the objects of `side`."""
         position = np.ravel_multi_index(np.unravel_index(self.at, self.shape), self.shape, order="F")
         labels = self.labels[side]
         sizes = np.bincount(labels, minlength=1)
@@ -172,7 +172,7 @@ class ConflictResolution(NamedTuple):
 
     #: Vertices in painting order, first to last.
     order: list[int]
-    #: For each vertex, the vertex of its merge group that is painted last; -1 if the object is dropped.
+    #: For each vertex, the vertex that is painted last in its group of merged objects; -1 if the object is dropped.
     group: np.ndarray
 
 
@@ -193,7 +193,7 @@ def _check_structure(
 
 
 class Structure(Checked, ABC):
-    """Draws the painting order of objects in conflict, and the conflicts that may end in a merge."""
+    """Draws the painting order of objects in conflict, and the edges along which objects may be merged."""
 
     @returns(_check_structure)
     @abstractmethod
@@ -203,24 +203,24 @@ class Structure(Checked, ABC):
         Parameters
         ----------
         graph : networkx.Graph
-            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` of a vertex ascend.
+            The conflict graph (`ConflictGraph.networkx`). The neighbours ``graph[v]`` are in ascending order.
         component : sequence of int
             Vertices of one connected component, ascending.
 
         Returns
         -------
         order : list of int
-            All vertices of the component in painting order. Later vertices are painted over earlier ones.
+            All vertices of the component in painting order. Later vertices are painted over earlier vertices.
         edges : list of (child, parent)
-            Edges of the graph along which the child may be merged into the parent, which is painted after the child.
+            Edges of the graph along which a child may be merged into its parent. Parents are painted after children.
         """
 
 
 @dataclass(frozen=True)
 class RandomOrder(Structure):
-    """The paper's text: edges get a random acyclic orientation, and vertices a topological order of it.
+    """The paper's text: edges get a random acyclic orientation, and vertices get a topological order of these edges.
 
-    A uniformly random order of the vertices gives both. Every conflict may end in a merge.
+    A uniformly random order of the vertices determines the orientation. Objects may be merged along every edge.
     """
 
     def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
@@ -233,7 +233,7 @@ class RandomOrder(Structure):
 class SpanningTree(Structure):
     """The authors' program: a uniform random spanning tree from a uniform random root.
 
-    Only edges of the tree may end in a merge. Children are painted before their parent, and the root is painted last.
+    Objects are merged only along edges of the tree. Children are painted before their parent.
     """
 
     def draw(self, rng: np.random.Generator, graph: nx.Graph, component: Sequence[int]) -> OrderAndEdges:
@@ -288,8 +288,8 @@ def merge_probability(
 ) -> np.ndarray:
     """Probability that a child object is merged into its parent, elementwise.
 
-    The table of the module has the formulas. `intersection`, `child` and `parent` are numbers of voxels: in common,
-    of the child, and of the parent.
+    The docstring of the module has the formulas. `intersection`, `child` and `parent` are the numbers of voxels in
+    the intersection, in the child, and in the parent.
     """
     common, n1, n2 = (np.asarray(a, dtype=np.float64) for a in (intersection, child, parent))
     match rule:
@@ -309,8 +309,8 @@ def resolve(
 ) -> ConflictResolution:
     """Draw a resolution of all conflicts. Objects without conflict are painted first.
 
-    `drop_rule` reproduces a fault of the authors' program: an object without conflict is lost if its vertex number
-    exceeds that of every vertex in conflict.
+    `drop_rule` reproduces a fault of the authors' program: an object without conflict is lost if it has a larger
+    vertex number than all objects in conflict.
     """
     links = graph.networkx()
     components = components_in_conflict(links)
@@ -331,7 +331,7 @@ def resolve(
 def _merged(
     rng: np.random.Generator, graph: ConflictGraph, links: nx.Graph, rule: MergeRule, edges: list[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """The edges (child, parent) along which objects merge. Each edge is drawn with its probability."""
+    """Draw each edge (child, parent) with its merge probability. Objects are merged along the returned edges."""
     if not edges:
         return []
     child, parent = np.array(edges).T
@@ -341,7 +341,7 @@ def _merged(
 
 
 def _unite(group: np.ndarray, merged: list[tuple[int, int]], order: list[int]) -> None:
-    """Merge groups along edges, in place. The vertex that is painted last represents its group."""
+    """Merge groups of objects along edges, in place. The vertex that is painted last represents its group."""
     place = {v: k for k, v in enumerate(order)}
     for edge in merged:
         first, last = sorted((int(group[v]) for v in edge), key=place.__getitem__)

@@ -1,4 +1,4 @@
-"""The mode filter, which removes the speckle that painting leaves (the authors' program; paper, section IV-D).
+"""The mode filter, which removes speckle from painted labels (the authors' program; paper, section IV-D).
 
 >>> smooth = ModeFilter(window=5, margin=3).apply(labels)
 """
@@ -22,20 +22,20 @@ class ModeFilter(Bounded):
     """Majority filter over label grids.
 
     An occupied voxel takes the most frequent other label in its window, if the count of this label exceeds the count
-    of the voxel's label by at least `margin`. If several labels are equally frequent, the largest one is used. Free
-    cells are not counted as a label. But an occupied voxel with more than `isolation` free cells in its window
-    becomes free. All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects
-    thinner than half a window, for example a 2 cm book or a rod, are removed.
+    of the voxel's label by at least `margin`. If several labels are equally frequent, the largest label is used. Free
+    voxels are not counted as a label. An occupied voxel with more than `isolation` free voxels in its window becomes
+    free. All voxels of a sweep change at the same time. Sweeps are repeated until no voxel changes. Objects thinner
+    than half a window, for example a 2 cm book or a rod, are removed.
 
     Parameters
     ----------
     window : int
-        Edge of the cubic window in voxels, an odd number. With 1 the filter has no effect.
+        Edge of the cubic window in voxels, an odd number. A window of 1 has no effect.
     margin : float
         Least difference between the count of the other label and the count of the voxel's label.
     isolation : int
-        Largest number of free cells in the window of an occupied voxel. With more, the voxel becomes free. A value of
-        at least ``window**3`` has no effect.
+        Largest number of free voxels in the window of an occupied voxel. With more free voxels, the occupied voxel
+        becomes free. An isolation of at least ``window**3`` has no effect.
     max_sweeps : int
         Largest number of sweeps.
     """
@@ -79,7 +79,7 @@ class ModeFilter(Bounded):
         return tuple(slice(max(s.start - half, 0), min(s.stop + half, n)) for s, n in zip(box, shape, strict=True))
 
     def _swept(self, labels: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Labels after one sweep. `cells` is the number of grid cells in the window of each voxel."""
+        """Labels after one sweep of the filter. `cells` is the number of grid cells in the window of each voxel."""
         own, best = np.zeros(labels.shape, np.int32), np.zeros(labels.shape, np.int32)
         winner = np.zeros_like(labels)
         for label, box in enumerate(ndimage.find_objects(labels), start=1):
@@ -97,7 +97,7 @@ class ModeFilter(Bounded):
         return out
 
     def _window_counts(self, hit: np.ndarray) -> np.ndarray:
-        """For each cell, how many cells in its window are True, (X, Y, Z) int32. Cells beyond the array are False."""
+        """The number (X, Y, Z) int32 of True cells in the window of each cell. Cells beyond the array are False."""
         count = hit.astype(np.int32)
         for axis in range(3):
             count = _window_sums(count.swapaxes(0, axis), self.window).swapaxes(0, axis)

@@ -2,26 +2,27 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. The projection onto free space clears voxels of every predicted hypothesis j. A hypothesis keeps a share Q_j.
-2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate,
+1. Free-space projection clears voxels of every predicted hypothesis j, which keeps the share Q_j of its voxels.
+2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate
+   depends only on its parents (section IV-E):
 
-       log w = log w_i + log w_j + lambda log Q_j     (section IV-E),
+       ``log w = log w_i + log w_j + lambda log Q_j``
 
-   depends only on its parents. w_i and w_j are the weights of the parents, and lambda is `quality_exponent`. So
-   resampling selects among unbuilt candidates, and only selected candidates are built.
+   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. Candidates are therefore resampled
+   before they are built, and only selected candidates are built.
 
-Without a proposal, the update is the projection with its weights. If only a thin set of states agrees with an
-observation, few predictions lie in it. So every particle is projected into this set. The method is the manifold
-filter of Koval, Pollard and Srinivasa (2015).
+Without a proposal, the update only projects and weights the predictions. The projection follows the manifold filter
+of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, few predicted states agree. So every
+particle is projected onto the set of states that agree with the observation.
 
-One crossover has these steps (figure 5):
+One crossover has four steps (paper, figure 5):
 
 >>> child = Crossover().cross(rng, proposed, predicted)
 
 1. `graph_of` builds the conflict graph, in which two objects that share voxels are in conflict.
 2. `resolve` draws, for each connected component of the graph, which objects are merged, and the painting order of all
-   objects. A later object covers an earlier one.
-3. `assign_labels` paints the objects. Objects without conflict are copied.
+   objects. Objects that are painted later cover earlier objects.
+3. `assign_labels` paints the objects into one label grid. Objects without conflict are copied.
 4. `mstfilter.crossover.ModeFilter` removes speckle from the painted labels.
 """
 
@@ -71,14 +72,13 @@ class Crossover(Bounded):
     Parameters
     ----------
     structure : Structure
-        Draws the painting order and the candidate merges.
+        Draws the painting order and the edges along which objects may be merged.
     merge : {"share", "printed", "always", "never"}
         Probability of a merge along a directed edge (`mstfilter.crossover.conflicts`).
     mode_filter : ModeFilter
         Smooths the painted labels.
     drop_rule : bool
-        Reproduces a fault of the authors' program: an object without conflict is lost if its vertex number exceeds
-        that of every vertex in conflict.
+        Reproduces a fault of the authors' program, which `mstfilter.crossover.conflicts.resolve` describes.
     """
 
     structure: Structure = SpanningTree()  # noqa: RUF009 (frozen)
@@ -89,8 +89,8 @@ class Crossover(Bounded):
     def cross(self, rng: np.random.Generator, proposed: Hypothesis, predicted: Hypothesis) -> Hypothesis:
         """A hypothesis from the objects of both parents.
 
-        If one parent has no objects, the result is the other parent. An object keeps the identity of the largest
-        predicted object in it. An object keeps the motion history if its voxels are exactly those predicted.
+        If one parent has no objects, the result is the other parent. Merged objects get the identity of the largest
+        predicted object. An object keeps its motion history if its voxels are exactly the predicted voxels.
         """
         check_grid("the proposed hypothesis", proposed, predicted.grid)
         if not predicted.objects:
@@ -124,11 +124,11 @@ class CrossoverUpdate(Update):
     Parameters
     ----------
     free_space : Projection
-        Projects the predicted hypotheses onto those that agree with the latest frame.
+        Projects predicted hypotheses onto hypotheses that agree with the latest frame.
     crossover : Crossover
-        Makes one hypothesis from two.
+        Makes one hypothesis from two hypotheses.
     eta : int
-        Number of candidates that are made from each pair.
+        Number of candidates of each pair of a sample and a prediction.
     quality_exponent : float
         Exponent lambda of Q in the weight.
     """
@@ -145,7 +145,7 @@ class CrossoverUpdate(Update):
     ) -> Population:
         """The candidates of all pairs, which are built on access.
 
-        Without a prediction, the result is the proposed samples. Without a proposal, it is the refined predictions.
+        Without a prediction, the proposed samples are returned. Without a proposal, refined predictions are returned.
         """
         if predicted is None:
             return union(None, proposed)
@@ -178,7 +178,7 @@ def _pairs(rng: np.random.Generator, n_proposed: int, n_predicted: int, eta: int
 
     Each sample is paired with the predictions in cyclic order. The first predictions of the samples are drawn without
     replacement. Systematic resampling takes equal steps through nearly equal weights. If all samples had the same
-    first prediction, it would select this prediction again and again.
+    first prediction, systematic resampling would often select the same prediction.
     """
     rounds = -(-n_proposed // n_predicted)
     first = np.concatenate([rng.permutation(n_predicted) for _ in range(rounds)])[:n_proposed]
@@ -198,7 +198,7 @@ def assign_labels(
 
 
 def _painted(graph: ConflictGraph, resolution: ConflictResolution, voxels: OccupiedVoxels) -> np.ndarray:
-    """Group + 1 of each occupied voxel (n,); 0 if its object was dropped. A later object covers an earlier one."""
+    """Group number + 1 of each occupied voxel (n,); 0 for dropped objects. Later objects cover earlier objects."""
     rank = np.zeros(len(graph), np.int64)
     rank[resolution.order] = np.arange(1, len(resolution.order) + 1)
     groups, ranks = (
@@ -216,7 +216,7 @@ def _renumbered(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Child:
-    """The labels of a child, and the objects of the parents from which they come."""
+    """The labels of a child, and the objects of the parents from which the labels come."""
 
     voxels: OccupiedVoxels
     graph: ConflictGraph
@@ -233,7 +233,7 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The record of each object, taken from its head. The motion history ends if the voxels have changed."""
+        """The record of the head of each object (`_heads`). The motion history ends if the voxels have changed."""
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)
@@ -242,7 +242,7 @@ class _Child:
         return tuple(r if same else r.changed() for r, same in zip(records, unchanged, strict=True))
 
     def _heads(self) -> np.ndarray:
-        """The head (objects,) of each group: its largest predicted vertex, or else its largest proposed vertex."""
+        """The head (objects,) of each group: the largest predicted vertex, or else the largest proposed vertex."""
         side, size = self.graph.side.tolist(), self.graph.size.tolist()
         ranking = sorted(range(len(self.graph)), key=lambda v: (side[v], size[v], -v))
         head_of = {int(self.group[v]): v for v in ranking}  # the last one of a group counts
@@ -259,7 +259,7 @@ class _Child:
         return (size == kept) & (size == self.graph.size[heads])
 
     def _occupancy(self, labels: np.ndarray, parents: tuple[Hypothesis, Hypothesis]) -> Occupancy:
-        """The larger probability of the parents: at least .5 in labelled voxels, at most .5 elsewhere."""
+        """The larger probability of both parents, at least .5 in labelled voxels and at most .5 in other voxels."""
         owner, p = labels.copy(), np.where(labels > 0, np.float16(0.5), np.float16(0))
         heir = np.searchsorted(self.groups, self.group) + 1
         heir[~np.isin(self.group, self.groups)] = 0

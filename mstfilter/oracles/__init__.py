@@ -1,13 +1,13 @@
-"""Oracles replace stages of a filter by the truth of a recording.
+"""Oracles replace stages of a filter by the ground truth of a recording.
 
-A simulated recording contains its true voxels, instance images and poses. Components named ``true_...`` use this
-truth instead of an estimate. The gain shows how much quality each stage loses:
+A simulated recording contains its true voxels, instance images and poses. Components named ``true_...`` use the
+truth instead of an estimate. The gain in quality shows how much quality each stage loses:
 
 >>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-`STAGES` lists the overrides by stage.
+`STAGES` lists the overrides of the preset ``mst`` for each stage.
 """
 
 from mstfilter.lazy import attach

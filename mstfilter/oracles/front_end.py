@@ -4,10 +4,10 @@
 >>> proposal = TrueMasks()                       # every sample is the true segmentation of the image
 >>> completer = TrueCompletion()                 # the true voxels of what a mask shows
 
-A mask that shows exactly one object is completed to all voxels of that object, including hidden ones. In general, a
-true voxel belongs to the mask that contains its pixel. Among all pixels that show the object of a voxel, this is the
-pixel nearest to the projection of the voxel. So a mask of a part of an object gets this part. A mask of two gets
-both.
+A mask that shows exactly one object is completed to all voxels of the object, including hidden voxels. In general, a
+true voxel belongs to the mask that contains its pixel. The pixel of a voxel is the pixel nearest to the projection of
+the voxel, among all pixels that show the object. So a mask of a part of an object is completed to this part, and a
+mask of two objects to both objects.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ _REACH = 4.0  # distance to a true border up to which strength is kept, in pixel
 
 @dataclass(frozen=True)
 class TrueMasks(UsesTruth, Proposal):
-    """Hypotheses from the true masks of the clip's last frame, all equal.
+    """Equal hypotheses from the true masks of the clip's last frame.
 
-    `objects` says which pixels can belong to an object (only its `foreground` is used); completed voxels of
-    probability `threshold` or more are occupied.
+    The `foreground` of `objects` determines which pixels can belong to an object. Completed voxels of probability
+    `threshold` or more are occupied.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -54,7 +54,7 @@ class TrueMasks(UsesTruth, Proposal):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def masks(self, frame: Frame, clip: Clip) -> np.ndarray:
-        """(H, W) int32 true objects of the clip's last frame that have enough pixels; 0 elsewhere."""
+        """(H, W) int32 true object of each pixel of the clip's last frame; 0 for objects with too few pixels."""
         image = self.truth.instance(clip.index)
         counts = np.bincount(image.ravel())
         enough = counts >= scaled_area(MIN_PIXELS, image.size)
@@ -73,9 +73,9 @@ class TrueMasks(UsesTruth, Proposal):
 
 @dataclass(frozen=True)
 class TrueBoundary(UsesTruth, BoundaryModel):
-    """The measured strength near true borders between objects in the image, 0 elsewhere.
+    """The measured border strength near true borders between objects in the image, and 0 elsewhere.
 
-    Trees are fitted to measured strengths, so the strength is that of the model `measured`.
+    The model `measured` gives the strength, because segmentation trees are fitted to measured strengths.
     """
 
     measured: BoundaryModel = field(default_factory=ColourDepthBoundary)
@@ -83,7 +83,7 @@ class TrueBoundary(UsesTruth, BoundaryModel):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def boundary(self, frame: Frame) -> np.ndarray:
-        """(H, W) float32; the frame must be at a pause."""
+        """Boundary map (H, W) float32 of a frame at a pause."""
         import cv2
 
         image = self.truth.instance(self.truth.pause_of(frame))
@@ -106,9 +106,9 @@ _WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
 class TrueCompletion(UsesTruth, Completer):
     """The true voxels of the objects that a mask shows. A mask without true objects keeps its visible surface.
 
-    `objects` determines which pixels can belong to an object. True voxels are assigned to these pixels. A mask with
-    75 % of an object's pixels gets all voxels of the object. Objects with less than 10 % of a mask and less than half
-    in it are ignored.
+    `objects` determines which pixels can belong to an object. True voxels are assigned to pixels of their object. A
+    mask with 75 % of an object's pixels gets all voxels of the object. An object is ignored if it covers less than
+    10 % of a mask and the mask covers less than half of the object.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
@@ -116,7 +116,7 @@ class TrueCompletion(UsesTruth, Completer):
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """1 on the visible surface, for masks without true objects."""
+        """Probability 1 on the visible surface, for masks without true objects."""
         return seen.surface.astype(np.float32)
 
     def complete_each(

@@ -1,4 +1,4 @@
-"""Oracles of tracking, free space, partition and selection, and the overrides of all stages.
+"""Oracles of tracking, free space, partition and selection, and the overrides for the oracles of all stages.
 
 >>> transition = TrueMotions()                                     # the rigid motion of each object
 >>> PartitionUpdate(free_space=TrueFreeSpace())                    # exactly the free space that is visible
@@ -6,12 +6,12 @@
 >>> PartitionUpdate(pairs=TruePairs())                             # the best of the partitions that it considers
 >>> filter = mstfilter.preset("mst", *STAGES["selection"])         # the n best of the candidates
 
-The time of an observation is the index of its clip. A resampler gets no clip. So for true selection, the candidates
-are weighted by their true quality (`TrueQuality`), and `LargestWeights` selects the n best.
+Oracles find the time of an observation from the index of its clip. A resampler gets no clip. So for true selection,
+`TrueQuality` weights the candidates by their true quality, and `LargestWeights` selects the n best candidates.
 
-Replacing one stage shows what a perfect stage would add to the present filter. Replacing all stages but one shows
-what this stage costs a filter that is perfect elsewhere. The differences are not equal, since stages correct errors
-of each other.
+Replacing one stage by its oracle shows the gain from a perfect stage in the present filter. Replacing all other
+stages shows the loss from the remaining stage in an otherwise perfect filter. Gain and loss are not equal, because a
+stage can correct errors of another stage.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _NATS = 1e4  # log score of a true quality of 1
 class TrueMotions(UsesTruth, Transition):
     """Moves the objects of hypotheses by the true motions.
 
-    Only the motion is true. The objects come from the hypothesis and are moved by the ordinary warp. An object that
-    covers two true objects moves like the one with which it shares more voxels.
+    Only the motions are true. The objects come from the hypothesis and are moved by the ordinary warp. An object that
+    covers two true objects moves like the true object with which it shares more voxels.
     """
 
     warp: Warp = field(default_factory=Warp)
@@ -83,7 +83,7 @@ class TrueFreeSpace(UsesTruth, Projection):
     """Clears voxels that are truly free and visible to the camera."""
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> tuple[Hypothesis, float]:
-        """The hypothesis without these voxels, and the fraction of occupied voxels that it keeps."""
+        """The hypothesis without truly free visible voxels, and the fraction of occupied voxels that remain."""
         labels = self.truth.labels(self.truth.pause_of(frame))
         free = labels == 0
         geometry = frame_geometry(frame, hypothesis.grid)
@@ -108,7 +108,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Almost certain odds of the truth, so that draws are as near to the truth as possible.
+    """Nearly certain log odds of the truth, so that probable partitions are as near to the truth as possible.
 
     A cell belongs to the true object of most of its readings.
     """

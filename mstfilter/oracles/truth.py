@@ -1,14 +1,14 @@
 """Components that use the ground truth of a recording.
 
 A component gets a clip, which contains no truth. So a component that inherits `UsesTruth` is bound to a recording
-before a run. `bind_truth` binds all components that use the truth of a filter, including nested ones:
+before a run. `bind_truth` binds all components of a filter that use the truth, including nested components:
 
 >>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies bind these components automatically. The truth is not a field. So binding does not
-change the description of a component or its equality. Binding changes the `component_key` of a component.
+``mstfilter run`` and studies bind the components automatically. The truth is not a field of the component, so binding
+changes neither the description nor the equality of a component. Binding changes the `component_key` of a component.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 class RecordingTruth:
-    """The ground truth at the pauses of a recording. Call `check` first with what a component needs."""
+    """The ground truth at the pauses of a recording. Call `check` first with the needs of a component."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
@@ -61,7 +61,7 @@ class RecordingTruth:
         return labels
 
     def instance(self, t: int) -> np.ndarray:
-        """(H, W) int32 true object of each pixel at pause `t`; 0 if it has no true voxels."""
+        """(H, W) int32 true object of each pixel at pause `t`; 0 for objects without true voxels."""
         if t not in self._instance:
             image = self.recording.instance(self.recording.pauses[t])
             assert image is not None
@@ -74,7 +74,7 @@ class RecordingTruth:
         return np.unique([k for t in range(len(self.recording.pauses)) for k in np.unique(self.labels(t))])
 
     def motions(self, t: int) -> dict[int, np.ndarray]:
-        """(4, 4) motion in world metres of each object from pause `t` - 1 to pause `t`, by label."""
+        """Motion (4, 4) of each object in the world, in metres, from pause `t` - 1 to pause `t`, by label."""
         pauses = self.recording.pauses
         before, after = (self.recording.poses(pauses[k]) for k in (t - 1, t))
         assert before is not None and after is not None
@@ -88,7 +88,7 @@ class RecordingTruth:
 
     @cached_property
     def _mended(self) -> dict[bytes, int]:
-        """The same for frames with estimated depth."""
+        """The first pause with each frame, by the key of the frame with estimated missing readings."""
         from mstfilter.scene import foreground  # needs cv2, which the registry does not
 
         recording = self.recording
@@ -96,7 +96,7 @@ class RecordingTruth:
         return {foreground(recording.frames[index], recording.grid).frame.key: t for t, index in pauses}
 
     def pause_of(self, frame: Frame) -> int:
-        """The pause at which a frame was taken, found by its content."""
+        """The pause at which a frame was taken, found by the content of the frame."""
         found = self._pauses.get(frame.key)
         if found is None:
             found = self._mended.get(frame.key)
@@ -109,13 +109,13 @@ class RecordingTruth:
 
 
 class UsesTruth:
-    """A component that uses the truth. Inherit this class together with the interface of the component."""
+    """A component that uses the truth. A component inherits `UsesTruth` together with its interface."""
 
-    #: What the component needs from a recording.
+    #: Data that the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
 
     def bind(self: T, truth: RecordingTruth) -> T:
-        """The same component, bound to this truth."""
+        """A copy of the component that is bound to `truth`."""
         return bound_to(self, _truth=truth)
 
     @property
@@ -126,7 +126,7 @@ class UsesTruth:
 
     @property
     def truth(self) -> RecordingTruth:
-        """The truth; raises InputError if the component is not bound."""
+        """The truth of the bound recording. Raises InputError if the component is not bound."""
         truth = self.__dict__.get("_truth")
         if truth is None:
             raise InputError(
@@ -137,14 +137,14 @@ class UsesTruth:
 
 
 def uses_truth(component: Any) -> list[str]:
-    """Class names of a component and its components that use the truth, in order."""
+    """Class names of the component and its nested components, in order, without classes that use no truth."""
     return [type(part).__name__ for part in nested_components(component) if isinstance(part, UsesTruth)]
 
 
 def bind_truth(component: T, recording: Recording) -> T:
-    """The same filter (or component) with all components that use the truth bound to a recording.
+    """A filter or component, with all components that use the truth bound to a recording.
 
-    Raises InputError if the recording lacks data that a component needs, at any pause.
+    Raises InputError if the recording lacks data that a component needs at any pause.
     """
     return _bind(component, RecordingTruth(recording)) if uses_truth(component) else component
 

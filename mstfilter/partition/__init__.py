@@ -1,4 +1,4 @@
-"""The default measurement update. `PartitionUpdate` partitions the image, and completes objects from all their views.
+"""The default measurement update: `PartitionUpdate` partitions the image, and completes objects from all their views.
 
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)     # candidates, with weights

@@ -4,28 +4,28 @@
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
-A segment and a predicted object are *in conflict* if they share more than a tenth of the readings of the smaller of
-the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects that share
-voxels.) The *main object* of a segment is the predicted object with which it shares most readings. An object that is
-the main object of no segment and has fewer than about 60 readings is in no conflict. The readings come from objects
-nearby.
+A segment and a predicted object are *in conflict* if they share more than a tenth of the depth readings of the
+smaller of the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects
+that share voxels.) The *main object* of a segment is the predicted object that shares most readings with the segment.
+An object that is the main object of no segment and has fewer than about 60 readings is in no conflict. The few
+readings of a hidden object measure objects nearby.
 
-In each connected component, at most one segment continues a predicted object. Two rules are applied in order:
+A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
-1. The first rule uses only segments whose main object is the predicted object. The object is continued by the segment
-   with more than 80 % of the readings that these segments share with it. So readings at which another object now
-   occludes the predicted object are not counted.
-2. The second rule uses all segments. The object is continued by the segment with more than 80 % of the readings that
-   all segments share with it.
+1. The first rule considers only segments whose main object is the predicted object. A considered segment continues
+   the object if it has more than 80 % of the object's readings in all considered segments. The first rule ignores
+   readings at which another object now occludes the predicted object.
+2. The second rule considers all segments. A segment continues the object if it has more than 80 % of the object's
+   readings in all segments.
 
-If the component has one segment and one object, more than 50 % is sufficient. Consequences of these rules:
+In a component of one segment and one object, more than 50 % of the readings is enough. The rules have consequences:
 
-- If an object is *split* and no segment has enough of its readings, no segment continues the object. The track of
-  this object ends, its views are deleted, and the segments are new objects.
-- If several objects are *merged* into one segment, the segment continues all of them.
+- If a predicted object is *split* and no segment has enough readings of the object, no segment continues the object.
+  The track of a split object then ends, its views are deleted, and the segments are new objects.
+- If several objects are *merged* into one segment, the segment continues all these objects.
 - A segment that continues no object is a new object.
 
-An object without conflict is *occluded*. Readings that belong to no segment are never counted.
+A predicted object in no conflict is *occluded*. Readings that belong to no segment are never counted.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class ConflictComponent(NamedTuple):
     """A connected component of the conflict graph of segments and predicted objects."""
 
     segments: list[int]  #: ascending labels
-    objects: list[int]  #: ascending labels; none if the segment is in conflict with no object
+    objects: list[int]  #: ascending labels; empty if the segment is in conflict with no object
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Overlaps:
     def of(cls, partition: np.ndarray, counts: np.ndarray, least: float) -> Overlaps:
         """The overlaps of a partition, from the segment (K,) of each cell.
 
-        `counts` (K, objects + 1) has the number of readings of each cell with each predicted object; 0 is no object.
+        `counts` (K, objects + 1) has the numbers of readings that cells share with predicted objects; 0 is no object.
         """
         shared = np.zeros((int(partition.max(initial=0)) + 1, counts.shape[1]), np.int64)
         np.add.at(shared, partition, counts)
@@ -79,7 +79,7 @@ class Overlaps:
 
     @cached_property
     def main_object(self) -> np.ndarray:
-        """The predicted object (segments + 1,) with most readings of each segment; 0 for a segment without any."""
+        """The predicted object (segments + 1,) that shares most readings with each segment; 0 is no object."""
         main = self.shared[:, 1:].argmax(axis=1) + 1 if self.shared.shape[1] > 1 else np.zeros(len(self.shared), int)
         return np.where(self.shared[:, 1:].any(axis=1), main, 0)
 
@@ -100,7 +100,7 @@ class Overlaps:
         return sorted(found)
 
     def tracks(self, component: ConflictComponent) -> dict[int, list[int]]:
-        """The predicted objects that each segment of a component continues, the one with most readings first."""
+        """The predicted objects that each segment of a component continues, by decreasing number of readings."""
         continued: dict[int, list[int]] = {segment: [] for segment in component.segments}
         for predicted in component.objects:
             segment = self.continued_by(predicted, component)
@@ -116,9 +116,9 @@ class Overlaps:
         return self._holder(predicted, mainly_it, share) or self._holder(predicted, np.ones_like(mainly_it), share)
 
     def _holder(self, predicted: int, segments: np.ndarray, share: float) -> int:
-        """The segment in conflict with an object that has more than a share of its readings in `segments`; 0 if none.
+        """The segment that is in conflict with an object and has more than a `share` of the object's readings, or 0.
 
-        `segments` (segments + 1,) bool selects segments.
+        Only readings in the segments that `segments` (segments + 1,) bool selects are counted.
         """
         readings = np.where(segments, self.shared[:, predicted], 0)
         enough = self.in_conflict[:, predicted] & (readings > share * readings.sum())

@@ -1,18 +1,18 @@
-"""Candidates of the update as choices: described and weighted before any object is completed.
+"""Describes and weights the candidates of the update before any object is completed.
 
 >>> choices = Choices.of(cells, log_weights, log_odds, 100)   # for n predictions: log_weights (n,), log_odds (n, e)
 >>> choices.prediction[0], choices.partitions[0]             # prediction j, and the segment (K,) of each cell
 >>> choices = choices.with_occluded(probabilities_to_stay, 100)
 >>> choices.log_weights, choices.occluded[0]                 # log probability, occluded objects of j that stay
 
-A candidate is a prediction j, an alternative a_c for each component c of the cells, and for each occluded object k of
-the prediction whether it stays. Its probability is
+A candidate consists of a prediction j, an alternative a_c for each component c of the cells, and the set of occluded
+objects k that stay (e_k = 1). Object k stays with probability r_k. The probability of a candidate is a product:
 
-    w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}.
+    ``w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}``
 
-The components are independent given the prediction. So the most probable candidates are found factor by factor, and
-only the n largest products are kept after each factor (`largest_products`). All candidates together have probability
-1. The probability of the candidates that are left out is reported as the *discarded mass*.
+The components are independent given the prediction. Therefore the factors are multiplied one after the other, and
+only the n largest products are kept after each factor (`largest_products`). The probabilities of all candidates sum
+to 1. The total probability of the omitted candidates is reported as the *discarded mass*.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ class Choices:
         ----------
         cells : Cells
         log_weights : (predictions,) float
-            log (w_j Q_j^lambda), with sum 1 of the weights.
+            log (w_j Q_j^lambda), where the weights w_j Q_j^lambda sum to 1.
         log_odds : (predictions, e) float
             Log odds of "one object" of each pair of cells, given each prediction.
         n : int
             Largest number of candidates.
         temperature : float
-            T. The alternatives of a component have probabilities in proportion to P(a_c | image, j)^(1/T).
+            T. The probability of an alternative is proportional to P(a_c | image, j)^(1/T).
         """
         components = cells.alternatives()
         found, entropies = [], np.zeros(len(components))
@@ -80,9 +80,9 @@ class Choices:
         return cls(prediction[order], partitions, log_p[order]).most_probable(n)
 
     def with_occluded(self, probabilities: Sequence[dict[int, float]], n: int) -> Choices:
-        """The n most probable candidates, with each of the most probable sets of occluded objects that stay.
+        """The n most probable combinations of a candidate and a set of occluded objects that stay.
 
-        `probabilities` has, for each candidate, the probability of each occluded object to stay, by its label.
+        For each candidate, `probabilities` maps labels of occluded objects to the probability that the object stays.
         """
         sets = [stays(one, n) for one in probabilities]
         of = np.repeat(np.arange(len(self)), [len(one) for one in sets])
@@ -93,16 +93,16 @@ class Choices:
         )
 
     def most_probable(self, n: int) -> Choices:
-        """The n candidates of largest positive weight, in the present order."""
+        """The n candidates of largest positive weight, without change of order."""
         best = largest(self.log_weights, n)
         best = best[self.log_weights[best] > -np.inf]
         occluded = tuple(self.occluded[k] for k in best.tolist()) if self.occluded else ()
         return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], occluded)
 
     def described(self, projected: Population) -> Population:
-        """The candidates as a population whose particles are indices, with the parents of their predictions.
+        """The candidates as a population. The particles are indices with the parents of their predictions.
 
-        `projected` are the predictions. The notes have the probability of the candidates that are left out.
+        `projected` are the projected predictions. The notes have the total probability of the omitted candidates.
         """
         previous = projected.parents.get("previous", np.full(len(projected), -1))
         discarded = max(0.0, 1 - float(np.exp(self.log_weights).sum()))
@@ -112,12 +112,12 @@ class Choices:
 
 
 def largest(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """Indices of the n largest log weights, ascending; of equal ones the first."""
+    """Indices of the n largest log weights, ascending. If weights are equal, the first indices are used."""
     return np.sort(np.argsort(-log_weights, kind="stable")[:n])
 
 
 def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The n largest products with one entry of each factor.
+    """The n largest products of one entry from each factor.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndar
     Returns
     -------
     chosen : (m, C) int
-        Index of the entry of each factor, with m <= n.
+        Index of the chosen entry of each factor; m is at most n.
     log_products : (m,) float
         Descending.
     """
@@ -149,7 +149,7 @@ def tempered(p: np.ndarray, temperature: float) -> np.ndarray:
 def stays(probabilities: dict[int, float], n: int) -> list[tuple[tuple[int, ...], float]]:
     """The n most probable sets of occluded objects that stay, and their log probabilities.
 
-    `probabilities` has the probability of each object to stay, by its label. Objects are independent.
+    `probabilities` maps labels to the probability that the object stays. Objects stay independently.
     """
     p = np.array([*probabilities.values()])
     p = np.where(p < _CERTAIN, 0, np.where(p > 1 - _CERTAIN, 1, p))

@@ -6,24 +6,25 @@
 >>> component = cells.alternatives()[0]                           # the partitions of the cells of one component
 >>> cells.probabilities(log_odds, component)                      # (p,) probability of each of these partitions
 
-A sample groups the readings by its segments. A prediction groups the readings by the objects that lie at the
-readings. A cell is a set of readings that no sample and no prediction separates: the cells are the common refinement
-of all partitions. A component is a set of cells that are connected by joins in the partitions.
+A sample groups the depth readings by segment. A prediction groups the readings by the predicted object at each
+reading. A cell is a set of readings that no sample and no prediction separates: the cells are the common refinement
+of all partitions. Two cells are connected if they belong to one object in a sample or a prediction. A component is a
+connected set of cells.
 
-For two cells, f_image is the share of the samples in which both belong to one object. f_prediction is the same share
-of the predictions. The log odds of "one object" are
+For two cells, f_image is the share of the samples in which the cells belong to one object. The share
+f_prediction is the corresponding weighted share of the predictions. The log odds l of "one object" are a sum:
 
-    l = (1 - R) (image_only_constant + image_only logit(f_image))
-        + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant),
+    ``l = (1 - R) (image_only_constant + image_only logit(f_image))
+    + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant)``
 
-where R is the probability that a prediction is valid, and W <= R the weight of the predictions that explain both
-cells. The shares are softened by 2 %. The coefficients are the fields of `PairEvidence`. The odds of the image are
-taken as they are. The coefficients of the predictions were fitted in `experiments/partition_fit`.
+R is the probability that a prediction is valid. W <= R is the total weight of the predictions with an object at both
+cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,
+logit(f_image) is not scaled. The coefficients of the predictions were fitted in `experiments/partition_fit`.
 
-The alternatives of a component are the partitions that the samples and the predictions give it. If a prediction does
-not explain a cell, each sample in turn determines which predicted object the cell joins. Every mixture of the
-alternatives gives each pair of cells a probability of "one object". The selected mixture has the probabilities
-nearest to those of l (least cross entropy over the pairs of readings).
+The alternatives of a component are its partitions in the samples and in the predictions. If a prediction has no
+object at a cell, each sample in turn determines which predicted object the cell joins. A mixture of the alternatives
+gives each pair of cells a probability of "one object". The mixture is fitted to the probabilities of the log odds l
+by least cross entropy over the pairs of readings.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Readings:
 
     @property
     def smallest_region(self) -> float:
-        """Number of readings of the smallest region that is used in an image of this size."""
+        """Smallest number of readings of a separate region, for the size of this image."""
         return scaled_area(_LEAST_READINGS, self.shape[0] * self.shape[1])
 
     def mask(self, chosen: np.ndarray) -> np.ndarray:
@@ -78,7 +79,7 @@ class Readings:
         return np.asarray(image.ravel()[self.pixels])
 
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
-        """Label (m,) of each reading: of its voxel, or of the nearest object within `reach` voxels; 0 if none."""
+        """Label (m,) of the nearest occupied voxel within `reach` voxels of each reading; 0 if there is none."""
         occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
         _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
         found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
@@ -130,7 +131,7 @@ class Cells:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """Readings (K,) of each cell."""
+        """Number (K,) of readings of each cell."""
         return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
 
     @cached_property
@@ -142,7 +143,7 @@ class Cells:
 
     @cached_property
     def pairs(self) -> np.ndarray:
-        """Pairs (e, 2) of cells of one component."""
+        """All pairs (e, 2) of cells in the same component."""
         return np.argwhere(np.triu(self.component[:, None] == self.component, 1))
 
     def alternatives(self) -> list[Alternatives]:
@@ -156,7 +157,7 @@ class Cells:
         return found
 
     def _partitions_of(self, cells: np.ndarray) -> list[np.ndarray]:
-        """Partitions (k,) of some cells (k,) by the samples, and by the predictions, completed by each sample."""
+        """Partitions (k,) of cells (k,) by each sample, and by each prediction with its gaps filled by a sample."""
         labels = self.samples[:, cells]
         # A cell without a segment is a part by itself.
         samples = np.unique(np.where(labels > 0, labels, -1 - np.arange(len(cells))), axis=0)
@@ -181,7 +182,7 @@ class Cells:
 
     @staticmethod
     def joined(components: Sequence[Alternatives], chosen: np.ndarray) -> np.ndarray:
-        """Segment (K,) of each cell, 1, 2, ..., from the chosen alternative (C,) of each component."""
+        """Segment number (K,) of each cell, from 1, for the chosen alternative (C,) of each component."""
         partition, used = np.zeros(sum(len(one.cells) for one in components), np.int64), 0
         for one, k in zip(components, chosen.tolist(), strict=True):
             partition[one.cells] = one.partitions[k] + used
@@ -202,9 +203,9 @@ class Cells:
 
 
 def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Labels (m,) of a prediction, filled with the most frequent label of the cell (m,) where there is none.
+    """Labels (m,) of a prediction. A reading without an object gets the most frequent label of its cell (m,).
 
-    Only cells of which the prediction explains at least half are filled.
+    Only cells with an object at half of their readings or more are filled.
     """
     table = np.zeros((int(cells.max(initial=-1)) + 1, int(labels.max(initial=0)) + 1), np.int64)
     np.add.at(table, (cells, labels), 1)
@@ -214,7 +215,7 @@ def _extended(cells: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> np.ndarray:
-    """Cells of the kept readings. Small cells are joined to the nearest large cell, if one is near."""
+    """Cells of the kept readings, where readings of a small cell join the nearest large cell, if one is near."""
     pixels, least = readings.pixels[kept], readings.smallest_region
     large = np.bincount(cell, minlength=1)[cell] >= least
     if not large.any():
@@ -226,16 +227,16 @@ def _without_slivers(cell: np.ndarray, readings: Readings, kept: np.ndarray) -> 
 
 
 def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """A reading (K,) of each cell (m,) with the labels of the cell, not from a small cell that was joined."""
+    """Index (K,) of one reading of each cell, outside the small cells that were joined to the cell."""
     own = np.flatnonzero(cell == exact)
     return own[np.unique(cell[own], return_index=True)[1]]
 
 
 def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """A prediction (k,) of cells of these sizes (k,), with objects for the cells that it does not explain.
+    """A prediction (k,), filled with an object for every cell. `sizes` (k,) are the numbers of readings of the cells.
 
-    An unexplained cell joins the predicted object with most readings in its segment of the sample (k,). If no
-    predicted object has readings there, the segment is an object.
+    A cell without an object joins the predicted object with most readings in the cell's segment of the sample (k,).
+    If no predicted object has readings in the segment, the segment is a new object.
     """
     filled = prediction.copy()
     for segment in np.unique(sample[prediction == 0]):
@@ -248,11 +249,11 @@ def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np
 
 
 def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The mixture (p,) of partitions that forecasts pairs best.
+    """The proportions (p,) of the mixture of partitions with the best forecasts for pairs of cells.
 
     `same` (e,) are the probabilities that the cells of a pair belong to one object. `joined` (p, e) states which
-    partitions join the pair. The mixture minimises the cross entropy between `same` and the total probability of the
-    partitions that join the pair. `weights` (e,) weight the pairs. The problem is convex. The problem is solved by
+    partitions join each pair. The mixture minimises the cross entropy between `same` and the total probability of the
+    partitions that join each pair. `weights` (e,) are the weights of the pairs. The convex problem is solved by
     expectation maximisation for the proportions of a mixture.
     """
     q = np.full(len(joined), 1 / len(joined))
@@ -275,29 +276,29 @@ class PairOdds(Checked, ABC):
     @returns(lambda self, found, cells, weights, clip: check_array(found, (len(cells.pairs),), finite=False))
     @abstractmethod
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
-        """Log odds (e,) of "one object" for ``cells.pairs`` (e, 2), all pairs of cells of one component.
+        """Log odds (e,) of "one object" for each pair of cells in ``cells.pairs`` (e, 2).
 
         Parameters
         ----------
         cells : Cells
-            The common refinement of the samples and the predictions, with the label of every cell in each of them.
+            The common refinement of the samples and the predictions.
         weights : (n,) ndarray
-            Weight of each prediction times the probability that it is valid. One minus the sum is the probability
-            that no prediction is valid.
+            Weight of each prediction times the probability that the prediction is valid. One minus the sum of the
+            weights is the probability that no prediction is valid.
         clip : Clip
-            The last frame of the clip is the image.
+            Clip whose last frame is the image.
         """
 
 
 class PairTerms(NamedTuple):
-    """The factor of each field of `PairEvidence`: arrays (e,) with one number for each pair of cells."""
+    """The terms that the fields of `PairEvidence` multiply: arrays (e,) with one number for each pair of cells."""
 
-    image_only_constant: np.ndarray  #: probability that no prediction holds
-    image_only: np.ndarray  #: the same, times the logit of the share of samples
-    constant: np.ndarray  #: probability that a prediction holds
-    image: np.ndarray  #: the same, times the logit of the share of samples
-    prediction: np.ndarray  #: weight of the predictions that explain both cells, times the logit of their share
-    prediction_constant: np.ndarray  #: weight of the predictions that explain both cells
+    image_only_constant: np.ndarray  #: probability that no prediction is valid
+    image_only: np.ndarray  #: probability that no prediction is valid, times the logit of f_image
+    constant: np.ndarray  #: probability that a prediction is valid
+    image: np.ndarray  #: probability that a prediction is valid, times the logit of f_image
+    prediction: np.ndarray  #: weight of the predictions with an object at both cells, times the logit of f_prediction
+    prediction_constant: np.ndarray  #: weight of the predictions with an object at both cells
 
 
 @dataclass(frozen=True)
@@ -315,7 +316,7 @@ class PairEvidence(PairOdds):
         return np.column_stack(self.terms(cells, weights)) @ np.array(astuple(self))
 
     def terms(self, cells: Cells, weights: np.ndarray) -> PairTerms:
-        """The terms of the sum, without the coefficients."""
+        """The terms of the log odds, without the coefficients."""
         in_samples = _labels_of_pairs(cells.samples, cells.pairs)
         image = softened_logit(np.mean(in_samples.same, axis=0))
         in_predictions = _labels_of_pairs(cells.predictions, cells.pairs)
@@ -334,12 +335,12 @@ class _PairLabels(NamedTuple):
 
 
 def _labels_of_pairs(labels: np.ndarray, pairs: np.ndarray) -> _PairLabels:
-    """From labels (n, K) of the cells, in which 0 means no object."""
+    """Compare the labels (n, K) of the cells of each pair; label 0 is no object."""
     a, b = (labels[:, cell] for cell in pairs.T)
     both = (a > 0) & (b > 0)
     return _PairLabels(both, both & (a == b))
 
 
 def softened_logit(p: np.ndarray) -> np.ndarray:
-    """Log odds of shares that are softened by 2 %."""
+    """Log odds of shares p, after 0.02 is added to p and to 1 - p."""
     return np.log((p + _SOFT) / (1 - p + _SOFT))

@@ -1,40 +1,39 @@
-"""The measurement update: partitions of the image are weighed, and every object is completed from all its views.
+"""The measurement update, which weights partitions of the image and completes every object from all its views.
 
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # weighted candidates, built on access
 
-The update replaces section IV-D of the paper. In the paper, a sample of the image and a prediction are two sets of
-voxels, which are crossed. In this update, both are partitions of the depth readings of the last frame. The voxels of
-an object are estimated again from everything that was observed of it.
+The update replaces section IV-D of the paper. In the paper, each sample of the image and each prediction are sets of
+voxels, and all pairs are crossed. In this update, samples and predictions are partitions of the depth readings of the
+last frame. The voxels of an object are estimated again from all observations of the object.
 
-1. **Free-space projection** (as in the paper). Q_j is the share of the voxels of prediction j that the frame does not
-   observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j that the frame
-   shows at its place. A_j^lambda is used as the probability that prediction j *holds*, which means that it shows the
-   present scene. A predicted object is *refuted* and leaves the prediction if less than `least_agreement` of its
-   visible surface is at its place.
-2. **Partitions.** A sample groups the readings by its segments. A prediction groups the readings by the objects that
-   lie at the readings. The samples and prediction j give the odds that two readings belong to one object. These odds
-   give the partitions of each part of the image a probability (`mstfilter.partition.cells`). A candidate is a
-   prediction j and one partition of each part. Its weight is w_j Q_j^lambda times the probabilities of the partitions
-   (`mstfilter.partition.candidates`). The most probable candidates are described. The resampler of the filter selects
-   among them, and only these are completed. The paper crosses each sample with each prediction.
-3. **Association.** Segments and predicted objects form a *conflict graph*. In the *components* of the graph, segments
-   continue predicted objects by the rules in `mstfilter.partition.association`. At most one segment continues an
-   object that is split. The other segments are new objects. The paper draws which conflicts end in a merge. Here the
-   partition determines the merges.
-4. **Occluded objects.** A predicted object without conflict has no readings or very few. It stays with
-   probability (A_j q)^lambda, so there are candidates with it and without it. Here q is the share of its own voxels
-   that the frame does not observe as free. A_j says whether the prediction can be trusted at all, and q whether this
-   object is still there.
-5. **Completion.** An object keeps its views: what earlier frames showed of it (`mstfilter.scene.ObjectView`). A
-   visible object is completed from its readings in this frame and from the views of the objects that it continues. An
-   occluded object is completed from its views only. The completer drops views that the frame refutes. An object
-   without any voxel is removed. Observations are kept, and completions are not: no voxel from a completion at an
-   earlier pause is used again. The exception is an occluded object without views, which occurs if the completer does
-   not use views. The object keeps its voxels outside free space.
+1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not
+   observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j with which
+   the depth readings agree. A_j^lambda is used as the probability that prediction j is valid, which means that the
+   prediction shows the present scene. A predicted object is *refuted* and removed from the prediction if the readings
+   agree with less than the share `least_agreement` of the object's visible surface.
+2. **Partitions.** A sample groups the readings by segment. A prediction groups the readings by the predicted object
+   at each reading. The samples and prediction j give the odds that two readings belong to one object. The odds
+   determine the probabilities of the partitions of each part of the image (`mstfilter.partition.cells`). A candidate
+   consists of a prediction j and one partition of each part. The weight of a candidate is w_j Q_j^lambda times the
+   probabilities of its partitions (`mstfilter.partition.candidates`). Only the most probable candidates are
+   described. The resampler of the filter selects some candidates, and only selected candidates are completed.
+3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each *component* of the
+   graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. If an object is
+   split, at most one segment continues the object, and the other segments are new objects. In the paper, merges are
+   drawn at random. In this update, the partition determines the merges.
+4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
+   probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
+   the object's voxels that the frame does not observe as free. A_j rates the whole prediction, q the object.
+5. **Completion.** An object keeps its views, which are its observations in earlier frames
+   (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
+   views of the predicted objects that the visible object continues. An occluded object is completed from its views
+   only. The completer drops views that contradict the frame. An object without any voxel is removed. Completions of
+   earlier pauses are not used again, with one exception. If the completer does not use views, an occluded object has
+   no views and keeps its predicted voxels outside free space.
 
-At the first pause the candidates are the distinct samples, so every segment is a new object. Hypotheses have no
-objects that no frame has shown.
+At the first pause the candidates are the distinct samples, so every segment is a new object. A hypothesis contains
+only objects that some frame has shown.
 """
 
 from __future__ import annotations
@@ -74,12 +73,12 @@ from mstfilter.smc import Candidates, Key, Population, Update, first_seen, key_o
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A predicted hypothesis and its evidence in the last frame."""
+    """A predicted hypothesis, compared with the last frame."""
 
     hypothesis: Hypothesis
     refined: Hypothesis  #: without the voxels that the frame observes as free
-    holds: float  #: probability that it holds, A^lambda
-    objects: np.ndarray  #: (m,) its object at each reading, 0 is none or a refuted object
+    holds: float  #: probability A^lambda that the prediction is valid
+    objects: np.ndarray  #: (m,) predicted object at each reading, 0 is none or a refuted object
     refuted: frozenset[int]  #: labels of the objects that the frame does not show at their places
 
     @cached_property
@@ -89,7 +88,7 @@ class Prediction:
         return {label: left[label] / n for label, n in self.hypothesis.volumes().items()}
 
     def remaining(self, record: ObjectRecord, threshold: float) -> Completion:
-        """The voxels of an object outside free space, with at least the probability `threshold`."""
+        """The voxels of an object outside free space. Occupied voxels get at least the probability `threshold`."""
         crop, left = self.hypothesis.crop(record.label), self.refined.shares.probability
         p = crop.occupied if crop.probability is None else np.maximum(crop.probability, threshold * crop.occupied)
         p = np.where(left[crop.box] > 0, p, 0).astype(np.float32)
@@ -108,33 +107,33 @@ class SceneObject(NamedTuple):
 
 @dataclass(frozen=True)
 class PartitionUpdate(Update):
-    """Partition of the readings, and completion from all views.
+    """Partition of the depth readings, and completion of objects from all views.
 
     Parameters
     ----------
     completer : Completer
-        Completes the objects. The completer of the proposal is then not used, and may be `SurfaceOnly`.
+        Completes the objects. The completions of the proposal are not used, so the proposal can use `SurfaceOnly`.
     free_space : Projection
         Computes the share Q of a prediction that the frame does not observe as free, and the remaining voxels.
     pairs : PairOdds
         The log odds that two cells belong to one object.
     temperature : float
-        T. Partitions of a component have probabilities in proportion to P^(1/T), where P is their probability by the
-        pairs. A higher T makes the probabilities more even.
+        T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
+        cells. A higher T makes the probabilities more even.
     occupied_log_odds : float
-        Added to the log odds of every uncertain voxel, since the network is calibrated for its training scenes. The
-        value was fitted in `experiments/partition_fit`.
+        Added to the log odds of every uncertain voxel. The completion network is calibrated only for its training
+        scenes, so the default was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
     quality_exponent : float
-        lambda, the exponent of Q, A and q. With 0, every prediction holds, and every occluded object is kept.
+        Exponent lambda of Q, A and q. If lambda is 0, every prediction is valid, and every occluded object is kept.
     n_candidates : int
         Largest number of candidates after the first pause. 0 means 20 for each predicted hypothesis.
     n_scored : int
         Number of candidates that are built and scored by `evidence`.
     reach : float
-        Largest distance in voxels between a reading and the predicted object that explains it.
+        Largest distance in voxels between a reading and the predicted object to which the reading belongs.
     n_views : int
         Number of latest views that an object keeps.
     threshold : float
@@ -142,8 +141,8 @@ class PartitionUpdate(Update):
     mend : bool
         Whether missing readings of objects are estimated, as in `ObjectRule`.
     least_agreement : float
-        Least share of the visible surface of a predicted object that the frame shows at its place. With 0, surfaces
-        are not tested: no object is refuted, and Q replaces A.
+        Least share of the visible surface of a predicted object with which the depth readings must agree. At 0,
+        surfaces are not tested: no object is refuted, and Q replaces A.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -196,7 +195,7 @@ class PartitionUpdate(Update):
         return self._scored(candidates, observation) if self.evidence else candidates
 
     def _mended(self, clip: Clip) -> Clip:
-        """The last frame, with estimates of missing readings of objects. Free-space projection does not use them."""
+        """The last frame, with estimates of missing readings. Free-space projection does not use estimates."""
         return Clip((foreground(clip.after, clip.grid).frame,), clip.grid, clip.index) if self.mend else clip
 
     # 1. Free-space projection -----------------------------------------------------------------------------------
@@ -210,7 +209,7 @@ class PartitionUpdate(Update):
     def _predictions(
         self, predicted: Population, projected: Population, readings: Readings, frame: Frame
     ) -> list[Prediction]:
-        """The evidence about each prediction in the last frame."""
+        """Each prediction, compared with the last frame."""
         quality = np.exp(log_quality(np.array(projected.notes["quality"])))
         columns = zip(predicted.particles, projected.particles, quality.tolist(), strict=True)
         return each(lambda one: self._prediction(*one, readings, frame), columns)
@@ -251,7 +250,7 @@ class PartitionUpdate(Update):
         return choices.with_occluded(stay, n)
 
     def _stay(self, prediction: Prediction, overlaps: Overlaps) -> dict[int, float]:
-        """Probability (A_j q)^lambda of each occluded object of a prediction to stay, by its label."""
+        """Probability (A_j q)^lambda that each occluded object of a prediction stays, by label."""
         q = prediction.shares_left
         occluded = sorted(q.keys() - overlaps.visible - prediction.refuted)
         return {label: prediction.holds * q[label] ** self.quality_exponent for label in occluded}
@@ -321,7 +320,7 @@ class PartitionUpdate(Update):
     # Evidence of built candidates -------------------------------------------------------------------------------
 
     def _scored(self, candidates: Population, clip: Clip) -> Population:
-        """The `n_scored` candidates of largest weight, built and weighted by the evidence as well."""
+        """Build the `n_scored` candidates of largest weight, and add the evidence to their log weights."""
         kept = largest(candidates.log_weights, self.n_scored)
         built, scores = candidates.take(kept).realised(), {}
         total = np.zeros(len(built))
@@ -335,15 +334,15 @@ class PartitionUpdate(Update):
 def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
     """The segment (m,) of each reading in each sample, where 0 means none.
 
-    A reading belongs to the segment of its voxel, or to the nearest segment within a voxel. At borders, some pixels
-    of one object have readings of another.
+    A reading belongs to the segment of its voxel, or to the nearest segment within one voxel. At a border, a pixel of
+    one object can measure the depth of another object.
     """
     found = {id(h): readings.labels(h.labels, 1.0) for h in {id(h): h for h in proposed.particles}.values()}
     return [found[id(h)] for h in proposed.particles]
 
 
 def _distinct(proposed: Population, segments: Sequence[np.ndarray]) -> tuple[Population, list[np.ndarray]]:
-    """The distinct samples with the total weight of the equal ones, and their segments (m,)."""
+    """The distinct samples, weighted by the total weight of equal samples, and their segments (m,)."""
     which = first_seen(one.tobytes() for one in segments)
     example = np.unique(which, return_index=True)[1]
     merged = proposed.take(example, np.log(np.bincount(which, proposed.weights)))

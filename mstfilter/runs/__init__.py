@@ -9,7 +9,7 @@
 >>> rows = score_pauses(run.estimates(), read_truth(recording))
 
 The same call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
-an uninterrupted run have the same result. Modules: The module `run` has the loop, and `run_folder` the files.
+an uninterrupted run have the same result. The module `run` has the loop, the module `run_folder` has the files.
 """
 
 from mstfilter.lazy import attach

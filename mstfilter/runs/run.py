@@ -3,7 +3,7 @@
 >>> run = filter_recording(recording, load_config("mst"), Path("runs/mine"), seed=0)
 
 All input is checked before the folder is made. An interrupted run is resumed by the same call with the same
-configuration, seed and recording. An uninterrupted run has the same result.
+configuration, seed and recording. A resumed run and an uninterrupted run have the same result.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Configurations of the filters with which a run is compared. They keep the completer of the filter."""
+    """Configurations of the filters with which a run is compared. Compared filters keep the completer of the run."""
     parts = (config.get(slot) or {} for slot in ("proposal", "update"))
     proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
     proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
@@ -62,24 +62,24 @@ def filter_recording(
     config : mapping
         A configuration from `mstfilter.presets.load_config`.
     path : Path
-        The run folder. The folder must be new, empty, or of the same interrupted run.
+        The run folder. The folder must be new, be empty, or contain the same interrupted run.
     seed : int
         Seed of all random streams.
     replace : bool
-        Whether to remove an earlier run in the folder, as soon as the first step has succeeded.
+        Whether to remove an earlier run in the folder after the first step has succeeded.
     allow_files : bool
         Whether components may come from ``./file.py:Class``.
     progress : bool or callable
-        True shows a progress bar; a function is called before the first step and after every step, with the number
-        of pauses done and of all pauses.
+        True shows a progress bar. A function is called before the first step and after every step, with the number
+        of finished pauses and the number of all pauses.
     n_threads : int
-        Threads of one step. The result is the same.
+        Number of threads of one step. The result does not depend on the number of threads.
 
     Raises
     ------
     InputError
-        If the configuration or the recording is invalid, or the folder belongs to another run, or another process
-        is writing it.
+        If the configuration or the recording is invalid, if the folder belongs to another run, or if another process
+        is writing into the folder.
     """
     filter = build_filter(config, allow_files=allow_files)
     recording.check()
@@ -130,7 +130,7 @@ def filter_recording(
 
 
 def first_pause(path: Path, description: dict[str, Any], replace: bool, *step: Any) -> RunFolder:
-    """Make a run folder with its first pause, or nothing. `step` are the arguments of `RunFolder.write_pause`."""
+    """Make a run folder with its first pause. `step` are the arguments of `RunFolder.write_pause`."""
     with atomic_folder(path, "replace" if replace else "refuse") as work:
         RunFolder.create(work, description).write_pause(*step)
     return RunFolder(path)
@@ -139,7 +139,7 @@ def first_pause(path: Path, description: dict[str, Any], replace: bool, *step: A
 def describe_run(
     recording: Mapping[str, Any], config: Mapping[str, Any], filter: ParticleFilter, seed: int
 ) -> dict[str, Any]:
-    """The content of run.json except its format and status; `recording` is the entry of the recording."""
+    """The content of run.json except its format and status. `recording` is the description of the recording."""
     description: dict[str, Any] = as_json(
         {
             "seed": seed,
@@ -156,7 +156,7 @@ def describe_run(
 
 
 def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> RunFolder | None:
-    """The folder of the same run, to be resumed; None if it does not exist yet, or can be replaced."""
+    """The folder of the same run, to be resumed. None if the folder does not exist yet, or is to be replaced."""
     check_run_folder(path, replace)
     if replace or not (path / "run.json").is_file():
         return None
@@ -175,7 +175,7 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
 
 
 def check_run_folder(path: Path, replace: bool = False) -> None:
-    """Raise InputError unless a path is a run folder, an empty folder, or a new folder can be made there.
+    """Raise InputError unless a path is a run folder or an empty folder, or a new folder can be made at the path.
 
     With `replace`, a run folder must not contain files that are not part of a run.
     """

@@ -1,24 +1,25 @@
-"""The folder of a run, written pause by pause. Reports read this folder, and an interrupted run resumes from it.
+"""The folder of a run, written pause by pause, from which reports are made and interrupted runs are resumed.
 
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
 
-Layout::
+=======================  =============================================================================================
+run.json                 configuration, seed, versions, recording, status
+pauses/000/rgb.png       image at the pause
+pauses/000/camera.json   camera with its pose at the pause
+pauses/000/state.npz     particles and log weights
+pauses/000/info.json     record of the step
+pauses/000/truth.npz     true labels, if known
+pauses/000/instance.png  true label image, if known
+pauses/000/seconds.json  wall time by component
+pauses/000/SHA256SUMS    hashes of the files of the pause without seconds.json
+metrics.csv, SHA256SUMS  table with one row per pause and hypothesis, and the hash of this table
+compare/without-past     run folders of other filters on the same recording, if requested
+=======================  =============================================================================================
 
-    run.json                 configuration, seed, versions, recording, status
-
-    pauses/000/rgb.png       the image at the pause          pauses/000/state.npz        particles and log weights
-    pauses/000/info.json     record of the step              pauses/000/camera.json      pose at the pause
-
-    pauses/000/truth.npz     true labels, if known           pauses/000/seconds.json     wall time by component
-    pauses/000/instance.png  true label image, if known      pauses/000/SHA256SUMS       hashes, not of seconds.json
-
-    metrics.csv              one row per pause and hypothesis; SHA256SUMS: its hash
-    compare/without-past     run folders of other filters on the same recording, if asked for
-
-A pause is written under a temporary name and renamed when it is complete, so a run that was stopped at any moment
-holds complete pauses only. `filter_recording` resumes from state.npz of the last one. Its arrays ``particles/...``
-are those of `mstfilter.scene.encode_hypotheses`. The same seed gives the same bytes in all files except seconds.json.
+A pause is written under a temporary name and renamed when it is complete, so a stopped run has only complete pauses.
+`filter_recording` resumes from state.npz of the last complete pause. `mstfilter.scene.encode_hypotheses` makes the
+arrays ``particles/...`` in state.npz. The same seed gives the same bytes in all files except seconds.json.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def as_json(value: Any) -> Any:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON in one step."""
+    """Write a JSON file atomically."""
     write_text(path, json.dumps(as_json(value), indent=1) + "\n")
 
 
@@ -144,7 +145,7 @@ class _SecondsFile(RootModel[dict[str, float]]):
 
 @dataclass(frozen=True)
 class HypothesisCodec(Codec):
-    """Hypotheses on one grid as arrays, bit for bit."""
+    """Converts hypotheses on one grid to arrays and back, without any change."""
 
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
         return encode_hypotheses(particles)
@@ -167,14 +168,14 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
-        """An existing run folder."""
+        """Open an existing run folder."""
         folder = cls(Path(path))
         _ = folder.description
         return folder
 
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
-        """A new run folder that contains only its description."""
+        """Make a run folder that contains only its description."""
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
@@ -187,9 +188,9 @@ class RunFolder:
         return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
 
     def check(self) -> RunFolder:
-        """Read every file of the run and of its comparison runs, before work with them starts.
+        """Read every file of the run and of its comparison runs, before the files are used.
 
-        Raises InputError if a file is missing or damaged, or files of a pause do not belong together.
+        Raises InputError if a file is missing or damaged, or if files of a pause are inconsistent.
         """
         if self.n_pauses > len(self.description["recording"]["pauses"]):
             raise InputError(f"{self.path}: there are more pauses than run.json lists")
@@ -201,7 +202,7 @@ class RunFolder:
         return self
 
     def _check_pause(self, t: int, n_before: int) -> int:
-        """Check the files of a pause after one with `n_before` hypotheses; returns the number of hypotheses."""
+        """Check the files of a pause, given the number of hypotheses before. Returns the number of hypotheses."""
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
         _ = self.seconds(t), self.questions(t)
@@ -254,7 +255,7 @@ class RunFolder:
         questions: Questions | None = None,
         instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, and of the pause if known: true labels, questions, true label image.
+        """Write the results of a step, and, if known, true labels, questions and true label image of the pause.
 
         An interrupted call writes nothing.
         """
@@ -290,10 +291,7 @@ class RunFolder:
             )
 
     def repair(self) -> None:
-        """Prepare the folder for resuming. Remove remains of a killed process, and damaged pauses with a warning.
-
-        All pauses after a damaged one are removed.
-        """
+        """Prepare for resuming: remove temporary files, and with a warning the first damaged and all later pauses."""
         sweep(self.path)
         sweep(self.path / "pauses")
         good = 0
@@ -335,7 +333,7 @@ class RunFolder:
         return self._truth(t).get("labels")
 
     def questions(self, t: int) -> Questions | None:
-        """The questions of a pause with ground truth; None if unknown."""
+        """The questions of a pause with ground truth; None if the truth is unknown."""
         pairs = self._truth(t).get("questions")
         return Questions(self._truth(t)["labels"].shape, *pairs) if pairs is not None and pairs.size else None
 
@@ -352,7 +350,7 @@ class RunFolder:
         return {"labels": labels, "questions": pairs}
 
     def hypotheses(self, t: int) -> tuple[Hypothesis, ...]:
-        """The particles after the step."""
+        """The hypotheses after the step that ended at pause `t`."""
         population = self.state(t).population
         assert population is not None
         return tuple(population.particles)
@@ -360,7 +358,7 @@ class RunFolder:
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed.
 
-        The state is kept in `scene_cache`, since a report uses it many times.
+        The state is kept in `scene_cache`, because a report reads the state many times.
         """
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"):
@@ -369,7 +367,7 @@ class RunFolder:
         return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
 
     def estimates(self) -> list[PauseEstimate]:
-        """The weighted hypotheses of all pauses, to be scored by `mstfilter.scoring.score_pauses`."""
+        """The weighted hypotheses of all pauses, the input of `mstfilter.scoring.score_pauses`."""
         run, found = self.check(), []
         if run.n_pauses == 0:
             raise InputError(f"{self.path}: the run has no complete pause yet")
@@ -379,7 +377,7 @@ class RunFolder:
         return found
 
     def write_metrics(self) -> None:
-        """Write metrics.csv from the pauses."""
+        """Write metrics.csv, with one row per pause and hypothesis."""
         rows = []
         for t in range(self.n_pauses):
             info = self.info(t)

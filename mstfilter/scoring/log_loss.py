@@ -1,17 +1,17 @@
-"""Scores of the probabilities of a weighted set of hypotheses: scores of its answers to `questions`.
+"""Scores the forecasts of a weighted set of hypotheses, which are its answers to `questions`.
 
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t))
 >>> belief.row["brier"], belief.row["log_loss"]                # as the hypotheses come
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-**Log loss (recalibrated).** A raw proper score of hypotheses rewards noise. Hypotheses that consist only of labels
-have no uncertainty of shape. Noise at the borders of objects makes forecasts less certain where forecasts are often
-wrong. Recalibration removes this effect. Forecasts are recalibrated by isotonic regression, fitted to other scenes.
-The score is the mean log loss in nats; lower is better. Noise at the border is added if it lowers the loss on the
-other scenes. So a forecaster that adds noise at borders gains nothing (`experiments/information` shows this for all
-methods). Forecasters are compared by the questions that their forecasts distinguish. Noise of another kind, or at a
-higher rate than the largest one, can still give a small gain.
+**Log loss.** A proper score without recalibration rewards noise. Hypotheses that consist only of
+labels have no uncertainty of shape, and noise at the borders makes wrong forecasts less certain. Forecasts are
+therefore recalibrated by isotonic regression, fitted to other scenes. The score is the mean log loss in nats; lower
+is better. Before recalibration, the score itself adds noise at the borders if noise lowers the loss on the other
+scenes. So a method gains nothing by adding noise at the borders (`experiments/information` shows this for all
+methods). The score measures how well forecasts distinguish the answers yes and no. Noise of another kind, or noise at
+a higher rate than the largest of `NOISE_RATES`, can still give a small gain.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ NO_COUNTS = read_only(np.zeros((N_LEVELS, 2), np.int64))
 
 
 class BeliefScore(NamedTuple):
-    """Scores of the hypotheses of one pause.
+    """Scores of the hypotheses at one pause.
 
     Parameters
     ----------
     row : dict
         ``brier``: mean squared error of the forecasts. ``log_loss``: mean log loss of softened forecasts, in nats.
-        ``calibration_error``: on ten bins of equal numbers of questions.
+        ``calibration_error``: calibration error on ten bins of equal numbers of questions.
     counts : (r, 1001, 2) int32
         Number of questions by rate of noise, forecast in thousandths, and outcome.
     """
@@ -51,7 +51,7 @@ class BeliefScore(NamedTuple):
 
     @property
     def base_rate_loss(self) -> float:
-        """Log loss, in nats, of a constant forecast that equals the share of true questions."""
+        """Log loss, in nats, of a constant forecast, the share of questions with the answer yes."""
         table = forecast_table(self.counts[0].astype(np.int64))
         if not table.n:
             return float("nan")
@@ -64,7 +64,7 @@ def score_belief(
     weights: np.ndarray,
     truth: np.ndarray,
 ) -> BeliefScore:
-    """Score hypotheses by their answers.
+    """Score hypotheses by their answers to questions.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def score_belief(
 
 
 def forecast_table(counts: np.ndarray) -> ForecastTable:
-    """The forecasts and outcomes of counts (1001, 2)."""
+    """The table of forecasts and outcomes from counts (1001, 2)."""
     kept = counts.any(axis=1)
     no, yes = counts[kept].T.astype(float)
     return ForecastTable(np.flatnonzero(kept) / (N_LEVELS - 1), no, yes)
@@ -103,7 +103,7 @@ def forecast_table(counts: np.ndarray) -> ForecastTable:
 
 @dataclass(frozen=True, eq=False)
 class FittedForecasts:
-    """A fitted transformation of the forecasts of a method: noise at the border, and recalibration.
+    """A fitted transformation of the forecasts of a method: noise at the borders of objects, and recalibration.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class FittedForecasts:
 
     @classmethod
     def fit(cls, counts: np.ndarray) -> FittedForecasts:
-        """Fit to counts (r, 1001, 2): the rate of least log loss after recalibration."""
+        """Fit the noise rate and the recalibration to counts (r, 1001, 2), by least log loss."""
         tables = [forecast_table(one) for one in counts]
         fits = [Recalibration.fit(table) for table in tables]
         best = int(np.argmin([fit.log_loss(table) for fit, table in zip(fits, tables, strict=True)]))
@@ -129,9 +129,9 @@ class FittedForecasts:
 
 
 def leave_one_out(counts: Mapping[Any, np.ndarray]) -> dict[Any, FittedForecasts]:
-    """For each scene, what is fitted to all others; `counts` maps a scene to counts (r, 1001, 2).
+    """For each scene, the transformation fitted to all other scenes; `counts` maps scenes to counts (r, 1001, 2).
 
-    Scenes are omitted if the other scenes have no questions.
+    A scene is omitted if the other scenes have no questions.
     """
     total = sum((one.astype(np.int64) for one in counts.values()), np.zeros(1, np.int64))
     return {scene: FittedForecasts.fit(rest) for scene, one in counts.items() if (rest := total - one).any()}

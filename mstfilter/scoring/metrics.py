@@ -5,18 +5,18 @@
 
 Unless stated otherwise, a metric is the unweighted mean over the hypotheses, measured in volume.
 
-``quality``: weighted coverage in the form ``objects``. Missed, invented, split and merged objects reduce it.
+``quality``: weighted coverage in the form ``objects``. Missed, invented, split and merged objects reduce the quality.
 ``quality_paper``, ``quality_authors``: the other forms (see `mstfilter.scoring`). ``quality_top``,
 ``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean, and maximum.
-Compare maxima only for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least expected
-loss (`least_loss`). ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true objects that
-are visible at this pause, were visible only at an earlier one, or never were visible
+Maxima are comparable only for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least
+expected loss (`least_loss`). ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true
+objects that are visible at this pause, that were visible only at earlier pauses, and that never were visible
 (`mstfilter.scoring.object_status`). ``quality_one_blob``, ``quality_components``: trivial baselines, with the
 occupied voxels as one object or as their connected components. ``occupancy``: intersection over union of the occupied
 voxels. ``volume_missed``, ``volume_invented``: volume that is occupied only in the truth, and only in the hypothesis,
 divided by the true volume. ``object_f``: F score of objects at IoU 0.5. ``split``, ``merged``, ``missed``,
-``invented``: numbers of objects (see `object_metrics`). ``diversity``: 1 - mean quality of one hypothesis against
-another, which is 0 if all are equal.
+``invented``: numbers of objects (see `object_metrics`). ``diversity``: 1 - mean quality over pairs of hypotheses,
+which is 0 if all hypotheses are equal.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def pause_metrics(
 
 
 def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
-    """The grids cropped to the voxels that any of them occupies, and the number of removed voxels.
+    """The grids cropped to the voxels that any grid occupies, and the number of removed voxels.
 
     A layer of free voxels is kept at each cropped side, so that free space remains a region of every grid.
     """
@@ -113,14 +113,14 @@ def _distinct(labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarra
 
 
 def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Intersections (na, nb), sizes (na,) and (nb,), and intersections over union, without label 0."""
+    """Intersections (na, nb), sizes (na,) and (nb,), and intersections over union of objects, without label 0."""
     rows, columns = table.labels_a > 0, table.labels_b > 0
     box = np.ix_(rows, columns)
     return table.counts[box], table.sizes_a[rows], table.sizes_b[columns], table.jaccard()[box]
 
 
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
-    """Mean over some true objects, by size, of the largest intersection over union with an object, or NaN."""
+    """Mean, weighted by size, of the largest intersection over union of some true objects with an object, or NaN."""
     _, _, sizes, jaccard = _objects(table)
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():
@@ -130,17 +130,18 @@ def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
 
 
 def object_metrics(table: Overlap) -> dict[str, float]:
-    """Metrics of the objects of one hypothesis: columns of the table against the truth; see the module.
+    """Metrics of the objects of one hypothesis against the truth, by name. Labels a of `table` are the hypothesis.
 
-    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Each of the
-      parts has at least a tenth of the true object's size.
+    - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Only
+      hypothesis objects with at least a tenth of the true object's size count.
     - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
-    - *missed*: true objects for which no object of the hypothesis contains more than half, and that contain more than
-      half of no object.
-    - *invented*: the same with the roles exchanged (as in Hoover et al. 1996).
+    - *missed*: true objects of which no hypothesis object contains more than half, and that contain more than half of
+      no hypothesis object.
+    - *invented*: hypothesis objects of which no true object contains more than half, and that contain more than half
+      of no true object (as in Hoover et al. 1996).
 
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
-    (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if both are empty.
+    (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if neither the truth nor the hypothesis has objects.
     """
     counts, sizes_a, sizes_b, jaccard = _objects(table)
     found, true, both = float(sizes_a.sum()), float(sizes_b.sum()), float(counts.sum())
@@ -162,7 +163,7 @@ def object_metrics(table: Overlap) -> dict[str, float]:
 
 
 def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
-    """Quality (n, n) of every hypothesis against every other, in the form ``objects``; 1 on the diagonal."""
+    """Quality (n, n) of all pairs of hypotheses, in the form ``objects``; 1 on the diagonal."""
     n = len(labels)
     stacked = np.stack([np.asarray(one).ravel() for one in labels])
     # Voxels with equal labels in all hypotheses form a pattern; the voxels of each pattern are counted once.
@@ -180,10 +181,10 @@ def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
-    """The hypothesis of least expected loss, which has the largest weighted mean similarity to the others.
+    """Index of the hypothesis of least expected loss, with the largest weighted mean quality against all hypotheses.
 
-    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. The result is the best single
-    answer among the hypotheses if the truth has their distribution.
+    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. The hypothesis is the best
+    single answer among the hypotheses if the truth has their distribution.
     """
     return int(np.argmax(pairwise_quality(labels) @ np.asarray(weights, dtype=np.float64)))
 
@@ -195,7 +196,7 @@ def diversity(quality: np.ndarray) -> float:
 
 
 def _patterns(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct columns of (k, m) small integers, and how often each occurs."""
+    """Distinct columns of (k, m) small integers, and the number of times that each column occurs."""
     code = np.zeros(columns.shape[1], np.int64)
     for row in columns:  # renumbered after each row to keep the code small
         code = code * (int(row.max(initial=0)) + 1) + row

@@ -3,13 +3,13 @@
 >>> rows = score_pauses(RunFolder.open("runs/mine").estimates(), read_truth(open_recording("recordings/mine")))
 >>> rows[0].form, rows[0].mean, rows[0].best, rows[0].one_blob
 
-There is one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). The row has the mean over
-the hypotheses, the weighted mean, the maximum, and the values of two hypotheses: that of largest weight and that of
-least expected loss. The row also has two floors: the occupied voxels of the same hypotheses as one blob, and as
-connected components. If the ground truth has instance images but no volumes, hypotheses are rendered and compared in
-the image. Pixels of the robot (255) are ignored. For a recording with volumes, rows also have the scores of the
-weighted set: Brier score, log loss, log loss of the base rate and calibration error (`score_belief`), which are the
-same for all forms.
+`score_pauses` makes one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). A row has the
+mean over the hypotheses, the weighted mean, the maximum, and the values of the hypothesis of largest weight and of
+the hypothesis of least expected loss. A row also has the values of two trivial baselines: the occupied voxels as one
+object, and as connected components. If the ground truth has instance images but no volumes, hypotheses are rendered
+and compared in the image. Pixels of the robot (label 255) are ignored. For a recording with volumes, rows also have
+the scores of the forecasts: Brier score, log loss, log loss of the base rate and calibration error (`score_belief`).
+The scores of the forecasts are the same for all forms.
 
 `measure_pause` computes all metrics of a pause, for the tables of a study.
 """
@@ -39,13 +39,13 @@ class PauseEstimate:
     Parameters
     ----------
     hypotheses : sequence of Hypothesis or of (X, Y, Z) arrays
-        A `Hypothesis` also has probabilities of its voxels.
+        A `Hypothesis` also has probabilities of its voxels, and an array has only labels.
     weights : (n,) array
         The sum of the weights is 1.
     frame : int
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
-        Grid of arrays.
+        Grid of the arrays.
     """
 
     hypotheses: Sequence[Hypothesis | np.ndarray]
@@ -86,7 +86,7 @@ class PauseTruth:
 
 @dataclass(frozen=True)
 class PauseScore:
-    """Quality at one pause, measured by one variant of weighted coverage."""
+    """Quality at one pause, measured by one form of weighted coverage."""
 
     pause: int
     where: str
@@ -141,8 +141,8 @@ def measure_pause(
     Returns
     -------
     row : dict
-        Metrics of `mstfilter.scoring.metrics` and `score_belief`; without ground truth only those that need none.
-        ``qualities`` is a list, which tables leave out.
+        Metrics of `mstfilter.scoring.metrics` and `score_belief`. Metrics that need a missing ground truth are left
+        out. ``qualities`` is a list, which tables leave out.
     counts : (r, 1001, 2) int32, or None without ground truth
         As in `BeliefScore`.
     """
@@ -160,7 +160,7 @@ def measure_pause(
 
 
 def score_pauses(estimates: Sequence[PauseEstimate], truths: Sequence[PauseTruth]) -> list[PauseScore]:
-    """Scores of all pauses that have both. Pauses are matched by their frames."""
+    """Scores of all pauses with an estimate and ground truth. Pauses are matched by their frames."""
     by_frame = {truth.frame: truth for truth in truths}
     rows = []
     for pause, estimate in enumerate(estimates):

@@ -1,36 +1,36 @@
 """Quality of a segmentation, trivial baselines, and the visibility of objects.
 
-Weighted coverage takes, for every region of one segmentation, the region of the other that overlaps it best (Jaccard
-index J). Weighted coverage averages J by size:
+For every region of a segmentation, weighted coverage takes the largest Jaccard index J with a region of another
+segmentation. Weighted coverage is the mean of J, weighted by the sizes of regions:
 
-    side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)
+    ``side(A -> B) = sum_{a in A} size(a) max_{b in B} J(a, b)``
 
-There are three forms, by name:
+Weighted coverage has three forms:
 
 ``objects`` (default)
-    Objects only (label 0 is not a region). ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V is the volume
-    of all objects of that segmentation. The form is symmetric. Missing, invented, split and merged objects reduce it.
+    Only objects are regions; label 0 is no region. ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V_A is
+    the volume of all objects of A. The form is symmetric. Missing, invented, split and merged objects reduce q.
 ``paper``
     The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
-    Both sides are divided by the size of the grid. Free space dominates, so the result is nearly 1.
+    Both sides are divided by the size of the grid. Free space is the largest region, so the result is nearly 1.
 ``authors``
-    The authors' program. Objects only, but both sides are divided by the volume of the FIRST argument. The form is
-    not symmetric, and too high if the first argument is too small.
+    The formula of the authors' program. Only objects are regions, and both sides are divided by the volume of the
+    FIRST argument. The form is not symmetric. The result is too high if the first segmentation is too small.
 
 >>> import numpy as np
 >>> a = np.array([1, 1, 2, 2, 0]); b = np.array([1, 1, 1, 1, 0])
 >>> weighted_coverage(a, b)
 0.5
 
-`one_blob` and `connected_components` are trivial baselines that are shown beside every quality. Both keep the
-occupied voxels of a hypothesis and change only the objects to which they belong. A filter that is not better than
-these detects occupied space but not objects.
+`one_blob` and `connected_components` are trivial baselines that are shown beside every quality. Trivial baselines
+keep the occupied voxels of a hypothesis and change only the object labels. A filter that is not better than a trivial
+baseline detects occupied space but not objects.
 
 >>> object_status(recording, 2)  # doctest: +SKIP
 {1: 'visible', 2: 'hidden', 3: 'unseen'}
 
-Quality is also split by the status of objects. No method can represent an object that was never seen, and hidden
-objects show the contribution of tracking.
+Quality is also computed for visible, hidden and unseen objects. No method can represent an object that was never
+seen. The quality of hidden objects shows the contribution of tracking.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ FORMS: tuple[Form, ...] = get_args(Form)
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Sizes of the regions of two segmentations and of their intersections, including label 0 where it occurs.
+    """Sizes of the regions of two segmentations and of their intersections, including the region of label 0.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def weighted_coverage(a: np.ndarray, b: np.ndarray, form: Form = "objects") -> f
     a, b : integer arrays of the same shape
         Labels, 0 is background or free.
     form : {"objects", "paper", "authors"}
-        The module describes the forms. The quality is 1 if neither segmentation has objects and 0 if only one has.
+        The module describes the forms. The quality is 1 without any objects, and 0 if only one argument has objects.
     """
     return quality_of(overlap(a, b), form)
 
@@ -159,8 +159,8 @@ MIN_PIXELS = 100  # of a 640 x 480 image: 2.3 cm^2 at 0.8 m
 def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) -> dict[int, Status]:
     """Status of every object that has true voxels at pause `t`, by its label, ascending.
 
-    *visible*: the instance image of the pause shows it. *hidden*: only an earlier image shows it. *unseen*: no image
-    shows it. Frames between pauses are not used.
+    A *visible* object is in the instance image of the pause, a *hidden* object only in an earlier image, and an
+    *unseen* object in no image. Frames between pauses are not used.
 
     Parameters
     ----------
@@ -169,12 +169,13 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     t : int
         Number of the pause.
     min_pixels : float
-        Number of pixels from which an image shows an object, for 640 x 480 pixels. The number scales with the area.
+        Least number of pixels of a shown object in an image of 640 x 480 pixels. The least number scales with the
+        area of the image.
 
     Raises
     ------
     InputError
-        If the recording has no true voxels at pause `t`, or no instance image at this or an earlier pause.
+        If the recording has no true voxels at pause `t`, or no instance image at pause `t` or at an earlier pause.
     """
     if not 0 <= t < len(recording.pauses):
         raise InputError(f"recording {recording.name} has no pause {t}, it has {len(recording.pauses)}")
@@ -192,7 +193,7 @@ def status_of(labels: np.ndarray, visible: Set[int], earlier: Set[int]) -> dict[
 
 
 def shown_objects(image: np.ndarray, min_pixels: float = MIN_PIXELS) -> set[int]:
-    """Labels with enough pixels in an instance image (H, W); `min_pixels` as for `object_status`."""
+    """Labels with enough pixels in an instance image (H, W). `object_status` explains `min_pixels`."""
     counts = np.bincount(image.ravel())
     return set(np.flatnonzero(counts >= max(1.0, scaled_area(min_pixels, image.size))).tolist())
 

@@ -1,11 +1,11 @@
-"""Contracts of components of scenes, and the check of any component, which ``mstfilter check`` uses.
+"""Contracts of components that process scenes, and a function that checks any component (``mstfilter check``).
 
 >>> for result in run_contract(MyRule()):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
-`mstfilter.smc.testing` has the contracts of components of numbers, and describes how to use a contract as a test.
-`scene_example` returns hypotheses and a clip for either kind. ``mstfilter new resampler mine.py`` writes a starting
-file for a component (`write_starter`).
+`mstfilter.smc.testing` has the contracts of components that process numbers, and describes how to use a contract as a
+test. `scene_example` returns hypotheses and a clip as an example input. ``mstfilter new resampler mine.py`` writes a
+starting file for a component (`write_starter`).
 """
 
 from mstfilter.lazy import attach

@@ -1,11 +1,11 @@
-"""An example for components that use images: hypotheses and a clip of a table with three boxes, one pushed.
+"""Example input for components that use images: hypotheses and a clip of three boxes on a table. One box is pushed.
 
 >>> population, clip = scene_example(np.random.default_rng(0), 4)
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
-Return the example from the method `example` of a contract, or define ``example = scene_example`` in a component's
-file.
+To use the scene in a contract, return the scene from the method `example`, or define ``example = scene_example`` in
+the file of a component.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _COLOURS = np.array([[160, 140, 110], [190, 60, 50], [60, 100, 180], [70, 160, 8
 
 
 def _labels(shift: int) -> np.ndarray:
-    """(24, 24, 8) three boxes; the first stands `shift` voxels farther along x."""
+    """Labels (24, 24, 8) of three boxes. The first box is moved by `shift` voxels along x."""
     labels = np.zeros(_GRID.shape, np.uint16)
     labels[4 + shift : 9 + shift, 9:14, :4] = 1
     labels[15:20, 5:12, :3] = 2
@@ -32,7 +32,7 @@ def _labels(shift: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _clip() -> Clip:
-    """Three frames of the push, seen from the front and above, with a texture and without noise."""
+    """Three frames of the push from a camera in front and above, with a texture and without noise."""
     pose = look_at(np.array([0.0, -0.5, 0.45]), np.array([0.0, 0.0, 0.03]))
     camera = Camera.from_intrinsics(105, 105, 63.5, 47.5, 128, 96, pose)
     texture = np.random.default_rng(1).integers(-35, 36, (4, 64, 64))
@@ -52,9 +52,9 @@ def _clip() -> Clip:
 
 
 def scene_example(rng: np.random.Generator, n: int) -> tuple[Population, Clip]:
-    """`n` hypotheses before the push, unevenly weighted, and the clip of the push.
+    """`n` hypotheses with unequal weights before a box is pushed, and the clip of the push.
 
-    Some hypotheses are correct. In others two boxes are merged, a box is missing, or a box is split.
+    Some hypotheses are correct. In other hypotheses two boxes are merged, a box is missing, or a box is split.
     """
     hypotheses = []
     for _ in range(n):

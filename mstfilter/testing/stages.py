@@ -1,6 +1,6 @@
 """Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
 
-`contract_of` and `run_contract` are for components of every interface, including those of `mstfilter.smc.testing`.
+`contract_of` and `run_contract` accept components of every interface, also the interfaces of `mstfilter.smc`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ STAGE_OWNERS: dict[type, Callable[[Any], Component]] = {
 
 
 class EvidenceContract(ScoreContract):
-    """The contract of every `Evidence`. The default example is a scene."""
+    """The contract of every `Evidence`. The default example is `scene_example`."""
 
     example = staticmethod(scene_example)
 
@@ -78,7 +78,7 @@ class EvidenceContract(ScoreContract):
         return np.round(component.log_score(hypotheses, inputs["observation"]), 9)
 
     def test_copies_score_the_same(self) -> None:
-        """Equal hypotheses have equal scores, also if the numbers of the labels differ."""
+        """Equal hypotheses have equal scores, also if their labels have other numbers."""
         inputs, rng = self.inputs(9), seeded(2)
         hypotheses = tuple(inputs["population"].realised().particles)
 
@@ -96,12 +96,12 @@ class EvidenceContract(ScoreContract):
 
 
 class StageContract(Contract):
-    """The contract of a stage of MST, which is tested in its place in the proposal, the tracking or the update."""
+    """The contract of a stage of MST, which is tested as a part of the proposal, the tracking or the update."""
 
     example = staticmethod(scene_example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        """The result of the step of a filter that uses the component."""
+        """The result of the filter step that uses the component."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
         if isinstance(owner, Proposal):
@@ -117,7 +117,7 @@ class StageContract(Contract):
 
     @prerequisite
     def test_works_in_its_place(self) -> None:
-        """It works in a filter, also for hypotheses without objects: the step that uses it gives hypotheses."""
+        """The filter step that uses the component returns hypotheses, also if no hypothesis has an object."""
         inputs = self.inputs(2)
         grid = inputs["observation"].grid
         empty = Hypothesis.from_labels(np.zeros(grid.shape, np.uint16), grid)
@@ -131,7 +131,7 @@ class CompleterContract(StageContract):
     """The contract of every `Completer`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> list[np.ndarray]:
-        """The probabilities of the boxes of three objects; nothing is cached."""
+        """The probabilities of the boxes of three objects, computed without a cache."""
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
@@ -145,20 +145,20 @@ class CompleterContract(StageContract):
             return _estimated(self.make(), seeded(0), seen, clip, first)
 
     def test_works_for_any_box(self) -> None:
-        """It works for a box with edges of different lengths, and for one without voxels."""
+        """The completer works for a box with edges of different lengths, and for a box without voxels."""
         seen, clip = self._seen()
         odd = [_cropped(seen[0], *size) for size in ((7, 6, 5), (0, 0, 0))]
         with reports_errors("boxes of shape (7, 6, 5) and (0, 0, 0)"):
             _estimated(self.make(), seeded(0), odd, clip)
 
     def test_follows_what_is_seen(self) -> None:
-        """Its probabilities are not constant, and visible surface is probably occupied."""
+        """The probabilities are not constant, and the visible surface is probably occupied."""
         seen, clip = self._seen()
         fault = fault_of(seen, self._filled(seen, clip))
         assert fault is None, f"{type(self.make()).__name__}.fill {fault}"
 
     def test_axes_are_those_of_the_grid(self) -> None:
-        """Its result has the axes of the box: a reversed result fits the visible surface less well."""
+        """The result has the axes of the box: a reversed result fits the visible surface less well."""
         seen, clip = self._seen(cut=True)
         filled = self._filled(seen, clip)
         choices = [axes for n in range(4) for axes in combinations(range(3), n)]
@@ -170,7 +170,7 @@ class CompleterContract(StageContract):
         )
 
     def test_objects_do_not_depend_on_others(self) -> None:
-        """The result for an object does not depend on the others, nor on their order."""
+        """The result for an object depends neither on other objects nor on the order of the objects."""
         seen, clip = self._seen()
         every, last = self._filled(seen, clip), self._filled(seen[-1:], clip, len(seen) - 1)
         assert same(np.asarray(every[-1]), np.asarray(last[0])), (
@@ -179,7 +179,7 @@ class CompleterContract(StageContract):
 
 
 def _correct(inputs: dict[str, Any]) -> Hypothesis:
-    """The hypothesis with most objects."""
+    """The hypothesis with the largest number of objects."""
     return max(inputs["population"].particles, key=lambda h: h.n_objects)
 
 
@@ -189,7 +189,7 @@ def _on_surface(filled: list[np.ndarray], seen: list[ObservedBox], axes: tuple[i
 
 
 def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool = False) -> list[ObservedBox]:
-    """The first frame's evidence about the objects of a hypothesis; with `cut`, about the half above a diagonal."""
+    """The boxes of the objects of a hypothesis in the first frame. With `cut`, half of each mask is removed."""
     image, _ = render_hypothesis(hypothesis, clip.before.camera)
     masks = [image == k for k in np.unique(image[image > 0])]
     if cut:
@@ -201,14 +201,14 @@ def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool =
 def _estimated(
     completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
 ) -> list[np.ndarray]:
-    """The probabilities of boxes. Box k uses the stream `first` + k."""
+    """The probabilities of boxes. Box k uses the random stream `first` + k."""
     bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     with _quiet():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
 
 
 def _cropped(box: ObservedBox, a: int, b: int, c: int) -> ObservedBox:
-    """The box reduced to its first voxels."""
+    """The first ``a x b x c`` voxels of a box."""
     parts = {f.name: getattr(box, f.name)[:a, :b, :c] for f in fields(box) if f.name != "height"}
     return ObservedBox(**parts, height=box.height[:c])
 
@@ -248,7 +248,7 @@ def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
 
 
 def contract_of(cls: type) -> type[Contract]:
-    """The contract of a class of components: `UpdateContract` for an `Update`, and so on for the other interfaces.
+    """The contract of a class of components, for example `UpdateContract` for an `Update`.
 
     Raises InputError if no interface of the class has a contract.
     """
@@ -271,11 +271,11 @@ def run_contract(
     """Test all properties of a component whose interface has a contract.
 
     ``example(rng, n)`` returns a population and an observation that the component can process. The default is the
-    function ``example`` in the module of its class. Without one, it is a scene for components of images, and numbers
-    for others.
+    function ``example`` in the module of the component's class. Without such a function, components that use images
+    get a scene, and other components get numbers.
 
     ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
-    observation; see the contract. The default is the function ``exact`` in the module of its class, if there is one.
+    observation, as the contract describes. The default is the function ``exact`` in the module of the class, if any.
     """
     cls = type(component)
     contract = contract_of(cls)

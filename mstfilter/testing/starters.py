@@ -1,4 +1,4 @@
-"""Starting files for components of a user: the examples of the documentation, with other names.
+"""Starting files for components of a user: the example components of the documentation, with other file names.
 
 >>> write_starter("resampler", Path("mine.py"))                # returns the commands that test and run it
 >>> write_starter("transition", Path("mine.py"), "numbers")    # particles are numbers instead of hypotheses
@@ -18,7 +18,7 @@ _BOTH = ("resampler", "trigger", "size")  # use the weights only, so one file is
 
 
 def starter_kinds(target: str = "") -> list[str]:
-    """Kinds of component that have a starting file: for "scenes", for "numbers", or for either."""
+    """Kinds of component that have a starting file for `target`, "scenes" or "numbers", or for any target."""
     folders = map(_folder, [target] if target else _TARGETS)
     return sorted({path.stem for folder in folders for path in folder.glob("*.py")} | set(_BOTH))
 
@@ -28,10 +28,10 @@ def _folder(target: str) -> Path:
 
 
 def write_starter(kind: str, path: Path, target: str = "") -> list[str]:
-    """Write a commented component of one of `starter_kinds` that works; returns the commands that test and run it.
+    """Write a working component of one of `starter_kinds`, and return the commands that test and run the component.
 
-    `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if there is a
-    file for them. Raises InputError if there is no such file, the name cannot be imported, or a file already exists.
+    `target` states the kind of particles: "scenes" (hypotheses) or "numbers". The default is scenes, if a starting
+    file for scenes exists. Raises InputError if no starting file exists, the name is invalid, or `path` exists.
     """
     check_choice("the target", target or "scenes", _TARGETS)
     kinds = starter_kinds(target)
