@@ -19,7 +19,10 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
+
+from mstfilter.errors import MissingLibraryError, missing_library
 
 
 def exported(init: str | Path) -> dict[str, str]:
@@ -92,3 +95,25 @@ def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> It
             yield advance
     else:
         yield progress or (lambda *arguments: None)
+
+
+SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")
+
+
+def import_open3d() -> ModuleType:
+    """Import open3d, limited to one thread. Only this function imports the package, which needs system libraries.
+
+    With several threads the order of a parallel sum varies, so the last digits of results vary. Raises
+    MissingLibraryError if the package or a required system library is missing.
+    """
+    try:
+        open3d = import_module("open3d")
+    except ModuleNotFoundError as error:
+        raise missing_library(error, "this function") from error
+    except (ImportError, OSError) as error:  # a shared library does not load
+        raise MissingLibraryError(
+            f"open3d cannot be imported: {error}",
+            f"install its libraries: apt-get install {' '.join(SYSTEM_PACKAGES)}",
+        ) from error
+    open3d.utility.set_max_threads(1)
+    return open3d

@@ -53,7 +53,7 @@ def test_filters_and_resampling():
         (["--version"], "mstfilter 0."),
         (["list"], "not available: pip install opencv-python-headless"),
         (["list"], "\nfamilies:\n"),
-        (["list", "resamplers"], "systematic          One uniform"),
+        (["list", "resamplers"], "systematic          Makes floor or ceil"),
         (["list", "resamplers"], "scheme=multinomial"),
         (["list", "presets"], "mst                 MST, the default"),
     ],

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from mstfilter.errors import MissingLibraryError
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 
 
 def test_a_missing_package_is_reported_with_the_command_that_installs_it(monkeypatch):
@@ -22,7 +22,7 @@ def test_a_missing_system_library_is_reported_with_the_packages_that_hold_it(mon
     def fail(name):
         raise kind("libGL.so.1: cannot open shared object file: No such file or directory")
 
-    monkeypatch.setattr("mstfilter.open3d_import.import_module", fail)
+    monkeypatch.setattr("mstfilter.lazy.import_module", fail)
     with pytest.raises(MissingLibraryError, match="libGL.so.1") as caught:
         import_open3d()
     assert "\n" not in caught.value.message

@@ -2,8 +2,8 @@
 
 >>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
 
-`updates` has updates without crossover (samples alone, predictions alone, their union). `proposals` has trivial
-segmentations (floors). ``models/published/object_fusion.py`` has a baseline in the style of MID-Fusion.
+The updates use samples alone, predictions alone, or their union. The proposals are trivial segmentations (floors).
+``models/published/object_fusion.py`` has a baseline in the style of MID-Fusion.
 ``docs/baselines.md`` lists all presets.
 """
 

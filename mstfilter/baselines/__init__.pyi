@@ -1,7 +1,9 @@
-from mstfilter.baselines.proposals import (
+from mstfilter.baselines.methods import (
     FirstPause as FirstPause,
     ImageComponents as ImageComponents,
     OccupiedComponents as OccupiedComponents,
     OneBlob as OneBlob,
+    SamplesOnly as SamplesOnly,
+    TrackingOnly as TrackingOnly,
+    Union as Union,
 )
-from mstfilter.baselines.updates import SamplesOnly as SamplesOnly, TrackingOnly as TrackingOnly, Union as Union

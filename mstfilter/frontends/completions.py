@@ -35,7 +35,7 @@ from mstfilter.errors import InputError
 from mstfilter.fields import bound_to
 from mstfilter.files import reading
 from mstfilter.frontends.mask_files import read_label_image, read_weights
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 from mstfilter.reading import MAX_FILE, read_bytes, unpack_arrays
 from mstfilter.scene import (
     Camera,

@@ -17,7 +17,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.files import atomic_path
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 from mstfilter.report.pictures import Colour, colour
 from mstfilter.scene import Hypothesis
 

@@ -1,3 +1,4 @@
+from mstfilter.resources import starter_kinds as starter_kinds, write_starter as write_starter
 from mstfilter.testing.scenes import scene_example as scene_example
 from mstfilter.testing.stages import (
     STAGE_OWNERS as STAGE_OWNERS,
@@ -7,8 +8,4 @@ from mstfilter.testing.stages import (
     StageContract as StageContract,
     contract_of as contract_of,
     run_contract as run_contract,
-)
-from mstfilter.testing.starters import (
-    starter_kinds as starter_kinds,
-    write_starter as write_starter,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter.baselines.proposals import FirstPause, ImageComponents, OccupiedComponents, OneBlob
+from mstfilter.baselines import FirstPause, ImageComponents, OccupiedComponents, OneBlob
 from mstfilter.scene import Camera, Frame
 from mstfilter.segmentation import TreeCutProposal
 from tests.baselines.scenes import slide

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mstfilter.baselines.updates import SamplesOnly, TrackingOnly, Union
+from mstfilter.baselines import SamplesOnly, TrackingOnly, Union
 from mstfilter.crossover import CrossoverUpdate
 from mstfilter.presets import build_filter, load_config
 from mstfilter.scene import FreeSpace, Hypothesis, NoFreeSpace

@@ -12,7 +12,7 @@ from mstfilter.completion import Extrude
 from mstfilter.errors import InputError, MissingLibraryError
 from mstfilter.frontends import ExternalCompletion, MaskProposal, write_masks
 from mstfilter.frontends.completions import place_shape
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 from mstfilter.scene import render, write_image
 from tests.segmentation.scenes import GRID, boxes, clip_of
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import MissingLibraryError
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 from mstfilter.report import write_report
 from mstfilter.report.export import export_mesh, voxel_faces
 from mstfilter.report.pictures import PALETTE

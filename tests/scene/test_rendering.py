@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.rendering import render, render_hypothesis
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.open3d_import import import_open3d
+from mstfilter.lazy import import_open3d
 from mstfilter.scene import Camera, depth_sigma, look_at
 from mstfilter.simulation.lighting import Stage
 from mstfilter.simulation.recorder import POSE_TOLERANCE
