@@ -2,7 +2,7 @@
 
 >>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
-The subfolders are numbered by pause (`Clip.index`), from 0:
+Each pause has a subfolder, whose name is the number of the pause (`Clip.index`), from 0:
 
 * ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, not 0 on the object.
 * ``shapes/000001/cup/a.ply``, ``b.npz``: shapes of this object. Each hypothesis draws one shape.
@@ -172,9 +172,9 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
 
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
-    """The objects of a pause. `shape` is the shape (H, W) of the image. Files of shapes are not opened.
+    """The objects of a pause. `shape` is the shape (H, W) of the image.
 
-    Raises InputError if the folder, a mask or a shape is missing, or if a mask or weights.json is invalid.
+    This function does not open the files of the shapes. Raises InputError if the folder, a mask or a shape is missing, or if a mask or weights.json is invalid.
     """
     if not str(folder):
         raise InputError(

@@ -116,7 +116,7 @@ class MaskGenerator(Protocol):
 
 
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
-    """Run a mask generator on the last frame of each clip, and write the masks as nested sets.
+    """Run a mask generator on the last frame of each clip, and write its masks, which may contain each other.
 
     `share` is passed to `nested_masks`.
     """

@@ -62,7 +62,7 @@ class TrueMasks(UsesTruth, Proposal):
         return np.where(enough[image] & self.objects.foreground(frame, clip.grid).pixels, image, 0).astype(np.int32)
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
-        """`n` equal hypotheses about the scene at the end of the clip."""
+        """`n` copies of one hypothesis about the scene at the end of the clip."""
         true = self.masks(observation.after, observation)
         shown = np.unique(true[true > 0]).astype(np.int64)
         particles, counts = complete_segments(

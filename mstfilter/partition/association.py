@@ -5,10 +5,10 @@
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
 A segment and a predicted object are *in conflict* if they share more than a tenth of the depth readings of the
-smaller of the two. Conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join objects
-that share voxels.) The *main object* of a segment is the predicted object that shares most readings with the segment.
-An object that is the main object of no segment and has fewer than about 60 readings is in no conflict. The few
-readings of a hidden object measure objects nearby.
+smaller of the two. The segment may then show the object. Conflicts are the edges of the conflict graph. (In the
+paper, section IV-D, edges join objects that share voxels.) The *main object* of a segment is the predicted object
+that shares most readings with the segment. An object that is the main object of no segment and has fewer than about
+60 readings is in no conflict. The few readings of a hidden object measure objects nearby.
 
 A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
@@ -18,7 +18,7 @@ A predicted object is continued by at most one segment of its connected componen
 2. The second rule considers all segments. A segment continues the object if it has more than 80 % of the object's
    readings in all segments.
 
-In a component of one segment and one object, more than 50 % of the readings is enough. The rules have consequences:
+In a component of one segment and one object, the share is 50 % instead of 80 %. The rules have consequences:
 
 - If a predicted object is *split* and no segment has enough readings of the object, no segment continues the object.
   The track of a split object then ends, its views are deleted, and the segments are new objects.

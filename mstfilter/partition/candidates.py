@@ -3,7 +3,7 @@
 >>> choices = Choices.of(cells, log_weights, log_odds, 100)   # for n predictions: log_weights (n,), log_odds (n, e)
 >>> choices.prediction[0], choices.partitions[0]             # prediction j, and the segment (K,) of each cell
 >>> choices = choices.with_occluded(probabilities_to_stay, 100)
->>> choices.log_weights, choices.occluded[0]                 # log probability, occluded objects of j that stay
+>>> choices.log_weights, choices.staying[0]                  # log probability, occluded objects of j that stay
 
 A candidate consists of a prediction j, an alternative a_c for each component c of the cells, and the set of occluded
 objects k that stay (e_k = 1). Object k stays with probability r_k. The probability of a candidate is a product:
@@ -36,7 +36,7 @@ class Choices:
     prediction: np.ndarray  #: (m,) index of the prediction
     partitions: np.ndarray  #: (m, K) segment of each cell, 1, 2, ...
     log_weights: np.ndarray  #: (m,) log probability
-    occluded: tuple[tuple[int, ...], ...] = ()  #: labels of the occluded objects that stay, for each candidate
+    staying: tuple[tuple[int, ...], ...] = ()  #: labels of the occluded objects that stay, for each candidate
 
     def __len__(self) -> int:
         return len(self.prediction)
@@ -73,8 +73,8 @@ class Choices:
                 chosen, log_p = largest_products([np.log(one) for one in p], n)
             found.append((np.full(len(chosen), j), chosen, log_weight + log_p))
         prediction, chosen, log_p = (np.concatenate(column) for column in zip(*found, strict=True))
-        # Schemes such as systematic resampling take equal steps through the candidates. Neighbours therefore agree in
-        # the most uncertain component first.
+        # Schemes such as systematic resampling take equal steps through the candidates. Therefore neighbours are
+        # similar: the most uncertain component is the first key of the order, the prediction is the last key.
         order = np.lexsort((prediction, *chosen.T[np.argsort(entropies)]))
         partitions = np.stack([cells.joined(components, row) for row in chosen[order]])
         return cls(prediction[order], partitions, log_p[order]).most_probable(n)
@@ -93,11 +93,11 @@ class Choices:
         )
 
     def most_probable(self, n: int) -> Choices:
-        """The n candidates of largest positive weight, without change of order."""
+        """The n candidates of largest positive weight, in their present order."""
         best = largest(self.log_weights, n)
         best = best[self.log_weights[best] > -np.inf]
-        occluded = tuple(self.occluded[k] for k in best.tolist()) if self.occluded else ()
-        return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], occluded)
+        staying = tuple(self.staying[k] for k in best.tolist()) if self.staying else ()
+        return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], staying)
 
     def described(self, projected: Population) -> Population:
         """The candidates as a population. The particles are indices with the parents of their predictions.
@@ -155,7 +155,7 @@ def stays(probabilities: dict[int, float], n: int) -> list[tuple[tuple[int, ...]
     p = np.where(p < _CERTAIN, 0, np.where(p > 1 - _CERTAIN, 1, p))
     with np.errstate(divide="ignore"):
         chosen, total = largest_products([*np.log(np.column_stack([p, 1 - p]))], n)
-    labels = np.array([*probabilities])
+    labels = np.array([*probabilities])  # entry 0 of each factor: the object stays
     return [
         (tuple(labels[row == 0].tolist()), log_p)
         for row, log_p in zip(chosen, total.tolist(), strict=True)

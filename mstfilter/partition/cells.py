@@ -17,7 +17,8 @@ f_prediction is the corresponding weighted share of the predictions. The log odd
     ``l = (1 - R) (image_only_constant + image_only logit(f_image))
     + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant)``
 
-R is the probability that a prediction is valid. W <= R is the total weight of the predictions with an object at both
+R is the probability that a prediction is valid. The update gives one prediction at a time a weight above 0, so
+f_prediction is 0 or 1 there. W <= R is the total weight of the predictions with an object at both
 cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,
 logit(f_image) is not scaled. The coefficients of the predictions were fitted in `experiments/partition_fit`.
 

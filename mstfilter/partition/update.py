@@ -10,21 +10,23 @@ last frame. The voxels of an object are estimated again from all observations of
 1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j with which
    the depth readings agree. A_j^lambda is used as the probability that prediction j is valid, which means that the
-   prediction shows the present scene. A predicted object is *refuted* and removed from the prediction if the readings
-   agree with less than the share `least_agreement` of the object's visible surface.
+   prediction shows the present scene. A predicted object is *refuted* if the readings agree with less than the
+   share `least_agreement` of the object's visible surface. No candidate contains a refuted object.
 2. **Partitions.** A sample groups the readings by segment. A prediction groups the readings by the predicted object
    at each reading. The samples and prediction j give the odds that two readings belong to one object. The odds
    determine the probabilities of the partitions of each part of the image (`mstfilter.partition.cells`). A candidate
-   consists of a prediction j and one partition of each part. The weight of a candidate is w_j Q_j^lambda times the
-   probabilities of its partitions (`mstfilter.partition.candidates`). Only the most probable candidates are
-   described. The resampler of the filter selects some candidates, and only selected candidates are completed.
+   consists of a prediction j, one partition of each part, and the occluded objects that stay (step 4). The weight of
+   a candidate is w_j Q_j^lambda times the probabilities of these choices (`mstfilter.partition.candidates`). Only the
+   most probable candidates are described. The resampler of the filter selects some candidates, and only selected
+   candidates are completed.
 3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each *component* of the
    graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. If an object is
-   split, at most one segment continues the object, and the other segments are new objects. In the paper, merges are
-   drawn at random. In this update, the partition determines the merges.
+   split, at most one segment continues the object, and the other segments are new objects. A predicted object with
+   conflicts that no segment continues is removed. In the paper, merges are drawn at random. In this update, the
+   partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
    probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
-   the object's voxels that the frame does not observe as free. A_j rates the whole prediction, q the object.
+   the object's voxels that the frame does not observe as free. A_j is one factor for all objects of the prediction.
 5. **Completion.** An object keeps its views, which are its observations in earlier frames
    (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
    views of the predicted objects that the visible object continues. An occluded object is completed from its views
@@ -77,7 +79,7 @@ class Prediction:
 
     hypothesis: Hypothesis
     refined: Hypothesis  #: without the voxels that the frame observes as free
-    holds: float  #: probability A^lambda that the prediction is valid
+    p_valid: float  #: probability A^lambda that the prediction is valid
     objects: np.ndarray  #: (m,) predicted object at each reading, 0 is none or a refuted object
     refuted: frozenset[int]  #: labels of the objects that the frame does not show at their places
 
@@ -171,8 +173,8 @@ class PartitionUpdate(Update):
         """
         check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
         check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
-        clip = self._mended(observation)
-        readings = Readings.of(clip.after, clip.grid)
+        mended = self._mended(observation)
+        readings = Readings.of(mended.after, mended.grid)
         if predicted is None:
             assert proposed is not None
             described, segments = _distinct(proposed, _segments(proposed, readings))
@@ -183,13 +185,13 @@ class PartitionUpdate(Update):
                 return projected
             predictions = self._predictions(predicted, projected, readings, observation.after)
             cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
-            choices = self._choices(cells, predictions, projected.log_weights, clip)
+            choices = self._choices(cells, predictions, projected.log_weights, mended)
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
         key = key_of(rng)
 
         def build(candidate: int) -> Hypothesis:
-            return self._hypothesis(key.child("candidate", candidate), objects_of(candidate), readings, clip)
+            return self._hypothesis(key.child("candidate", candidate), objects_of(candidate), readings, mended)
 
         candidates = replace(described, particles=Candidates(build, len(described)))
         return self._scored(candidates, observation) if self.evidence else candidates
@@ -228,8 +230,8 @@ class PartitionUpdate(Update):
         refuted = np.flatnonzero(of_objects < self.least_agreement)  # NaN, unknown, is not refuted
         objects = readings.labels(hypothesis.labels, self.reach)
         objects[np.isin(objects, refuted)] = 0
-        holds = of_scene**self.quality_exponent
-        return Prediction(hypothesis, refined, holds, objects, frozenset(refuted.tolist()))
+        p_valid = of_scene**self.quality_exponent
+        return Prediction(hypothesis, refined, p_valid, objects, frozenset(refuted.tolist()))
 
     # 2. Partitions of the image, and their weights --------------------------------------------------------------
 
@@ -238,8 +240,9 @@ class PartitionUpdate(Update):
     ) -> Choices:
         """The most probable candidates. `log_weights` (predictions,) are log (w_j Q_j^lambda)."""
         n = self.n_candidates or 20 * len(predictions)
-        valid = np.diag([one.holds for one in predictions])  # row j: prediction j is the past
-        log_odds = [self.pairs.log_odds(cells, one, clip) for one in valid]
+        # Row j has the weights of the predictions given that prediction j is used alone.
+        given_one = np.diag([one.p_valid for one in predictions])
+        log_odds = [self.pairs.log_odds(cells, weights, clip) for weights in given_one]
         choices = Choices.of(cells, log_weights - logsumexp(log_weights), log_odds, n, self.temperature)
         counts = [cells.counts(one.objects) for one in predictions]
         overlaps = (
@@ -253,7 +256,7 @@ class PartitionUpdate(Update):
         """Probability (A_j q)^lambda that each occluded object of a prediction stays, by label."""
         q = prediction.shares_left
         occluded = sorted(q.keys() - overlaps.visible - prediction.refuted)
-        return {label: prediction.holds * q[label] ** self.quality_exponent for label in occluded}
+        return {label: prediction.p_valid * q[label] ** self.quality_exponent for label in occluded}
 
     # 3. Association, 4. occluded objects ------------------------------------------------------------------------
 
@@ -271,7 +274,7 @@ class PartitionUpdate(Update):
             for segment, tracks in overlaps.tracks(component).items()
         ]
         none = np.zeros(len(segments), bool)
-        stay = [record_of[label] for label in choices.occluded[candidate]]
+        stay = [record_of[label] for label in choices.staying[candidate]]
         return visible + [SceneObject(none, (one,), prediction.remaining(one, self.threshold)) for one in stay]
 
     # 5. Completion ----------------------------------------------------------------------------------------------

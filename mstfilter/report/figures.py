@@ -123,8 +123,8 @@ def quality_figure(
 ) -> str:
     """Quality of every hypothesis (points, area by weight), mean and compared runs (lines), baselines (dashed).
 
-    `times` are the pauses with ground truth. `qualities` and `weights` have one value per hypothesis for each pause.
-    `compared` and `baselines` have one value per pause for each name. NaN means no value.
+    `times` are the indices of the pauses with ground truth. `qualities` and `weights` have one value per hypothesis
+    for each pause. `compared` and `baselines` have one value per pause for each name. NaN means no value.
     """
     with _style("quality"):
         figure, (axes,) = _new_figure(6.6, 3.3)
@@ -149,7 +149,7 @@ _MOST, _GROUP = len(SERIES), 8  # arms in a single figure, and in each of severa
 
 
 def _arm_colours(arms: Sequence[str]) -> dict[str, str]:
-    """Colour of each arm. Colours repeat after twelve arms."""
+    """The colour of each compared method (arm). Colours repeat after twelve arms."""
     return {arm: SERIES[k % len(SERIES)] for k, arm in enumerate(arms)}
 
 
@@ -272,8 +272,8 @@ def differences_figure(
 ) -> str:
     """Differences of a measure between arms and the reference, with t intervals, by family.
 
-    An entry of `differences` is (family, arm, arm minus reference). `arms` determines the colours. `side` is the side
-    of zero on which the reference is better, "left" or "right".
+    An entry of `differences` is (family, arm, arm minus reference). `arms` lists all compared methods, in the order
+    of the colours. `side` is the side of zero on which the reference is better, "left" or "right".
     """
     colours = _arm_colours(arms)
     rows = [(family, arm, (d.mean, d.low, d.high), colours[arm]) for family, arm, d in differences]

@@ -349,8 +349,8 @@ class _Corners:
 def drift(first: Look, look: Look) -> tuple[float, float, float]:
     """Tilt (degrees), height (m) and shift (m) of the camera relative to its given pose, between two pauses.
 
-    If few readings remain at z = 0, tilt and height are computed from the plane of the table. The shift is measured
-    at corners of the image on the table and outside the workspace.
+    If few depth readings are near z = 0, tilt and height are computed from a plane that is fitted to the table. The
+    shift is measured at corners of the image on the table and outside the workspace.
     """
     tilt = height = shift = 0.0
     left = look.on_table.mean() / max(first.on_table.mean(), 1e-9)

@@ -273,7 +273,7 @@ def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: 
 
 
 def _ring(regions: np.ndarray, k: int, box: tuple[slice, slice]) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """The pixels (h, w) bool around region `k` of a label image, and the image window of the pixels."""
+    """Mask (h, w) bool of the pixels around region `k` of a label image in a window, and the slices of the window."""
     reach = _reach(regions.shape[1])
     rows, columns = (slice(max(0, side.start - reach), side.stop + reach) for side in box)
     inside = regions[rows, columns] == k

@@ -83,7 +83,7 @@ class PushLoop:
 
     @property
     def lost(self) -> set[int]:
-        """True labels of the objects of the first pause that have left the workspace."""
+        """Ground-truth labels of the objects that were present at the first pause and have left the workspace."""
         truths = [one.truth for one in self._recorded if one.truth is not None]
         return set(np.unique(truths[0]).tolist()) - set(np.unique(truths[-1]).tolist())
 

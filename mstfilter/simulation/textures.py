@@ -166,7 +166,7 @@ class Atlas:
         self._texels = _linear(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Linear albedo (n, 3) float32 at places (n, 2) of charts (n,) of a skin, interpolated bilinearly."""
+        """Linear albedo (n, 3) float32 of a texture, interpolated at coordinates (n, 2) in its charts (n,)."""
         chart = chart + self._base[skin]
         w, h = self._width[chart], self._height[chart]
         x = np.clip(place[:, 0] * w - 0.5, 0, w - 1.001)

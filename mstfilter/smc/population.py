@@ -91,7 +91,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     @property
     def n_built(self) -> int:
-        """Number of distinct candidates built so far. Selections by `take` share built candidates."""
+        """Number of distinct candidates built so far. A selection by `take` uses the same built candidates."""
         return len(self._built)
 
     def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
@@ -329,7 +329,7 @@ class Population:
         """The same particles, with parents before the resampling that preceded the prediction.
 
         ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, the indices are converted to
-        indices into the population before the resampling. The notes are dropped.
+        indices into the population before the resampling. The result has no notes.
         """
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         index = self.parents.get("previous")

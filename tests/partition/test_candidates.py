@@ -75,7 +75,7 @@ def test_candidates_by_enumeration(seed, n):
         assert not set(row[components[0].cells].tolist()) & set(row[components[1].cells].tolist())
     # Each candidate is divided into its sets of occluded objects.
     kept = found.with_occluded([{1: 0.25, 2: 1.0} for _ in names], 2 * n)
-    assert len(kept) == 2 * len(names) and set(kept.occluded) == {(1, 2), (2,)}
+    assert len(kept) == 2 * len(names) and set(kept.staying) == {(1, 2), (2,)}
     assert np.exp(kept.log_weights).sum() == pytest.approx(np.exp(found.log_weights).sum())
-    share = sum(w for w, labels in zip(np.exp(kept.log_weights), kept.occluded, strict=True) if 1 in labels)
+    share = sum(w for w, labels in zip(np.exp(kept.log_weights), kept.staying, strict=True) if 1 in labels)
     assert share == pytest.approx(0.25 * np.exp(found.log_weights).sum())
