@@ -364,7 +364,7 @@ class _Sweep:
         return State(t + 1, population, self.streams.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
-        """Results (T, R, ...) of a collector. After a step at which all weights are zero, it is undefined."""
+        """Results (T, R, ...) of a collector. Entries of a run are undefined once all its weights are zero."""
         steps = self.found[name]
         check_one_shape(name, [values.shape[1:] for _, values in steps])
         shape = steps[0][1].shape[1:] if steps else ()
