@@ -33,8 +33,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.fields import NonNegativeInt
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
+    WORKING_PIXELS,
     Camera,
     Frame,
     LazyFrames,
@@ -143,6 +145,7 @@ class Video:
     #: True label image of a frame, by index.
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
     distortion: tuple[float, ...] = ()  #: OpenCV's k1, k2, p1, p2, k3, ... of both images; they are undistorted
+    max_pixels: int = WORKING_PIXELS  #: larger images are reduced; 0 means no limit
 
     @classmethod
     def of_files(
@@ -197,14 +200,18 @@ class Video:
                 f"{self.path}: K has the principal point ({cx:g}, {cy:g}), outside images of {width} x {height}",
                 "K is fx, fy, cx, cy in pixels of these images; adapt it if they were resized or cropped",
             )
-        camera = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
-        source = undistortion_map(camera, self.distortion)
-        return camera, source, lambda index, view: self._frame(index, view, source)
+        stored = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
+        source = undistortion_map(stored, self.distortion)
+
+        def read(index: int, camera: Camera) -> Frame:
+            return self._frame(index, stored, source).resized(camera)
+
+        return stored.limited(self.max_pixels), source, read
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
         """The recording of the video. Pose and workspace are computed in the call. Images are read on access."""
         camera, source, read = self.frame_reader()
-        height, width = camera.height, camera.width
+        height, width = self.read_rgb(0).shape[:2]
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
         found = pauses.find(self.times, self.read_rgb)
         first_pause = found[0]
@@ -223,7 +230,12 @@ class Video:
             image = self.read_instance(index)
             if image is not None and image.shape != (height, width):
                 raise InputError(f"instance image of frame {index} of {self.path} has shape {image.shape}")
-            return image if image is None else _undistort(image, source)
+            if image is None:
+                return None
+            import cv2
+
+            size = camera.width, camera.height
+            return np.asarray(cv2.resize(_undistort(image, source), size, interpolation=cv2.INTER_NEAREST))
 
         return Recording(
             LazyFrames(lambda index: read(index, camera_at(index)), len(self.times)),
@@ -272,6 +284,8 @@ class VideoFormat(RecordingFormat):
         Largest difference of the time stamps of a colour and a depth image of one frame.
     start_s, stop_s : float
         Part of the video to use, in seconds after its first frame.
+    max_pixels : int
+        Images with more pixels are reduced to this number. 0 means no limit.
     pauses : PauseRule
         The rule that finds the pauses.
     world : KnownWorld
@@ -284,6 +298,7 @@ class VideoFormat(RecordingFormat):
     tolerance_s: float = 0.02
     start_s: float = 0.0
     stop_s: float = math.inf
+    max_pixels: NonNegativeInt = WORKING_PIXELS
     pauses: PauseRule = field(default_factory=Still)
     world: KnownWorld = field(default_factory=KnownWorld)
 
@@ -293,7 +308,8 @@ class VideoFormat(RecordingFormat):
 
     def open(self, path: Path) -> Recording:
         """The recording of the selected part of the video."""
-        return self.video(path).between(self.start_s, self.stop_s).recording(self.pauses, self.world)
+        video = replace(self.video(path), max_pixels=self.max_pixels)
+        return video.between(self.start_s, self.stop_s).recording(self.pauses, self.world)
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:

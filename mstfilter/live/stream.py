@@ -32,6 +32,7 @@ from mstfilter.presets import preset
 from mstfilter.processes import parallel
 from mstfilter.registry import nested_components
 from mstfilter.scene import (
+    WORKING_PIXELS,
     Camera,
     Clip,
     Frame,
@@ -98,6 +99,8 @@ class Stream:
         Function that is called with a `Pause` after each step, in the thread of the filter.
     max_frames : int
         Maximum number of queued frames, and maximum number of frames of a clip. See Notes.
+    max_pixels : int
+        Images with more pixels are reduced to this number. 0 means no limit.
     threads : int
         Number of threads of one step. The results do not depend on this number.
 
@@ -120,16 +123,18 @@ class Stream:
         seed: int = 0,
         on_pause: Callable[[Pause], Any] | None = None,
         max_frames: int = 150,
+        max_pixels: int = WORKING_PIXELS,
         threads: int = 2,
     ) -> None:
         check_integer("max_frames", max_frames, at_least=4)
+        check_integer("max_pixels", max_pixels, at_least=0)
         check_integer("threads", threads, at_least=1)
         self._camera, self._grid = camera, grid
         self._filter = preset(filter) if isinstance(filter, str) else filter
         self._flows = [part for part in nested_components(self._filter) if isinstance(part, DenseFlow)]
         self._found = pauses.watch() if pauses is not None else lambda time, rgb: False
         self._state, self._on_pause = self._filter.start(seed), on_pause
-        self._max, self._threads = max_frames, threads
+        self._max, self._threads, self._max_pixels = max_frames, threads, max_pixels
         self._world: Camera | None = None  # the camera of the first pause
         self._clip: list[_Item] = []
         self._trackers: list[Any] = []
@@ -200,9 +205,10 @@ class Stream:
             rigid = pose if isinstance(pose, RigidTransform) else rigid_from_matrix(pose, f"pose of frame {number}")
             camera = camera.at(rigid)
         elif camera.T_world_camera is None:
-            camera = self._world or camera
+            camera = camera if self._world is None else camera.at(self._world.pose)
         frame = Frame(np.array(rgb), depth, camera, None if robot_mask is None else np.array(robot_mask))
         check_depth(frame.depth, f"depth image of frame {number}")
+        frame = frame.resized(camera.limited(self._max_pixels))
         self._last_time = time
         self._queue.put(_Item(number, frame, time, pause, arrived))
         return True

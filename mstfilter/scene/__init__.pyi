@@ -11,6 +11,7 @@ from mstfilter.scene.cache import (
     scene_cache as scene_cache,
 )
 from mstfilter.scene.camera import (
+    WORKING_PIXELS as WORKING_PIXELS,
     Camera as Camera,
     look_at as look_at,
     rigid_from_matrix as rigid_from_matrix,

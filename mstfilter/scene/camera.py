@@ -12,6 +12,7 @@ first pixel is (0, 0). Without a pose (`T_world_camera=None`), the world axes ar
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -172,11 +173,19 @@ class Camera:
         K[1, 2] = (self.K[1, 2] + 0.5) * factor - 0.5
         return Camera(K, width, height, self.T_world_camera)
 
+    def limited(self, max_pixels: int) -> Camera:
+        """The camera of the image reduced to about `max_pixels` pixels, if it has more. 0 means no limit."""
+        n = self.width * self.height
+        return self.scaled(math.sqrt(max_pixels / n)) if 0 < max_pixels < n else self
+
     def at(self, T_world_camera: RigidTransform) -> Camera:
         """The same camera at another pose."""
         return replace(self, T_world_camera=T_world_camera)
 
 
+#: Images of videos and streams are reduced to this number of pixels, which is above 848 x 480. A voxel of 1 cm still
+#: has several pixels.
+WORKING_PIXELS = 410_000
 _WIDTH, _HEIGHT = 640, 480  # pixels: the image size in which numbers of pixels are given
 
 

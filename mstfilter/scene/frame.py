@@ -264,6 +264,21 @@ class Frame:
         key = content_key("frame", self.rgb, self.depth, self.camera.key, robot)
         return content_key("views", key, *(view.key for view in self.views)) if self.views else key
 
+    def resized(self, camera: Camera) -> Frame:
+        """The frame in the image size of a camera, without views. Depth is that of the nearest pixel."""
+        if camera is self.camera:
+            return self
+        import cv2
+
+        size = camera.width, camera.height
+        if size == (self.camera.width, self.camera.height):
+            return Frame(self.rgb, self.depth, camera, self.robot_mask)
+        robot = self.robot_mask
+        if robot is not None:
+            robot = cv2.resize(robot.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        depth = cv2.resize(self.depth, size, interpolation=cv2.INTER_NEAREST)
+        return Frame(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA), depth, camera, robot)
+
     @property
     def all_views(self) -> tuple[Frame, ...]:
         """The frame itself and its views."""

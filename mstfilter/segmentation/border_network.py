@@ -164,16 +164,7 @@ class BorderNetwork:
 def reduced(frame: Frame) -> Frame:
     """The frame with `RASTER` pixels per row and a camera pose. Depth is taken from the nearest pixel."""
     camera = posed_camera(frame)
-    w = camera.width
-    if w == RASTER:
-        return Frame(frame.rgb, frame.depth, camera, frame.robot_mask)
-    camera = camera.scaled(RASTER / w)
-    size = camera.width, camera.height
-    depth = cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST)
-    robot = frame.robot_mask
-    if robot is not None:
-        robot = cv2.resize(robot.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return Frame(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), depth, camera, robot)
+    return frame.resized(camera if camera.width == RASTER else camera.scaled(RASTER / camera.width))
 
 
 @functools.lru_cache(maxsize=4)

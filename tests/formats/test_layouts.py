@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, InputWarning
@@ -46,6 +47,18 @@ def same_on_disk(recording, path):
     """A converted recording is byte-identical."""
     assert open_recording(save_recording(recording, path)).key == recording.key
     assert not list(path.parent.glob(".*"))
+
+
+def test_large_images_are_reduced(tmp_path):
+    path = write_redwood(tmp_path / "video")
+    full, small = (Redwood(fps=FPS, world=WORLD, max_pixels=n).open(path) for n in (0, 5000))
+    same_frames(full, SHIFTS)
+    for index in range(len(small)):
+        frame = small.frames[index]
+        assert frame.depth.shape == (61, 82) and small.pauses == full.pauses
+        seen, exact = frame.points[20:50, 20:60], full.frames[index].points[40:98, 40:117]
+        distance, _ = cKDTree(exact[np.isfinite(exact).all(axis=-1)]).query(seen[np.isfinite(seen).all(axis=-1)])
+        assert np.quantile(distance, 0.9) < 0.008  # pixels are 8 mm apart
 
 
 VIDEOS = {

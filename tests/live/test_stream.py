@@ -62,6 +62,18 @@ def test_a_stream_has_the_results_of_the_recording(threads):
     assert found[1].counts == {"pushed": len(SHIFTS)}
 
 
+def test_a_stream_reduces_large_images():
+    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_pixels=5000) as stream:
+        for k in (0, 1):
+            stream.push(RGB[k], DEPTH[k], TIMES[k], pause=True)
+        stream.wait()
+        small = CAMERA.limited(5000)
+        for frame in stream.last.clip.frames:
+            assert frame.depth.shape == (small.height, small.width)
+            np.testing.assert_allclose(frame.camera.K, small.K)
+            assert frame.camera.T_world_camera is not None
+
+
 def test_frames_can_be_announced_as_pauses():
     states = filtered(pauses=(2, 15))
     found = []

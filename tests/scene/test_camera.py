@@ -51,6 +51,24 @@ def test_scaling_keeps_rays():
     np.testing.assert_allclose((big + 0.5) / 2 - 0.5, small, atol=1e-9)
 
 
+def test_a_resized_frame_shows_the_same_plane():
+    camera = Camera.from_intrinsics(1000, 1000, 959.5, 539.5, 1920, 1080)
+    normal, offset = np.array([0.1, -0.6, -1.0]), -1.2  # the plane normal @ x = offset in camera axes
+    depth = (offset / (camera.rays() @ normal)).astype(np.float32)
+    rgb = np.repeat((np.arange(1920) / 10).astype(np.uint8)[None, :, None], 1080, 0).repeat(3, 2)
+    small = camera.limited(410_000)
+    frame = Frame(rgb, depth, camera, depth > 1.3).resized(small)
+    assert 400_000 < frame.depth.size < 420_000 and frame.camera is small
+    exact = offset / (small.rays() @ normal)
+    slope = np.abs(np.gradient(exact)).max()  # metres per pixel of the small image
+    assert np.abs(frame.depth - exact).max() < slope  # the depth of the nearest pixel is less than a pixel away
+    assert np.mean(frame.robot_mask == (exact > 1.3)) > 0.99
+    columns = np.arange(small.width) + 0.5
+    np.testing.assert_allclose(frame.rgb[5, :, 0], columns * 1920 / small.width / 10 - 0.5, atol=1.5)
+    assert frame.resized(small) is frame
+    assert camera.limited(0) is camera and small.limited(410_000).width <= small.width
+
+
 def test_numbers_of_pixels_scale_with_the_image():
     assert (scaled_length(3, 640), scaled_length(3, 1280), scaled_length(3, 320)) == (3, 6, 1.5)
     assert (scaled_area(60, 640 * 480), scaled_area(60, 320 * 240)) == (60, 15)
