@@ -13,7 +13,7 @@ The studies use the families `s1`, `s2` and `s3`. A scene can also be simulated 
 >>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
 >>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
 
-With a `PushLoop`, a filter chooses the pushes.
+With a `PushLoop`, a program chooses each push by the belief of a filter.
 
 The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
 (MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),
