@@ -2,11 +2,11 @@
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
-A topic must be named only if several topics are suitable. The camera matrix is K (P for rectified images) in the
-``camera_info`` topic that belongs to the colour topic. A frame consists of a colour and a depth image with mutually
-nearest header time stamps. The two stamps differ by at most `tolerance_s`. Depth must be registered to colour, and
-both images must have the same size and ``frame_id``. Transforms (tf) are not read. The camera is assumed not to move,
-and its pose is computed from the table.
+The parameters `colour` and `depth` are needed only if several topics are suitable. The camera matrix is K (P for
+rectified images) in the ``camera_info`` topic that belongs to the colour topic. A frame consists of a colour and a
+depth image with mutually nearest header time stamps. The two time stamps differ by at most `tolerance_s` seconds.
+Depth must be registered to colour, and both images must have the same size and ``frame_id``. Transforms (tf) are not
+read. The camera is assumed not to move, and its pose is computed from the table.
 
 Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
 encoding 32FC1 is in metres. Compressed depth is a PNG, or a header of 12 bytes (quantisation A, B of 32FC1) and a PNG
@@ -114,7 +114,7 @@ class BagFile:
         return entries
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """The message of an entry."""
+        """The message to which an `Entry` refers."""
         for k, (_, message) in enumerate(self._messages(topic, entry.logged, entry.logged + 1)):
             if k == entry.ordinal:
                 return message
@@ -143,7 +143,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def image_encoding(message: Any, compressed: bool) -> str:
-    """The encoding of an image message. For a compressed image: ``16UC1``, ``32FC1`` or ``compressed colour``."""
+    """The encoding of an image message. A compressed image has ``16UC1``, ``32FC1`` or ``compressed colour``."""
     if not compressed:
         return str(message.encoding)
     named = str(message.format)

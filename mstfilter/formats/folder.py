@@ -313,7 +313,7 @@ def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
 
 @dataclass(frozen=True)
 class RecordingFolder(RecordingFormat):
-    """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/.
+    """Reader of the recording folder of mstfilter (manifest.json, camera.json, rgb/, depth/).
 
     Images and true poses are read on access. All other files are checked when the folder is opened. If `pauses` is a
     rule, the rule replaces the pauses in manifest.json. True volumes are known only at the pauses in manifest.json.

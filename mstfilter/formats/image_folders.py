@@ -285,7 +285,7 @@ def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float
 
 
 def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tuple[float, ...]:
-    """fx, fy, cx, cy of the file of intrinsics."""
+    """Intrinsics fx, fy, cx, cy from the intrinsics file."""
     if file is None:
         raise InputError(
             f"{path}: intrinsics are missing, there is no {' or '.join(_INTRINSICS)}",
@@ -303,7 +303,7 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
 
 
 def _four(K: Any) -> tuple[float, ...]:
-    """fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
+    """Intrinsics fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:
         return tuple(values.ravel().tolist())
@@ -317,7 +317,7 @@ def _four(K: Any) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Tum(VideoFormat):
-    """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. K must be given.
+    """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. The parameter `K` is required.
 
     Lines of rgb.txt and depth.txt are ``timestamp filename``. Lines of groundtruth.txt are ``timestamp tx ty tz qx qy
     qz qw``. Depth is in units of 1/5000 m. The format is described by Sturm et al. (2012).

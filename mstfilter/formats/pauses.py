@@ -107,7 +107,7 @@ class Still(PauseRule):
     Parameters
     ----------
     hold_s : float
-        Shortest interval, in seconds.
+        Length in seconds of the shortest still interval that gives a pause.
     levels : float
         A block differs if its grey level (0 to 255) changes by more than `levels` and by more than 6 times the noise.
     region : tuple of 4 float
@@ -157,7 +157,7 @@ class Still(PauseRule):
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
 
     def _part(self, blocks: np.ndarray) -> np.ndarray:
-        """The blocks (h, w) of the region."""
+        """The blocks (h, w) inside `region`."""
         h, w = blocks.shape
         left, top, right, bottom = self.region
         return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]

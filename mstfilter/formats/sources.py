@@ -50,7 +50,7 @@ def open_recording(
 def open_format(
     path: str | Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
 ) -> RecordingFormat:
-    """The reader for an existing path. Parameters: `open_recording`."""
+    """The reader for an existing file or folder. Parameters: `open_recording`."""
     path = Path(path)
     fields = format_settings(options)
     if pauses:

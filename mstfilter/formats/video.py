@@ -59,7 +59,7 @@ class RecordingFormat(ABC):
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
-        """The recording, whose images may be read on access. Raises InputError if the data are not valid."""
+        """The recording, with images in memory or read on access. Raises InputError if the data are not valid."""
 
 
 _NEGLIGIBLE = 0.5  # pixels
@@ -202,7 +202,7 @@ class Video:
         return camera, source, lambda index, view: self._frame(index, view, source)
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording of the video. Pose and workspace are computed in the call. Images are read on access."""
+        """The recording of the video. Pose and workspace are computed during the call. Images are read on access."""
         camera, source, read = self.frame_reader()
         height, width = camera.height, camera.width
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
@@ -262,7 +262,7 @@ class VideoFormat(RecordingFormat):
     Parameters
     ----------
     K : tuple of 4 float
-        fx, fy, cx, cy in pixels. By default, K is read from the files.
+        Intrinsics fx, fy, cx, cy in pixels. By default, K is read from the files.
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float

@@ -24,7 +24,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array. An array with writeable memory is copied, so writing to another array has no effect."""
+    """A read-only array. An array with writeable memory is copied, so writes to other arrays have no effect on it."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:

@@ -35,9 +35,8 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    If the total size exceeds `limit_bytes`, the least recently used values are dropped. A loop calls `forget` after
-    each step to drop values of older steps. The counter `hits` has the number of values found in memory or on disk,
-    by name.
+    If the total size exceeds `limit_bytes`, the least recently used values are dropped. The counter `hits` has the
+    number of values found in memory or on disk, by name.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:

@@ -6,8 +6,7 @@
 
 Free-space projection is the first step of the measurement update (paper, section IV-D). The quality of a prediction
 is Q = 1 - (cleared voxels) / (occupied voxels). An update adds lambda log Q to the log weight of the prediction. The
-factor lambda is the parameter `quality_exponent` of the update. A prediction with objects in free space loses voxels
-and weight.
+factor lambda is the parameter `quality_exponent` of the update.
 """
 
 from __future__ import annotations
@@ -80,10 +79,10 @@ class NoFreeSpace(Projection):
 class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
-    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The first
-    margin accounts for the size of the voxel. The second margin accounts for the sensor noise at the range of the
-    surface (`mstfilter.scene.depth_sigma`). Voxels that are not observed (no depth reading, robot pixel, outside the
-    image, behind a surface) are kept. A voxel that contains a measured point is kept.
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins, one for
+    the size of the voxel and one for the sensor noise (`mstfilter.scene.depth_sigma`). Voxels that are not observed
+    (no depth reading, robot pixel, outside the image, behind a surface) are kept. A voxel that contains a measured
+    point is kept.
 
     With several cameras (`Frame.views`), a voxel is free if at least one camera observes the voxel as free and no
     camera measures a point in the voxel.
@@ -153,10 +152,10 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
     Returns
     -------
     of_objects : (k,) ndarray
-        Share of each label. The share is NaN for label 0, for objects with few used pixels, and for objects with
-        fewer used pixels than pixels without a reading.
+        Share of confirmed pixels for each label. The share is NaN for label 0, for objects with few used pixels, and
+        for objects with fewer used pixels than pixels without a reading.
     of_scene : float
-        Share of all objects together. The share is 1 if no pixel can be used.
+        Share of confirmed pixels for all objects together. The share is 1 if no pixel can be used.
     """
     rendered, shown = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid).pixels
     would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])

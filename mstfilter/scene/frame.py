@@ -202,7 +202,7 @@ class Frame:
     robot_mask : (H, W) bool, optional
         Pixels that show the robot. The depth at robot pixels is treated as unknown.
     views : tuple of Frame
-        Simultaneous frames of other cameras. If there are views, all cameras need a pose in the same world axes.
+        Simultaneous frames of other cameras. With views, all cameras need a pose in the same world axes.
     """
 
     rgb: np.ndarray
@@ -287,8 +287,7 @@ class Frame:
 class Clip:
     """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
-    `before` is the frame at the previous pause, and `after` is the frame at the pause that ends the clip. The frames
-    between the two pauses show the action. The first clip of a recording has one frame.
+    The frames between the pauses show the action. The first clip of a recording has one frame.
 
     Parameters
     ----------

@@ -170,8 +170,8 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
 def table_residual(frame: Frame) -> np.ndarray:
     """Measured disparity minus the disparity of the table, (H, W) float32 in 1/8 pixels. The result is cached.
 
-    The table is the plane z = 0 of the world. Positive values are above the table. Pixels without a reading have the
-    value NaN. Readings on rays that do not meet the table have the value +inf.
+    The table is the plane z = 0 of the world. Positive values mean readings above the table. Pixels without a reading
+    have the value NaN. Readings on rays that do not meet the table have the value +inf.
     """
 
     def compute() -> np.ndarray:

@@ -1,7 +1,7 @@
 """Partitions of voxels or pixels: renumbered labels, and the common refinement of several partitions.
 
-A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation. The
-number of cells is far smaller than the number of voxels.
+A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation.
+There are far fewer cells than voxels.
 
 >>> both = common_refinement([np.array([0, 1, 1, 2]), np.array([0, 7, 7, 7])])
 >>> both.cells, both.sizes

@@ -257,7 +257,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
     A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
     is at a right angle to a wall and extends far from the wall. In the image, the normal of a table points up, and
-    the normal of a wall does not point up.
+    the normal of a wall does not.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None

@@ -5,8 +5,7 @@
 >>> for clip in recording.clips():
 ...     clip.before, clip.after                              # Frames, read when they are used
 
-If the camera pose is not given, the support plane at the first pause defines the world axes. The default workspace
-covers the visible table.
+If the camera pose is not given, the support plane at the first pause defines the world axes.
 """
 
 from __future__ import annotations
@@ -264,8 +263,8 @@ class Recording:
 
         The first clip has the frame at the first pause. Each other clip has the frames from one pause to the next.
 
-        The first call warns if the input is not plausible. The first call raises InputError if no hypothesis can be
-        correct (`mstfilter.scene.examine`).
+        The first call warns if the input is not plausible, and raises InputError if no hypothesis can be correct
+        (`mstfilter.scene.examine`).
         """
         self._examined  # noqa: B018
         clips = []
@@ -332,7 +331,7 @@ def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
 
 
 def _stacked(images: Any, what: str) -> np.ndarray:
-    """Images as one array. Raises InputError if the images have different shapes."""
+    """Stack images into one array. Raises InputError if the images have different shapes."""
     try:
         return np.asarray(images)
     except ValueError as error:

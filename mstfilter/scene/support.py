@@ -61,8 +61,7 @@ class Foreground:
 def above_table(frame: Frame) -> np.ndarray:
     """Disparity minus the disparity of the table, (H, W) float32 in sensor units; NaN at pixels without a reading.
 
-    One sensor unit is 1/8 px at f = 525 px, or 3.2 mm of depth at 1 m. The table is the plane z = 0 if the camera has
-    a pose, else the plane with the most depth readings.
+    One sensor unit is 1/8 px at f = 525 px, or 3.2 mm of depth at 1 m.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
 

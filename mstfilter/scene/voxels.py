@@ -297,7 +297,7 @@ class Occupancy:
         return content_key("occupancy", self.owner, self.probability)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
-        """The occupancy after a change of labels. Changed voxels become certain. Only objects in `known` are kept."""
+        """The occupancy for new labels. Changed voxels get probability 0 or 1. Only objects in `known` are kept."""
         changed = before != after
         owner = np.where(changed | (after > 0), after, self.owner)
         p = np.where(changed, after > 0, self.probability)

@@ -1,6 +1,4 @@
-"""The border network, a small 2-D U-Net that estimates the borders and the centres of objects.
-
-The import of the module `border_network` also imports torch.
+"""The border network, a small 2-D U-Net in torch that estimates the borders and the centres of objects.
 
 >>> network = load_border_network("border")
 >>> seen = network.look(frame)                     # maps of the frame's size

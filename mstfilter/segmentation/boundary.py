@@ -6,7 +6,7 @@ Most objects are convex, so depth has a concave crease or a step between two tou
 table. A convex crease, such as the edge of a box, lies inside one object. On a plane, disparity D = 8 f b / z (f
 focal length, b baseline, z depth) is affine in the pixel coordinates. The noise of D does not depend on depth. The
 largest eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not
-visible in depth. Colour has a lower weight than depth, because print on a box is not a boundary.
+visible in depth. The weight of colour is low, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ColourDepthBoundary(BoundaryModel):
         Weight of the colour edges. The weight 0 disables colour.
     quiet_table : float
         Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther from all surfaces above the
-        table, so print and shadows on the table are ignored. Negative values disable the rule.
+        table, so print and shadows on the table are ignored. With a negative distance, no pixel is set to 0.
     """
 
     colour_weight: float = 0.4

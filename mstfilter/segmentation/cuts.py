@@ -58,9 +58,9 @@ class SceneCutObjectness(CutValue):
     Parameters
     ----------
     background_weight : float
-        Area of a pixel that is not above the table. In SceneCut, the area is 1. With area 1, the table contributes
-        most of the optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives
-        more random cuts. With area 0, splits of the table do not change the value, and chains spend steps on splits.
+        Area of each pixel that is not above the table. With area 1, as in SceneCut, the table contributes most of the
+        optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives more random
+        cuts. With area 0, splits of the table do not change the value, and chains spend steps on splits.
     """
 
     background_weight: float = 0.003
@@ -177,7 +177,7 @@ class OptimalCut(CutSampler):
 
 @dataclass(frozen=True, eq=False)
 class Gibbs:
-    """A Gibbs distribution over the cuts of a tree and of its subtrees. Each list has one entry per node."""
+    """A Gibbs distribution over the cuts of a tree and of its subtrees. A list has one entry per node of the tree."""
 
     tree: Tree
     b: float  #: inverse temperature, per unit of value
@@ -186,7 +186,7 @@ class Gibbs:
     stop: list[float]  #: probability that a cut without an ancestor of the node contains the node
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
-        """Draw a cut of the subtree of `node`, with unordered nodes. `random` returns uniform numbers in [0, 1)."""
+        """Draw a cut of the subtree of `node`, with unordered nodes. ``random()`` is uniform in [0, 1)."""
         children, stop = self.tree.children, self.stop
         cut, stack = [], [node]
         while stack:

@@ -114,11 +114,11 @@ class CutState:
 
 
 class MoveRule(ABC):
-    """Proposes the next cut of a chain."""
+    """Proposes the next cut of a Metropolis-Hastings chain."""
 
     @abstractmethod
     def choose(self, random: Callable[[], float], state: CutState) -> Any:
-        """Draw a choice. `random` returns uniform numbers in [0, 1)."""
+        """Draw a choice. ``random()`` is uniform in [0, 1)."""
 
     @abstractmethod
     def outcome(self, state: CutState, choice: Any) -> Move | None:
@@ -248,7 +248,7 @@ class CutChain:
         self.restart(cut)
 
     def restart(self, cut: np.ndarray) -> None:
-        """Continue from another cut."""
+        """Continue the chain from another cut."""
         self.state = CutState(self.tree, cut.tolist())
         self.value = sum(self.w[x] for x in self.state.nodes)
 
@@ -293,7 +293,7 @@ class MetropolisHastingsCuts(CutSampler):
     moves : {"node", "authors"}
         Rule of the local moves: the exact rule of the paper, or the rule of the authors' program.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move; 0 if the temperature is 0.
+        Fraction of steps that redraw a random subtree instead of making a local move; 0 if the temperature is 0.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool

@@ -86,7 +86,7 @@ class ObjectRule:
         return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
-        """Test every node of a tree. Without a grid, the workspace is all space above the table."""
+        """Test which nodes of a tree are objects. Without a grid, the workspace is all space above the table."""
         found = self.foreground(frame, grid)
         pixels, frame = found.pixels, found.frame
         readings = tree.accumulate_pixels(frame.valid)
@@ -215,8 +215,8 @@ def complete_segments(
 
     Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
     segment is completed once, with the random stream ``"completion", segment``. The result for a segment does not
-    depend on the other segments. A stochastic completer completes a segment again for each further sample with the
-    segment. The random stream is then ``"completion", segment, k``.
+    depend on the other segments. A stochastic completer completes a segment again for its k-th further sample, with
+    the random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()

@@ -14,10 +14,10 @@ array([[1, 1],
        [1, 0]])
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
-in order of the mean strength of their common border. The height of a merge is the mean strength of the common border.
-A logistic curve maps the height to P(boundary), the probability that the merge joins different objects. The field
-`start` of a node is P(boundary) of the merge that makes the node. `start` is near 0 for a node inside one object, and
-near 1 for a node with several objects.
+in order of the mean strength of their common border, which is the height of a merge. A logistic curve maps the height
+to P(boundary), the probability that the merge joins different objects. The field `start` of a node is P(boundary) of
+the merge that makes the node. `start` is near 0 for a node inside one object, and near 1 for a node with several
+objects.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Tree:
 
     @cached_property
     def end(self) -> np.ndarray:
-        """(N,) `start` of the parent: P(boundary) of the merge that absorbs the node, or 1 for the root."""
+        """(N,) P(boundary) of the merge that absorbs each node (`start` of the parent), or 1 for the root."""
         end = self.start[self.parent]
         end[self.root] = 1.0
         return read_only(end)

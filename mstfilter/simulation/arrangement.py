@@ -38,7 +38,7 @@ class SceneObjects:
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw shapes and textures in rounds. A round has each family once, cartons three and cans two more times."""
+    """Draw shapes and textures of a scene from shuffled lists of all families, with cartons and cans repeated."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []

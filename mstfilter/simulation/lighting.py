@@ -1,8 +1,4 @@
-"""The rendered poses, and the light on the table and on bodies.
-
-`Stage` holds the poses that are rendered. `LightMap` holds the light on the table. `BodyColours` gives the colours of
-points on objects and on the finger.
-"""
+"""The rendered poses (`Stage`), and the light on the table (`LightMap`) and on bodies (`BodyColours`)."""
 
 from __future__ import annotations
 
@@ -27,7 +23,7 @@ class Stage:
 
     Soft contacts make bodies at rest move by micrometres between frames. A rendered pose changes only if a point of
     the body has moved by more than `tolerance` metres. Images, recorded poses and volumes agree exactly, because all
-    use the rendered poses. The simulation itself is not changed.
+    use the rendered poses.
     """
 
     def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
@@ -90,7 +86,7 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 class LightMap:
     """Raster of the light on the table. A value is the mean of cosine times visibility over light sources (k, 3).
 
-    The raster has a `spacing` in metres. The number of shadow rays does not depend on the image size.
+    The raster has a `spacing` in metres.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray) -> None:

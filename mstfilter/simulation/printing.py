@@ -240,7 +240,7 @@ def lid(rng: np.random.Generator, size: float, colour: _Rgb, ridges: bool, pool:
 def wood(
     rng: np.random.Generator, width: float, height: float, colour: _Rgb | None = None, dot: float = DOT
 ) -> np.ndarray:
-    """Texture of wood with the grain along the width. A pixel has `dot` metres."""
+    """Texture of wood with the grain along the width. A pixel is `dot` metres wide."""
     if colour is None:
         r = rng.uniform(0.75, 1.0)
         colour = (int(215 * r), int(178 * r * rng.uniform(0.9, 1.03)), int(132 * r * rng.uniform(0.8, 1.1)))
@@ -254,7 +254,7 @@ def wood(
 
 
 def cloth(rng: np.random.Generator, width: float, height: float, pool: Pool = ANY) -> np.ndarray:
-    """Texture of cloth with a checked weave."""
+    """Cloth with a checked weave."""
     ground, second = shade(rng, (0.5, 0.9), 0.5, pool), shade(rng, (0.3, 0.8), 0.6, pool)
     image = _canvas(width, height, ground)
     h, w = image.shape[:2]
@@ -269,7 +269,7 @@ def cloth(rng: np.random.Generator, width: float, height: float, pool: Pool = AN
 def speckle(
     rng: np.random.Generator, width: float, height: float, colours: tuple[_Rgb, _Rgb], dot: float = DOT
 ) -> np.ndarray:
-    """Texture of stone or foam: two colours mixed by noise of several scales."""
+    """Stone or foam: two colours mixed by noise of several scales."""
     image = _canvas(width, height, colours[0], dot)
     h, w = image.shape[:2]
     share = 1.0 / (1.0 + np.exp(-3.0 * noise(rng, (h, w), (0.016 / dot, 0.016 / dot), 4)))
@@ -280,7 +280,7 @@ def speckle(
 def glaze(
     rng: np.random.Generator, width: float, height: float, colours: tuple[_Rgb, _Rgb], motif: int
 ) -> np.ndarray:
-    """Texture of glazed ceramic: plain (motif 0), with stripes (1) or with dots (2)."""
+    """Glazed ceramic: plain (motif 0), with stripes (1) or with dots (2)."""
     import cv2
 
     image = _canvas(width, height, colours[0])
@@ -298,7 +298,7 @@ def glaze(
 
 
 def peel(rng: np.random.Generator, width: float, height: float, colour: _Rgb) -> np.ndarray:
-    """Texture of fruit peel: one colour with brown freckles."""
+    """Fruit peel: one colour with brown freckles."""
     image = _canvas(width, height, colour)
     h, w = image.shape[:2]
     freckle = np.clip(noise(rng, (h, w), (0.01 / DOT, 0.02 / DOT), 4) - 1.3, 0, 1)

@@ -95,7 +95,7 @@ class PushLoop:
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
         """`n` random pushes towards objects. Each push starts at a free position. The scene does not change.
 
-        Pushes are drawn towards true objects, so most pushes move an object. Some pushes miss or drop an object.
+        Pushes are drawn towards true objects, so most pushes move an object. Others miss all objects or drop one.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)
@@ -121,7 +121,7 @@ class PushLoop:
         return self.clip
 
     def save(self) -> LoopState:
-        """A copy of the present state. With `restore`, a policy can try several pushes from the same state."""
+        """A copy of the state of the scene. With `restore`, a policy can try several pushes from the same state."""
         world, stage = self._scene.world.save(), self._scene.stage.save()
         return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 

@@ -1,4 +1,4 @@
-"""Recording of simulated scenes. A call with an integer seed writes a recording folder.
+"""Recording of simulated scenes. `simulate_recording` writes a recording folder for an integer seed.
 
 >>> from mstfilter.simulation import scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
@@ -8,16 +8,15 @@
 The same family and seed give byte-identical recordings on one machine with the same library versions. Each part of
 the simulation has a separate random stream, with a name and an index.
 
-`cached_recording` stores recordings on disk. A second call with the same parameters returns the stored recording.
+`cached_recording` stores recordings on disk, and later calls return the stored recordings.
 
 >>> from mstfilter import open_recording
 >>> from mstfilter.simulation import cached_recording
 >>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
-The name of a cached folder contains a hash of the fields of the family, the seed, and the versions of the simulator
-and of MuJoCo. A folder is written under a temporary name and renamed when the recording is complete. Several
-processes can request the same recording at the same time.
+The name of a cached folder contains a hash (`recipe_key`). A folder is written under a temporary name and renamed
+when the recording is complete. Several processes can request the same recording at the same time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Colour, depth and instance images by ray casting. The renderer needs no display, GPU or OpenGL.
 
-One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
-the textures.
+One ray per pixel gives depth and instance. Colours are computed from textures and from shadow rays to a lamp and the
+ceiling.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def visible_texel(camera: Camera) -> float:
 class Renderer:
     """Renders the current state of a world.
 
-    There is one skin (texture) for each object. `supersample` casts additional rays for pixels on edges. Rendered
-    poses may differ from simulated poses by `tolerance` metres; see `Stage`.
+    Each object has one texture (`Skin`). `supersample` casts additional rays for pixels on edges. Rendered poses may
+    differ from simulated poses by `tolerance` metres; see `Stage`.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Renderer:
         self._lamp_map, self._sky_map = LightMap(fine, room.lamp), LightMap(2 * fine, room.sky)
 
     def _render_background(self) -> None:
-        """Render the room without objects. Later images need only the light on the table again."""
+        """Render the room without objects. Later images recompute only the light on the table."""
         geom, z, normal = self.stage.cast(self._eye, self._rays, (ROOM_GROUP,))
         points = self._eye + self._rays * z[:, None]
         self._room_depth = np.where(geom >= 0, z, np.nan).astype(np.float32)

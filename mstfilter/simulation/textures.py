@@ -36,7 +36,7 @@ _SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 class Skin:
     """Texture of a body: flat images (h, w, 3) uint8, called charts, and the strength of the highlight, 0 .. 1.
 
-    The charts show six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last one is plain.
+    Charts show six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart has one colour.
     """
 
     charts: tuple[np.ndarray, ...]
@@ -71,8 +71,8 @@ def texture_coordinates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (n,) of the texture images of surface points, and texture coordinates (n, 2) in these images.
 
-    `points`, in metres, and outward unit `normals` (n, 3) are in body axes. `plain` (n,) bool marks points of one
-    colour. Texture coordinates are 0 .. 1 from the upper left corner.
+    `points`, in metres, and outward unit `normals` (n, 3) are in body axes. `plain` (n,) bool marks points without
+    texture. Texture coordinates are 0 .. 1 from the upper left corner.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":

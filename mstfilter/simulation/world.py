@@ -13,8 +13,8 @@ pieces with torsional and rolling friction. The finger is a capsule on three sli
 arm above the finger is visible but has no contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates candidate pushes from one state. `choose_push` takes the first push that moves enough objects and neither
-topples nor drops an object. Physics is faster than rendering, so dozens of pushes can be simulated.
+simulates dozens of candidate pushes from one state. The first push that moves enough objects, and neither topples nor
+drops an object, is taken.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
-    Object k has the shape ``shapes[k]``. The id of the object in images, voxels and poses is k + 1. Objects start far
-    from the table. `place` puts one object on the table. The arm of the finger is visible but has no contacts.
+    Object k has the shape ``shapes[k]``, and the id k + 1 in images, voxels and poses. Objects start far from the
+    table. `place` puts one object on the table.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:
