@@ -369,7 +369,7 @@ def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:
 
 
 def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams: list[_Stream]) -> _Stream:
-    """The stream of the topic `name`, or the only candidate without a name."""
+    """The stream of the topic `name`, or the only candidate if `name` is empty."""
     listed = [f"  {s}" for s in sorted(streams, key=lambda s: s.name)]
     if name:
         chosen = next((s for s in streams if s.name == name), None)

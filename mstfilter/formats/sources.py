@@ -6,7 +6,7 @@
 
 Options ``FIELD=VALUE`` set fields of the format, which ``mstfilter list format`` shows. Commas separate the values of
 a list. The format ``./file.py:Class`` is a class in a file of the user. Each other format is a class of
-`mstfilter.formats`. A rule of ``formats/pauses.py`` finds the pauses.
+`mstfilter.formats`.
 """
 
 from __future__ import annotations

@@ -266,8 +266,8 @@ class VideoFormat(RecordingFormat):
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3 of colour and depth images. By default, the coefficients in the files are used, if
-        any.
+        OpenCV's distortion coefficients k1, k2, p1, p2, k3 of colour and depth images. By default, the coefficients
+        in the files are used, if any.
     tolerance_s : float
         Largest difference in seconds between the time stamps of the colour and the depth image of a frame.
     start_s, stop_s : float

@@ -24,7 +24,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array. An array with writeable memory is copied, so writes to other arrays have no effect on it."""
+    """A read-only array. Writeable memory is copied, so that no write to another array changes the result."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
@@ -38,8 +38,8 @@ def frozen(array: np.ndarray) -> np.ndarray:
 def component_key(component: object) -> bytes:
     """Hash of the class and the fields of a component, and of the source of a class that a user defines.
 
-    The hash includes the attribute ``bound_key``, which identifies the ground truth of an oracle. A field with a
-    torch module is hashed by the weights. A field of any other class is hashed by its pickled content.
+    The hash includes the attribute ``bound_key``, which identifies the ground truth of an oracle. A torch module is
+    hashed by its weights. A field of any other class is hashed by its pickled content.
     """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)

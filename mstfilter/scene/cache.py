@@ -51,7 +51,7 @@ class Cache:
         self._disk: DiskCache | None = None
 
     def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
-        """The cached value of ``compute()``. The function `compute` is called only if the value is not in the cache.
+        """The cached value of ``compute()``. `compute` is called only if the value is not cached.
 
         `name` is the name of the computation. `key` contains content keys (`Frame.key`, `Camera.key`,
         `VoxelGrid.key`) and every parameter that affects the value. Name and key together determine the value

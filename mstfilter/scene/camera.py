@@ -6,8 +6,8 @@
 >>> camera.project(np.array([0.0, 0.0, 1.0]))[0]
 array([319.5, 239.5])
 
-Camera axes follow OpenCV: x points right, y points down, and z points forward. A pixel is (u, v) = (column, row). The
-centre of the first pixel is (0, 0). Without a pose (`T_world_camera=None`), the world axes are the camera axes.
+Camera axes follow OpenCV: x points right, y down, and z forward. A pixel is (u, v) = (column, row). The centre of the
+first pixel is (0, 0). Without a pose (`T_world_camera=None`), the world axes are the camera axes.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class _BytesDisk(diskcache.Disk):
 
 
 class DiskCache:
-    """Values in a folder. The folder is created if necessary. `version` is part of the key of every entry.
+    """Values in a folder, which is created if necessary. `version` is part of the key of every entry.
 
     Several processes may use the folder at the same time. An entry that cannot be read is treated as missing. Nothing
     is stored, and no error is raised, if the folder cannot be written, the disk is full, or another process locks the

@@ -79,10 +79,10 @@ class NoFreeSpace(Projection):
 class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
-    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins, one for
-    the size of the voxel and one for the sensor noise (`mstfilter.scene.depth_sigma`). Voxels that are not observed
-    (no depth reading, robot pixel, outside the image, behind a surface) are kept. A voxel that contains a measured
-    point is kept.
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The
+    margins account for the size of the voxel and the sensor noise (`mstfilter.scene.depth_sigma`). Voxels that are
+    not observed (no depth reading, robot pixel, outside the image, behind a surface) are kept. A voxel that contains
+    a measured point is kept.
 
     With several cameras (`Frame.views`), a voxel is free if at least one camera observes the voxel as free and no
     camera measures a point in the voxel.
@@ -145,9 +145,10 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
     """Shares of the visible surface that a frame confirms, for each object and for all objects together.
 
     The test renders the hypothesis and uses the pixels inside the outlines of objects. Pixels without a depth reading
-    are not used. A pixel with a reading in front of the surface is not used, because another object may hide it. At
-    each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is not far
-    behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth noise.
+    are not used. A pixel with a reading in front of the surface is not used, because another object may hide the
+    surface. At each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is
+    not far behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth
+    noise.
 
     Returns
     -------
@@ -155,7 +156,7 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
         Share of confirmed pixels for each label. The share is NaN for label 0, for objects with few used pixels, and
         for objects with fewer used pixels than pixels without a reading.
     of_scene : float
-        Share of confirmed pixels for all objects together. The share is 1 if no pixel can be used.
+        Share of confirmed pixels for all objects. The share is 1 if no pixel can be used.
     """
     rendered, shown = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid).pixels
     would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])

@@ -74,7 +74,7 @@ _GIVE_WORKSPACE = "give a workspace around the objects, or none: it is then plac
 def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
     """Findings about the frames of a recording at its pauses, and about the workspace.
 
-    Findings that stop a run come first in the list.
+    Findings that stop a run come first.
 
     The frames are read one by one. Only reduced images (160 and 320 columns) and image corners are kept in memory.
     """
@@ -97,7 +97,7 @@ def report_findings(findings: Iterable[Finding], where: str) -> None:
 
 
 def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[Finding]:
-    """Findings about the hypotheses of a step, compared with the frame at the end of the step."""
+    """Findings from a comparison of the hypotheses of a step with the frame at the end of the step."""
     grid, points = hypotheses[0].grid, _sampled(frame, 160).points
     raised = grid.contains(grid.index_of(points)) & (points[..., 2] > 2 * _MIN_HEIGHT)
     if raised.mean() > 0.005 and not any(h.n_objects for h in hypotheses):
@@ -416,7 +416,8 @@ def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int]
 
     The first value is the best agreement minus the median over all shifts. The second value is the relative loss of
     agreement if colour is not shifted. The third value is the best shift (rows, columns) of colour, in pixels of an
-    image with 320 columns. The fourth value is the increase of the agreement if the pauses of depth are reordered.
+    image with 320 columns. The fourth value is the increase of the agreement if the depth images of pauses are
+    exchanged.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)

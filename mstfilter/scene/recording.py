@@ -276,9 +276,9 @@ class Recording:
     def in_world_of(self, other: Recording) -> Recording:
         """A copy with the workspace and the first camera pose of another recording, without true volumes and poses.
 
-        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pause of each:
-        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can then
-        update hypotheses of the other recording.
+        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pause of each
+        recording: ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can
+        then update hypotheses of the other recording.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()

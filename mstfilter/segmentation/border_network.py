@@ -7,8 +7,8 @@
 A frame is reduced to 320 pixels per row (`encode_image`), and the output maps are interpolated to the size of the
 frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. At the input and
 the output, 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's border,
-and that a pixel belongs to an object. Two more are the offset from the pixel to the object's centre (Neven et al.,
-"Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre (Neven
+et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarra
 
 
 def near_objects(x: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool of a network input within eight pixels of a reading above the table."""
+    """Pixels (H, W) bool of a network input that are within eight pixels of a reading above the table."""
     raised = (x[0] > np.arcsinh(TABLE_TOLERANCE / _HEIGHT_UNIT) / 3) & (x[5] > 0)
     raised = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return np.asarray(cv2.dilate(raised, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (17, 17))) > 0)

@@ -61,8 +61,9 @@ class ColourDepthBoundary(BoundaryModel):
     colour_weight : float
         Weight of the colour edges. The weight 0 disables colour.
     quiet_table : float
-        Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther from all surfaces above the
-        table, so print and shadows on the table are ignored. With a negative distance, no pixel is set to 0.
+        Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther than `quiet_table` from all
+        surfaces above the table, so print and shadows on the table are ignored. With a negative distance, no pixel is
+        set to 0.
     """
 
     colour_weight: float = 0.4

@@ -186,8 +186,8 @@ def pair_features(
 ) -> np.ndarray:
     """The named features (k, f) of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
 
-    `border` (k, B) has the common borders of the pairs, with `a` first. `table_a` and `table_b` (k, B) have the
-    borders with the table, or zeros. `scale` is the image width / 640.
+    `border` (k, B) has the common borders of the pairs, with `a` first. `table_a` and `table_b` (k, B) are the
+    borders of `a` and `b` with the table, or zeros. `scale` is the image width / 640.
     """
     pair = _PairMeasures(a, b, border, table_a, table_b, scale)
     return np.stack([FEATURES[name](pair) for name in names], axis=1)
@@ -300,7 +300,10 @@ class MergedTree(TreeBuilder):
         return measure_regions(leaves, frame, boundary, self.look(frame))
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
-        """Build the tree. `odds` are the log odds of merges. `start` is the largest P(boundary) inside a node."""
+        """Build the tree of merged regions.
+
+        `odds` has the log odds of each merge, and `start` the largest P(boundary) inside a node.
+        """
         if frame is None:
             raise InputError(
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"

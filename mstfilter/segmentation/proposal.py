@@ -65,8 +65,8 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its readings are on the table, behind the table or outside the workspace. A
-    region is also background if fewer than `min_points` readings are above the table and in the workspace.
+    A region is background if most of its depth readings are on the table, behind the table or outside the workspace.
+    A region is also background if fewer than `min_points` readings are above the table and in the workspace.
     `min_points` is for an image of 640 x 480 pixels and is scaled by the area of the image.
 
     Parameters
@@ -82,7 +82,7 @@ class ObjectRule:
     mend: bool = True
 
     def foreground(self, frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
-        """The pixels that can belong to an object, and the frame with their depth."""
+        """The pixels that can belong to an object, and the frame with known or estimated depth."""
         return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
@@ -156,7 +156,7 @@ class TreeCutProposal(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def tree_of(self, frame: Frame, grid: VoxelGrid | None = None) -> tuple[Tree, np.ndarray]:
-        """The tree of a frame in a workspace and its node values (N,). The result is cached."""
+        """The tree of a frame in a workspace, and the node values (N,) of the tree. The result is cached."""
 
         def compute() -> tuple[Tree, np.ndarray]:
             found = self.objects.foreground(frame, grid)

@@ -138,7 +138,7 @@ def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int
 
 
 def brand(rng: np.random.Generator, pool: Pool = ANY) -> tuple[str, str]:
-    """Draw a brand name and a product name."""
+    """A brand name and a product name."""
     return pool.name(rng, _WORDS), pool.name(rng, _KINDS)
 
 

@@ -9,8 +9,8 @@
 ...     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=50))
 ...     state, _ = mst.step(state, loop.play(push or pushes[0]))
 
-A policy chooses one of the candidate pushes by clips and beliefs. The ground truth is used for scores only. The scene
-and the candidate pushes depend on the family, the seed and the earlier pushes.
+A policy chooses one of the candidate pushes, using only clips and beliefs. The ground truth is for scores only. The
+scene and the candidate pushes depend on the family, the seed and the earlier pushes.
 """
 
 from __future__ import annotations
@@ -95,7 +95,8 @@ class PushLoop:
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
         """`n` random pushes towards objects. Each push starts at a free position. The scene does not change.
 
-        Pushes are drawn towards true objects, so most pushes move an object. Others miss all objects or drop one.
+        Pushes are drawn towards true objects, so most pushes move an object. Some pushes miss all objects or drop an
+        object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)

@@ -69,7 +69,7 @@ def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
 def texture_coordinates(
     shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (n,) of the texture images of surface points, and texture coordinates (n, 2) in these images.
+    """Texture image number (n,) and texture coordinates (n, 2) of surface points.
 
     `points`, in metres, and outward unit `normals` (n, 3) are in body axes. `plain` (n,) bool marks points without
     texture. Texture coordinates are 0 .. 1 from the upper left corner.

@@ -13,8 +13,8 @@ pieces with torsional and rolling friction. The finger is a capsule on three sli
 arm above the finger is visible but has no contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates dozens of candidate pushes from one state. The first push that moves enough objects, and neither topples nor
-drops an object, is taken.
+simulates dozens of candidate pushes from one state, and takes the first push that moves enough objects and neither
+topples nor drops an object.
 """
 
 from __future__ import annotations
@@ -336,7 +336,7 @@ def play_push(world: PhysicsWorld, push: FingerPush, family: SceneFamily) -> Pus
 
 
 def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: SceneFamily) -> PushEffect:
-    """The effect of a push, computed from the poses `before` (n, 4, 4) the push."""
+    """The effect of a push, computed from the poses `before` (n, 4, 4)."""
     after = world.positions()
     trace = np.einsum("nij,nij->n", before[:, :3, :3], world.rotations())
     kept = bool(family.contains_points(after).all())
@@ -380,7 +380,7 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. If no candidate does so, the
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate fails, the
     candidate with the best balance of moved and toppled objects is taken. Candidates that drop an object or leave an
     object in motion are discarded. Raises InputError if no candidate moves any object.
     """
