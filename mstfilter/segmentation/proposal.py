@@ -247,8 +247,9 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from completed segments of a frame, at the pause `birth`.
 
-    Segments get the labels 1, 2, ... in order. A segment without voxels is omitted. `threshold` is the smallest
-    probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
+    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. `threshold` is the
+    smallest probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments
+    contain.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)
