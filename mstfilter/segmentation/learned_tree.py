@@ -278,7 +278,7 @@ class MergedTree(TreeBuilder):
 
     @abstractmethod
     def model(self) -> tuple[Mapping[str, float], str]:
-        """Weights of the features, and key of the model files. Raises InputError if a feature has no weight."""
+        """Weights of the features, and key of the model files. Raises InputError for unknown or missing features."""
 
     @abstractmethod
     def look(self, frame: Frame) -> SeenBorders | None:
