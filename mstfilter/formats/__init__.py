@@ -5,8 +5,8 @@
 >>> save_recording(recording, "recordings/mine")  # doctest: +SKIP
 >>> recording = open_recording("recordings/mine")  # any format  # doctest: +SKIP
 
-A reader is a `RecordingFormat`: a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` divides a
-long video into clips.
+A reader is a `RecordingFormat`: a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` finds the
+pauses at which a long video is divided into clips.
 """
 
 from mstfilter.lazy import attach

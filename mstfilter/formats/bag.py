@@ -2,11 +2,11 @@
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
-A topic must be named only if several topics are suitable. The camera matrix is K of the ``camera_info`` topic of the
-colour topic (P for rectified images). A frame consists of a colour and a depth image with mutually nearest header
-time stamps. The two stamps differ by at most `tolerance_s`. Depth must be registered to colour, with the same size
-and the same ``frame_id``. Transforms (tf) are not read. The camera is assumed not to move, and its pose is computed
-from the table.
+The parameters `colour` and `depth` are needed only if several topics are suitable. The camera matrix is K (P for
+rectified images) in the ``camera_info`` topic that belongs to the colour topic. A frame consists of a colour and a
+depth image with mutually nearest header time stamps. The two time stamps differ by at most `tolerance_s` seconds.
+Depth must be registered to colour, and both images must have the same size and ``frame_id``. Transforms (tf) are not
+read. The camera is assumed not to move, and its pose is computed from the table.
 
 Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
 encoding 32FC1 is in metres. Compressed depth is a PNG, or a header of 12 bytes (quantisation A, B of 32FC1) and a PNG
@@ -71,7 +71,7 @@ class BagFile:
         self.is_ros2: bool = self._reader.is2
 
     def topics(self, *kinds: str) -> dict[str, int]:
-        """Number of messages of each topic with one of the message types. Topics without messages are omitted."""
+        """Number of messages of each topic with a message type in `kinds`. Topics without messages are omitted."""
         counts: Counter[str] = Counter()
         for connection in self._reader.connections:
             if connection.msgtype in kinds:
@@ -114,7 +114,7 @@ class BagFile:
         return entries
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """The message of an entry."""
+        """The message to which an `Entry` refers."""
         for k, (_, message) in enumerate(self._messages(topic, entry.logged, entry.logged + 1)):
             if k == entry.ordinal:
                 return message
@@ -242,7 +242,7 @@ class _Stream:
 
     @property
     def info(self) -> str:
-        """The name of the CameraInfo topic by the convention of image_transport."""
+        """The name of the CameraInfo topic of the images, by the convention of image_transport."""
         parts = self.name.split("/")
         if parts[-1] in ("compressed", "compressedDepth"):
             parts = parts[:-1]
@@ -253,7 +253,7 @@ class _Stream:
 class Bag(VideoFormat):
     """Reader of ROS 1 bags, ROS 2 bags and MCAP: image, compressed image, depth and CameraInfo topics.
 
-    Further parameters: `VideoFormat`. `K` replaces the CameraInfo.
+    Further parameters: `VideoFormat`. The parameter `K` replaces the camera matrix of the CameraInfo messages.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:
 
 
 def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams: list[_Stream]) -> _Stream:
-    """The stream of a name, or the only candidate."""
+    """The stream of the topic `name`, or the only candidate if `name` is empty."""
     listed = [f"  {s}" for s in sorted(streams, key=lambda s: s.name)]
     if name:
         chosen = next((s for s in streams if s.name == name), None)

@@ -86,9 +86,9 @@ class _Workspace(BaseModel):
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or must be empty. No other process may write the folder. The camera can have a
-    pose, and `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Keyword
-    arguments are other entries of manifest.json, such as generator and seed.
+    The new folder must not exist, or must be empty. No other process may write the folder. The pose of the camera is
+    optional. `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further keyword
+    arguments, such as generator and seed, are stored in manifest.json.
     """
 
     def __init__(
@@ -129,8 +129,8 @@ class RecordingWriter:
 
         `rgb` is (H, W, 3) uint8. `depth` is (H, W) float in metres, with NaN for no reading. `time_s` is in seconds.
         The role is "static" at a pause and "action" at other frames. `instance` (H, W) uint8 or uint16 has the true
-        object number of each pixel. `robot_mask` (H, W) bool marks the robot. `poses` has the true 4x4 T_world_object
-        by object number. Keyword arguments are other entries of the frame in the manifest.
+        object number of each pixel. `robot_mask` (H, W) bool marks the robot. `poses` maps object numbers to the true
+        4x4 T_world_object. Further keyword arguments are stored in the entry of the frame in manifest.json.
         """
         index = len(self._frames)
         units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
@@ -214,7 +214,7 @@ def save_recording(
     """Write a recording as a new recording folder. If the camera moves, every frame stores its pose.
 
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
-    and the number of all frames. Keyword arguments are other entries of manifest.json, such as the generator.
+    and the number of all frames. Further keyword arguments, such as the generator, are stored in manifest.json.
     """
     report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
@@ -313,10 +313,10 @@ def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
 
 @dataclass(frozen=True)
 class RecordingFolder(RecordingFormat):
-    """The recording folder of mstfilter: manifest.json, camera.json, rgb/, depth/.
+    """Reader of the recording folder of mstfilter (manifest.json, camera.json, rgb/, depth/).
 
-    Images and true poses are read on access. All other files are checked when the folder is opened. A rule `pauses`
-    replaces the pauses in the manifest. True volumes are known only at the pauses in the manifest.
+    Images and true poses are read on access. All other files are checked when the folder is opened. If `pauses` is a
+    rule, the rule replaces the pauses in manifest.json. True volumes are known only at the pauses in manifest.json.
     """
 
     pauses: PauseRule | None = None
@@ -396,7 +396,7 @@ class RecordingFolder(RecordingFormat):
 
 
 def _read_poses(path: Path) -> Any:
-    """The function `Recording.poses`. The first call reads the file."""
+    """Make the function `Recording.poses`. The first call of the function reads the file."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:

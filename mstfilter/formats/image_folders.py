@@ -33,8 +33,8 @@ class PairedImages(RecordingFormat):
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
     depth images. The format has no pose: the support plane defines the world axes. Label images NAME_label.png (8 or
-    16 bits, one number for each object) become the true instances. Label 0 and labels with most of their readings on
-    the support plane are no objects.
+    16 bits, one number for each object) are used as the true label images. Label 0, and labels with most of their
+    depth readings on the support plane, are background.
 
     Parameters
     ----------
@@ -103,9 +103,9 @@ class Redwood(VideoFormat):
 
     Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
-    Open3D's ``intrinsic_matrix``, column by column. Images are paired by the last number in their names, or by time
-    if the numbers are time stamps. Depth is PNG or TIFF of 16 bits, or float in metres (.npy, .tif). The camera does
-    not move. The format of Redwood is described at http://redwood-data.org/indoor/fileformat.html.
+    Open3D's ``intrinsic_matrix`` in column-major order. Colour and depth images are paired by the last number in
+    their names, or by time if the numbers are time stamps. Depth files are 16-bit PNG or TIFF, or floating-point in
+    metres (.npy, .tif). The camera must not move. Format: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
@@ -114,7 +114,7 @@ class Redwood(VideoFormat):
     depth_scale : float
         Metres per unit of integer depth. The default is the scale in the file of intrinsics, else 0.001.
     fps : float
-        Frames per second, if names are no time stamps. The default is the rate in the file of intrinsics, else 30.
+        Frames per second, used if names are not time stamps. The default is the rate in the intrinsics file, else 30.
     """
 
     depth_scale: float = 0.0
@@ -128,10 +128,10 @@ class Redwood(VideoFormat):
         return any((path / name).is_dir() for name in folders)
 
     def arriving(self, path: Path, idle_s: float = 10.0) -> Iterator[tuple[float, Frame]]:
-        """Yield time in seconds and frame, without a pose, of each image pair that a recorder adds to a folder.
+        """Yield the time in seconds and the frame (without a pose) of each image pair that is added to a folder.
 
         A pair is read when a later pair exists, or when the files of the pair no longer change. A colour image
-        without a depth image of the same number is left out. The iteration ends after `idle_s` seconds without a
+        without a depth image of the same number is skipped. The iteration ends after `idle_s` seconds without a new
         pair.
         """
         known: set[str] = set()  # names of the images that were read
@@ -159,12 +159,12 @@ class Redwood(VideoFormat):
         return self._video(path, *self._files(path))
 
     def _files(self, path: Path, known: Collection[str] = ()) -> tuple[list[Path], list[Path]]:
-        """Colour and depth images, except those with known names."""
+        """Files of colour images and of depth images, except files with names in `known`."""
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
         return _images(folder, _SUFFIXES, known), _images(path / "depth", _DEPTH_SUFFIXES, known)
 
     def _rate(self, file: Path | None, stored: dict[str, Any]) -> float:
-        """Frames per second."""
+        """Frame rate in frames per second."""
         return self.fps or _stored(file, stored, "fps", 30)
 
     def _video(self, path: Path, colour: list[Path], depth: list[Path]) -> Video:
@@ -199,7 +199,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()) -> list[Path]:
-    """Images of a folder without those with known names, ordered by the numbers in their names."""
+    """Image files of a folder, except names in `known`, ordered by the numbers in the names."""
     if not folder.is_dir():
         raise InputError(f"not a folder of colour and depth images: {folder} is missing", "it holds rgb/ and depth/")
     new = [folder / name for name in set(os.listdir(folder)).difference(known)]
@@ -215,7 +215,7 @@ def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()
 
 
 def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Path]]) -> list[tuple[Path, Path]]:
-    """The pairs of images of one number that are completely written, and later than the pair `after`."""
+    """Pairs of images with the same number that are completely written and later than the pair `after`."""
     last = _number(after[0][0]) if after else Decimal(-2)
     of_number = {_number(file): file for file in depth}
     pairs = [(file, of_number[n]) for file in colour if (n := _number(file)) in of_number and n > last]
@@ -235,7 +235,7 @@ def _number(file: Path) -> Decimal:
 def _paired(
     path: Path, colour: list[Path], depth: list[Path], tolerance_s: float
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
-    """Pairs of files, and the times of the pairs in seconds. If names are frame numbers, the times are empty."""
+    """Pairs of files, and the times of the pairs in seconds. If names are frame numbers, no times are returned."""
     numbers = [[_number(file) for file in files] for files in (colour, depth)]
     seconds = [[_seconds(number) for number in side] for side in numbers]
     if all(value is not None for side in seconds for value in side):
@@ -265,7 +265,7 @@ def _seconds(number: Decimal) -> Decimal | None:
 
 
 def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
-    """The file of intrinsics and its entries."""
+    """Path of the intrinsics file, and the entries in the file."""
     file = next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
     if file is None:
         return None, {}
@@ -278,14 +278,14 @@ def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
-    """A number of at least 1 from the file of intrinsics."""
+    """The number `name` in the intrinsics file (at least 1), or `default`."""
     value = stored.get(name, default)
     check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
 
 
 def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tuple[float, ...]:
-    """fx, fy, cx, cy of the file of intrinsics."""
+    """Intrinsics fx, fy, cx, cy from the intrinsics file."""
     if file is None:
         raise InputError(
             f"{path}: intrinsics are missing, there is no {' or '.join(_INTRINSICS)}",
@@ -303,7 +303,7 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
 
 
 def _four(K: Any) -> tuple[float, ...]:
-    """fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
+    """Intrinsics fx, fy, cx, cy from four numbers, or from the nine numbers of a 3 x 3 matrix."""
     values = np.asarray(K, dtype=float)
     if values.size == 4:
         return tuple(values.ravel().tolist())
@@ -317,7 +317,7 @@ def _four(K: Any) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Tum(VideoFormat):
-    """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. K must be given.
+    """TUM RGB-D: rgb.txt, depth.txt, and groundtruth.txt if the camera moves. The parameter `K` is required.
 
     Lines of rgb.txt and depth.txt are ``timestamp filename``. Lines of groundtruth.txt are ``timestamp tx ty tz qx qy
     qz qw``. Depth is in units of 1/5000 m. The format is described by Sturm et al. (2012).
@@ -379,7 +379,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 
 
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
-    """Camera poses at given times, taken from the nearest lines."""
+    """Camera poses at given times. Each pose is from the line with the nearest time stamp."""
     try:
         rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
         if not np.isfinite(rows).all():

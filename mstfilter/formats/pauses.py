@@ -24,7 +24,7 @@ from mstfilter.scene import PauseRule, grey_blocks
 
 @dataclass(frozen=True)
 class Ends(PauseRule):
-    """The first and the last frame are the pauses, so there is one clip."""
+    """The first and the last frame are the pauses, with one clip between the two pauses."""
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         return tuple(sorted({0, len(times) - 1}))
@@ -42,7 +42,7 @@ class EveryNth(PauseRule):
 
 @dataclass(frozen=True)
 class At(PauseRule):
-    """The pauses are given by frame index (negative from the end) or in seconds since the first frame."""
+    """Pauses at given frame indices (negative: from the end) or at given times in seconds since the first frame."""
 
     frames: tuple[int, ...] = ()
     seconds: tuple[float, ...] = ()
@@ -74,7 +74,7 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 
 
 def pauses_from_text(text: str) -> dict[str, Any]:
-    """The configuration of a rule from the text of a user: numbers, or the name of a rule."""
+    """The configuration of a pause rule from a text with numbers or the name of the rule."""
     words = text.replace(",", " ").split()
     if words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words):
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
@@ -86,7 +86,7 @@ _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if 
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(...) absolute change of each block from a to b, minus the median change."""
+    """(...) absolute value of the change of each block from `a` to `b` minus the median change."""
     difference = b - a
     return np.abs(difference - np.median(difference))
 
@@ -96,20 +96,20 @@ class Still(PauseRule):
     """Middle frames of the intervals in which the image does not change, for a camera that does not move.
 
     Images are reduced to blocks of grey levels. Two images differ if more than 0.1 % of the blocks change by more
-    than their noise. A still interval is a run of frames that do not differ from its first frame, so slow motion also
-    ends an interval. Each interval of at least `hold_s` seconds gives one pause at its middle frame. Changes that all
-    blocks share (exposure, flicker) are ignored. The noise of each block is measured in the video, so the scene must
-    be at rest for a quarter of the video.
+    than the noise of the block. A still interval is a sequence of frames that do not differ from the first frame of
+    the sequence, so slow motion also ends an interval. Each interval of at least `hold_s` seconds gives one pause at
+    its middle frame. Changes that all blocks share (exposure, flicker) are ignored. The noise of each block is
+    measured in the video, so the scene must be at rest for a quarter of the video.
 
-    An interval in which a robot waits in the image, or changes it by less than a grey level, also gives a pause.
-    Check the pauses, and replace wrong pauses by explicit pauses.
+    An interval also gives a pause if a robot waits in the image, or moves and changes the image by less than a grey
+    level. Check the pauses, and replace wrong pauses by explicit frame numbers.
 
     Parameters
     ----------
     hold_s : float
-        Shortest interval, in seconds.
+        Length in seconds of the shortest still interval that gives a pause.
     levels : float
-        Smallest change of the grey level (of 255) at which a block differs, and at least six times the block's noise.
+        A block differs if its grey level (0 to 255) changes by more than `levels` and by more than 6 times the noise.
     region : tuple of 4 float
         Part of the image that is used: left, top, right, bottom as shares of width and height. The selected part can
         exclude people behind the table.
@@ -157,13 +157,13 @@ class Still(PauseRule):
         return tuple((a, b) for a, b in runs if b > a and times[b] - times[a] >= self.hold_s - 1e-9)
 
     def _part(self, blocks: np.ndarray) -> np.ndarray:
-        """The blocks (h, w) of the region."""
+        """The blocks (h, w) inside `region`."""
         h, w = blocks.shape
         left, top, right, bottom = self.region
         return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
 
     def _limit(self, changes: np.ndarray) -> np.ndarray:
-        """Change (h, w) in grey levels at which a block differs, a multiple of its noise at rest.
+        """Change (h, w) in grey levels at which a block differs: a multiple of the noise of the block at rest.
 
         `changes` (n, h, w) are the changes between consecutive images.
         """
@@ -178,9 +178,9 @@ class Still(PauseRule):
 class Settled(Still):
     """The frames at which the image has been still for `hold_s` seconds, found while the frames arrive.
 
-    The parameters are the same as in `Still`. Each pause is the frame at which a still interval becomes `hold_s`
-    long. The noise is measured in the last hundred frames. A pause depends on earlier frames only, so a stream and
-    its recording have the same pauses.
+    The parameters are the same as in `Still`. Each pause is the frame at which a still interval reaches a length of
+    `hold_s` seconds. The noise is measured in the last hundred frames. A pause depends on earlier frames only, so a
+    stream and its recording have the same pauses.
     """
 
     def watch(self) -> Callable[[float, np.ndarray], bool]:

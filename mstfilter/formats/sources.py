@@ -4,9 +4,9 @@
 >>> open_recording("session.mcap")
 >>> open_recording("rgbd_dataset", options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
-Options ``FIELD=VALUE`` set fields of the format (shown by ``mstfilter list format``). Commas separate the values of a
-list. The format ``./file.py:Class`` is a reader of the user. Each other format is a class of `mstfilter.formats`. A
-rule of ``formats/pauses.py`` finds the pauses.
+Options ``FIELD=VALUE`` set fields of the format, which ``mstfilter list format`` shows. Commas separate the values of
+a list. The format ``./file.py:Class`` is a class in a file of the user. Each other format is a class of
+`mstfilter.formats`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _REGISTRY = Registry(formats)
 def open_recording(
     path: str | Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
 ) -> Recording:
-    """A recording of any format.
+    """Open a recording of any format.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def open_recording(
 def open_format(
     path: str | Path, format: str = "", options: Sequence[str] = (), pauses: str = "", *, allow_files: bool = True
 ) -> RecordingFormat:
-    """The reader for an existing path. Parameters: `open_recording`."""
+    """The reader for an existing file or folder. Parameters: `open_recording`."""
     path = Path(path)
     fields = format_settings(options)
     if pauses:
@@ -72,7 +72,7 @@ def pause_rule(text: str) -> PauseRule:
 
 
 def detect_format(path: Path) -> str:
-    """The name of the format of a file or folder."""
+    """Detect the format of a file or folder, and return its name."""
     if not path.exists():
         raise InputError(f"recording folder or file does not exist: {path}")
     names = _REGISTRY.known("format")
@@ -101,7 +101,7 @@ def format_settings(options: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_lists(text: str) -> str:
-    """Convert ``K=1,2,3`` to ``K=["1", "2", "3"]``. The type of the field converts words to numbers."""
+    """Convert ``K=1,2,3`` to ``K=["1", "2", "3"]``. The type of the field later converts the texts to numbers."""
     path, equals, value = text.partition("=")
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text

@@ -1,6 +1,6 @@
 """Videos with depth: the interface of all readers, and common functions.
 
-A reader is a subclass of `RecordingFormat`. A reader of videos is a `VideoFormat`, which defines ``video(path)``:
+A reader is a subclass of `RecordingFormat`. A reader of videos is a `VideoFormat` with the method ``video(path)``:
 
 >>> reader = Tum(K=(525, 525, 319.5, 239.5))
 >>> if reader.detects(path):
@@ -13,9 +13,9 @@ checks every frame on access. For arrays in memory use `Recording.from_arrays`.
 >>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
-The default camera pose is computed from the support plane of the first pause. A stored motion of the camera is used
-only relative to the first pause, because the table is seldom at z = 0 in the world of a stored trajectory. A `Camera`
-has no distortion, so distorted images are undistorted on access.
+The default camera pose is computed from the support plane of the first pause. Stored camera poses are used only
+relative to the pose at the first pause, because the table is seldom at z = 0 in the world axes of a stored
+trajectory. A `Camera` has no distortion, so distorted images are undistorted on access.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from mstfilter.scene import (
 
 
 class RecordingFormat(ABC):
-    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses, with fields for data missing in files."""
+    """A layout of RGB-D data on disk. Subclasses are frozen dataclasses, with fields for data that the files lack."""
 
     @classmethod
     @abstractmethod
@@ -61,7 +61,7 @@ class RecordingFormat(ABC):
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
-        """The recording, whose images may be read on access. Raises InputError if the data are not valid."""
+        """The recording, with images in memory or read on access. Raises InputError if the data are not valid."""
 
 
 _NEGLIGIBLE = 0.5  # pixels
@@ -89,7 +89,7 @@ def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarra
 
 
 def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0, smooth: bool = False) -> np.ndarray:
-    """The undistorted image. `smooth` interpolates colours; depth and labels must not be interpolated."""
+    """The undistorted image. If `smooth`, values are interpolated, which is wrong for depth and labels."""
     import cv2
 
     if source is None:
@@ -101,7 +101,7 @@ def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0,
 
 @dataclass(frozen=True)
 class KnownWorld:
-    """Known camera pose and workspace. Empty fields are computed from the first pause."""
+    """Known camera pose and workspace. Empty fields are computed from the frame at the first pause."""
 
     #: tuple of 16 float: pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
     T_world_camera: tuple[float, ...] = ()
@@ -110,7 +110,7 @@ class KnownWorld:
 
     @cached_property
     def pose(self) -> RigidTransform | None:
-        """The given pose, or None without a pose."""
+        """The given camera pose, or None if no pose is given."""
         if not self.T_world_camera:
             return None
         if len(self.T_world_camera) != 16:
@@ -119,7 +119,7 @@ class KnownWorld:
 
     @cached_property
     def grid(self) -> VoxelGrid | None:
-        """The given workspace, or None without a workspace."""
+        """The given workspace, or None if no workspace is given."""
         if not self.workspace:
             return None
         if len(self.workspace) != 6:
@@ -158,7 +158,7 @@ class Video:
         depth_scale: float,
         **more: Any,
     ) -> Video:
-        """A video with a file of colour and a file of depth for each frame."""
+        """A video with one colour file and one depth file for each frame."""
 
         def rgb(index: int) -> np.ndarray:
             return read_rgb(pairs[index][0])
@@ -209,7 +209,7 @@ class Video:
         return stored.limited(self.max_pixels), source, read
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording of the video. Pose and workspace are computed in the call. Images are read on access."""
+        """The recording of the video. Pose and workspace are computed during the call. Images are read on access."""
         camera, source, read = self.frame_reader()
         height, width = self.read_rgb(0).shape[:2]
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
@@ -255,7 +255,7 @@ class Video:
 
 
 def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: float, where: str) -> None:
-    """Raise InputError unless colour and depth (metres, `scale` per stored unit) have the size of the camera."""
+    """Raise InputError unless colour and depth have the size of the camera, and depth is plausible in metres."""
     sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (rgb, depth)]
     if rgb.shape[:2] != depth.shape[:2]:
         raise InputError(
@@ -274,14 +274,14 @@ class VideoFormat(RecordingFormat):
     Parameters
     ----------
     K : tuple of 4 float
-        fx, fy, cx, cy in pixels. By default, K is read from the files.
+        Intrinsics fx, fy, cx, cy in pixels. By default, K is read from the files.
     depth_scale : float
         Metres per unit of 16-bit depth.
     distortion : tuple of float
-        OpenCV's k1, k2, p1, p2, k3 of colour and depth images. The default is the coefficients in the files, else
-        none.
+        OpenCV's distortion coefficients k1, k2, p1, p2, k3 of colour and depth images. By default, the coefficients
+        in the files are used, if any.
     tolerance_s : float
-        Largest difference of the time stamps of a colour and a depth image of one frame.
+        Largest difference in seconds between the time stamps of the colour and the depth image of a frame.
     start_s, stop_s : float
         Part of the video to use, in seconds after its first frame.
     max_pixels : int
@@ -313,7 +313,7 @@ class VideoFormat(RecordingFormat):
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:
-    """Instance image (H, W) uint16 without the object number 255, which is reserved for the robot."""
+    """Instance image (H, W) uint16 in which no object has the number 255, which is reserved for the robot."""
     free = np.setdiff1d(np.arange(256, 65536), labels)[0]
     return np.where(labels == 255, free, labels).astype(np.uint16)
 

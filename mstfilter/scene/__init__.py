@@ -6,7 +6,7 @@
 >>> hypothesis = Hypothesis.from_labels(labels, clip.grid)  # doctest: +SKIP
 >>> project(hypothesis, clip.after.camera)            # label image of the hypothesis  # doctest: +SKIP
 
-Units are metres, radians and seconds; rigid motions are scipy `RigidTransform` objects named ``T_to_from``.
+Units are metres, radians and seconds. A rigid motion is a scipy `RigidTransform`, named ``T_to_from`` after its axes.
 `mstfilter.scene` does not depend on filters or file formats.
 """
 

@@ -24,7 +24,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array. An array with writeable memory is copied, so no other array can change the result."""
+    """A read-only array. Writeable memory is copied, so that no write to another array changes the result."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
@@ -36,10 +36,10 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def component_key(component: object) -> bytes:
-    """Key of a component from its class, its fields with their arrays and, for a class of the user, its file or code.
+    """Hash of the class and the fields of a component, and of the source of a class that a user defines.
 
-    The key also includes the attribute ``bound_key`` of an oracle, which identifies the ground truth of a recording.
-    Torch modules are identified by their weights. Other objects are identified by their pickled content.
+    The hash includes the attribute ``bound_key``, which identifies the ground truth of an oracle. A torch module is
+    hashed by its weights. A field of any other class is hashed by its pickled content.
     """
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
         cls = type(component)
@@ -70,7 +70,7 @@ def _code(cls: type) -> str:
 
 
 def _text(constant: Any) -> str:
-    """Text of a constant of compiled code, or of code without its file name and line numbers."""
+    """Text of compiled code (without file name and line numbers), or of a constant in compiled code."""
     if isinstance(constant, CodeType):
         return repr((constant.co_code, constant.co_names)) + "".join(_text(part) for part in constant.co_consts)
     return repr(sorted(map(repr, constant)) if isinstance(constant, frozenset) else constant)

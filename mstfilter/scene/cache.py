@@ -1,8 +1,8 @@
-"""Cache of intermediate results. The content of the input identifies a result.
+"""Cache of intermediate results. The key of a result is computed from the content of the inputs.
 
-Some results depend only on the data and not on the hypothesis, for example the boundary map of a frame. `memo` stores
-results that do not depend on the hypothesis. All hypotheses of a step share a stored result. A second run on the same
-data in the same process also uses the stored results.
+Some results depend only on the images and not on the hypothesis, for example the boundary map of a frame. `memo`
+computes a result once for all hypotheses of a step. A second run on the same data in the same process also uses the
+stored results.
 
 >>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)
@@ -35,8 +35,8 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    If the total size exceeds `limit_bytes`, the least recently used values are dropped. `forget` drops the values
-    that were not used recently. The counter `hits` counts, by name, the values found in memory or on disk.
+    If the total size exceeds `limit_bytes`, the least recently used values are dropped. The counter `hits` has the
+    number of values found in memory or on disk, by name.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
@@ -51,15 +51,15 @@ class Cache:
         self._disk: DiskCache | None = None
 
     def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
-        """The cached value of ``compute()``. The function `compute` is called only if the value is not in the cache.
+        """The cached value of ``compute()``. `compute` is called only if the value is not cached.
 
         `name` is the name of the computation. `key` contains content keys (`Frame.key`, `Camera.key`,
         `VoxelGrid.key`) and every parameter that affects the value. Name and key together determine the value
-        completely, so `compute` must not draw random numbers. The caller must not change the value.
+        completely, so `compute` must not draw random numbers. The caller must not modify the returned value.
 
-        If `stored_as` is a type, the value is also stored on disk (see `on_disk`). The type is an array, a dataclass
-        with fields that are arrays, strings or None, or a tuple of arrays and dataclasses. Use `stored_as` only if
-        computing the value takes much longer than reading the value.
+        If `stored_as` is a type, the value is also stored on disk (see `on_disk`). Supported types are arrays,
+        dataclasses (with fields that are arrays, strings or None), and tuples of arrays and dataclasses. Use
+        `stored_as` only if computing the value takes much longer than reading the value.
         """
         return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
 
@@ -72,7 +72,7 @@ class Cache:
     ) -> list[_Value]:
         """The values of several keys. One call ``compute(indices)`` computes all missing values.
 
-        If another thread computes a value at the moment, the call waits for this value.
+        If another thread is computing one of the values, `get_many` waits for the other thread.
         """
         found: dict[Hashable, _Value] = {}
         left: dict[Hashable, int] = {}
@@ -110,7 +110,7 @@ class Cache:
         compute: Callable[[Sequence[int]], Sequence[_Value]],
         stored_as: Any,
     ) -> dict[Hashable, _Value]:
-        """The values of keys that are not in memory, from the disk or computed."""
+        """The values of keys that are not in memory, read from the disk or computed."""
         disk = self._disk if stored_as is not None else None
         found = {} if disk is None else {key: disk.find(name, key, stored_as) for key in missing}
         found = {key: value for key, value in found.items() if value is not None}
@@ -147,7 +147,7 @@ class Cache:
         return self._n_bytes
 
     def forget(self) -> None:
-        """Drop the values that were not used since the second last call of `forget`.
+        """Drop the values that have not been used since the second last call of `forget`.
 
         A loop over pauses that calls `forget` after each step keeps the values of the last two steps.
         """
@@ -166,9 +166,9 @@ class Cache:
 
     @contextlib.contextmanager
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
-        """Also store the values with `stored_as` on disk, in a folder that several processes can share (`DiskCache`).
+        """Also store values on disk if `stored_as` is given. Several processes can share the folder (`DiskCache`).
 
-        `limit_bytes` is the largest size of the folder. Values of another `version` of the code are not used.
+        `limit_bytes` is the largest size of the folder. Values stored by another `version` of the code are not used.
         """
         from mstfilter.scene.disk_cache import DiskCache
 
@@ -184,7 +184,7 @@ scene_cache = Cache()  #: The cache of this process
 
 
 def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
-    """The value of ``compute()``, computed if `scene_cache` has no value for the key. See `Cache.get`."""
+    """The value of ``compute()`` from `scene_cache`. A missing value is computed and stored. See `Cache.get`."""
     return scene_cache.get(name, key, compute, stored_as)
 
 

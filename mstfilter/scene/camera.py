@@ -6,7 +6,7 @@
 >>> camera.project(np.array([0.0, 0.0, 1.0]))[0]
 array([319.5, 239.5])
 
-Camera axes follow OpenCV: x points right, y down, z forward. A pixel is (u, v) = (column, row). The centre of the
+Camera axes follow OpenCV: x points right, y down, and z forward. A pixel is (u, v) = (column, row). The centre of the
 first pixel is (0, 0). Without a pose (`T_world_camera=None`), the world axes are the camera axes.
 """
 
@@ -154,9 +154,9 @@ class Camera:
         return np.stack([u, v], axis=-1), z
 
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Column, row and z-depth (...) of world points (..., 3), and whether each pixel is in the image.
+        """Column, row and z-depth (...) of world points (..., 3), and whether each point projects into the image.
 
-        Column and row are int64, and 0 for points outside the image.
+        Column and row are int64. Points that project outside the image have column 0 and row 0.
         """
         uv, z = self.project(points)
         pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
@@ -165,7 +165,7 @@ class Camera:
         return u, v, z, inside
 
     def scaled(self, factor: float) -> Camera:
-        """The camera of the image resized by `factor`. The outer corner (-0.5, -0.5) of the first pixel is fixed."""
+        """The camera for images resized by `factor`. The corner (-0.5, -0.5) of the first pixel does not move."""
         width, height = round(self.width * factor), round(self.height * factor)
         K = self.K.copy()
         K[:2, :2] *= factor

@@ -3,8 +3,8 @@
 >>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
 ...     run()                                    # values with `stored_as` are stored, and found again
 
-The argument `stored_as` of `mstfilter.scene.memo` selects the stored values. The library diskcache stores the entries
-and removes the least recently used entries beyond the limit. Entries are .npz files and are not unpickled.
+Only values with the argument `stored_as` of `memo` are stored on disk. The library diskcache stores the entries and
+removes the least recently used entries beyond the limit. Entries are .npz files without pickled objects.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FILE = re.compile(r"[0-9a-f]{2}/[0-9a-f]{2}/[0-9a-f]{28}\.val".replace("/", re.
 
 
 class _BytesDisk(diskcache.Disk):
-    """Storage of values and keys that are bytes. The base class `diskcache.Disk` would unpickle stored values."""
+    """Stores keys and values as bytes. The base class `diskcache.Disk` would unpickle values, which can run code."""
 
     def put(self, key: bytes) -> tuple[Any, bool]:
         return sqlite3.Binary(key), True
@@ -59,14 +59,14 @@ class _BytesDisk(diskcache.Disk):
             super().remove(file_path)
 
     def _check_file(self, name: Any) -> None:
-        """Raise ValueError unless a file name from the data base has diskcache's form and is in the folder."""
+        """Raise ValueError if a file name in the database is not in diskcache's format or leads out of the folder."""
         inside = Path(self._directory).resolve() / str(name)
         if not _FILE.fullmatch(str(name)) or inside.parent.resolve() != inside.parent:
             raise ValueError(f"entry has the file {name!r}")
 
 
 class DiskCache:
-    """Values in a folder. The folder is created if necessary. `version` is part of the key of every entry.
+    """Values in a folder, which is created if necessary. `version` is part of the key of every entry.
 
     Several processes may use the folder at the same time. An entry that cannot be read is treated as missing. Nothing
     is stored, and no error is raised, if the folder cannot be written, the disk is full, or another process locks the
@@ -101,7 +101,7 @@ class DiskCache:
             self._entries = None
 
     def _can_lock(self) -> bool:
-        """Whether the data base can be written now. The library diskcache would wait a minute for a lock."""
+        """Whether the database can be written now. Without this test, diskcache would wait a minute for a lock."""
         with contextlib.closing(sqlite3.connect(self.folder / "cache.db", timeout=_LOCK_S)) as probe:
             try:
                 probe.execute("BEGIN IMMEDIATE")
@@ -137,7 +137,7 @@ class DiskCache:
             return None
 
     def store(self, name: str, key: Hashable, value: Any) -> None:
-        """Write an entry. Errors of the folder or the disk are ignored."""
+        """Write an entry. Errors of the folder or the disk are not raised."""
         if self._entries is None:
             return
         data = io.BytesIO()
@@ -161,7 +161,7 @@ class DiskCache:
 
 
 def _pack(value: Any, path: str) -> dict[str, np.ndarray]:
-    """Arrays of a value by path inside the value. The path ``0.labels`` is field `labels` of tuple item 0."""
+    """The arrays in a value, by their paths. The path ``0.labels`` means the field `labels` of item 0 of a tuple."""
     if value is None:
         return {}
     if isinstance(value, np.ndarray):

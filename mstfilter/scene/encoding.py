@@ -16,17 +16,17 @@ from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, O
 
 
 def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]:
-    """Convert hypotheses on one grid to named arrays.
+    """Convert hypotheses with the same grid to a dictionary of named arrays.
 
     The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and arrays with one row per
     object: ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``.
     The field `source` of the objects is stored as ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and
-    ``source_bits``. The array ``source_bits`` has the packed bits of all crops in order.
+    ``source_bits``. The array ``source_bits`` concatenates the packed bits of all `Crop` objects.
 
-    For a hypothesis with probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
-    ``source_probability`` has the probabilities of all crops in order. Each view of an object has a row in
-    ``view_of`` (the row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4), ``view_key``.
-    ``view_bits`` and ``view_signed`` have the values of all views in order.
+    If a hypothesis has probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
+    ``source_probability`` concatenates the probabilities of all `Crop` objects. Each `ObjectView` has a row in
+    ``view_of`` (row of the viewed object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4),
+    ``view_key``. ``view_bits`` and ``view_signed`` concatenate the arrays of all `ObjectView` objects.
     """
     grid = hypotheses[0].grid
     if any(h.grid != grid for h in hypotheses):
@@ -134,7 +134,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
 
 
 def _decode_views(arrays: Mapping[str, np.ndarray]) -> dict[int, list[ObjectView]]:
-    """The views of each object, by the row of the object."""
+    """Map the row of each object in the arrays to the views of the object."""
     found: dict[int, list[ObjectView]] = {}
     if "view_of" in arrays:
         bits, signed = _Reader(arrays["view_bits"]), _Reader(arrays["view_signed"])

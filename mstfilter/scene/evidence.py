@@ -6,8 +6,7 @@
 
 Free-space projection is the first step of the measurement update (paper, section IV-D). The quality of a prediction
 is Q = 1 - (cleared voxels) / (occupied voxels). An update adds lambda log Q to the log weight of the prediction. The
-factor lambda is the parameter `quality_exponent` of the update. A prediction with objects in free space loses voxels
-and weight.
+factor lambda is the parameter `quality_exponent` of the update.
 """
 
 from __future__ import annotations
@@ -54,23 +53,23 @@ def _check_refined(self: Projection, found: Any, hypotheses: Sequence[Hypothesis
 
 
 class Projection(Checked, ABC):
-    """Projects a hypothesis onto the set of hypotheses that agree with a frame."""
+    """Base class of components that change a hypothesis so that the hypothesis agrees with a frame."""
 
     @returns(_check_projected)
     @abstractmethod
     def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
-        """The nearest hypothesis that agrees with a frame, and the share of kept voxels, in [0, 1]."""
+        """The nearest hypothesis that agrees with a frame, and the share of kept voxels (0 to 1)."""
 
     @returns(_check_refined)
     def refine(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-        """Project hypotheses onto the last frame of a clip. Returns hypotheses and the shares (n,) of kept voxels."""
+        """Project hypotheses for the last frame of a clip. Returns hypotheses, and shares (n,) of kept voxels."""
         pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
 
 @dataclass(frozen=True)
 class NoFreeSpace(Projection):
-    """Leaves every hypothesis unchanged, with quality 1."""
+    """Returns every hypothesis unchanged, with the share 1 of kept voxels."""
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
         return hypothesis, 1.0
@@ -80,13 +79,13 @@ class NoFreeSpace(Projection):
 class FreeSpace(Projection):
     """Clears voxels that the depth image observes as free.
 
-    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The first
-    margin accounts for the size of the voxel. The second margin accounts for the sensor noise at the range of the
-    surface (`mstfilter.scene.depth_sigma`). Voxels without a measurement (no reading, the robot, outside the image,
-    behind a surface) are unknown and are kept. A voxel that contains a measured point is kept.
+    A voxel is free if its centre lies in front of the measured surface by more than the sum of two margins. The
+    margins account for the size of the voxel and the sensor noise (`mstfilter.scene.depth_sigma`). Voxels that are
+    not observed (no depth reading, robot pixel, outside the image, behind a surface) are kept. A voxel that contains
+    a measured point is kept.
 
-    With several cameras (`Frame.views`), a voxel is free if at least one camera observes it as free and no camera has
-    a measured point in it.
+    With several cameras (`Frame.views`), a voxel is free if at least one camera observes the voxel as free and no
+    camera measures a point in the voxel.
 
     Parameters
     ----------
@@ -124,7 +123,7 @@ class FreeSpace(Projection):
         return free
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
-        """Clear the voxels that the frame observes as free. A hypothesis without voxels has quality 1."""
+        """Clear the voxels that the frame observes as free. Without occupied voxels, the returned share is 1."""
         free = self.known_free(frame, hypothesis.grid)
         occupied = hypothesis.labels != 0
         possible = occupied if hypothesis.occupancy is None else hypothesis.occupancy.probability > 0
@@ -135,7 +134,7 @@ class FreeSpace(Projection):
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:
-    """log max(Q, 1e-3) (n,) of qualities Q (n,). The bound 1e-3 keeps all weights positive."""
+    """log max(Q, 1e-3), shape (n,), for shares Q (n,) of kept voxels. The bound 1e-3 keeps all weights positive."""
     return np.log(np.maximum(quality, _SMALLEST_QUALITY))
 
 
@@ -145,18 +144,19 @@ _LEAST_PIXELS = 30  # in an image of 640 x 480 pixels: an object with fewer of t
 def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray, float]:
     """Shares of the visible surface that a frame confirms, for each object and for all objects together.
 
-    The test renders the hypothesis and uses the pixels inside the outlines of objects. Pixels without a reading are
-    not used. A pixel with a reading in front of the surface is not used, because another object may hide the surface.
-    At each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is not far
-    behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth noise.
+    The test renders the hypothesis and uses the pixels inside the outlines of objects. Pixels without a depth reading
+    are not used. A pixel with a reading in front of the surface is not used, because another object may hide the
+    surface. At each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is
+    not far behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth
+    noise.
 
     Returns
     -------
     of_objects : (k,) ndarray
-        Share of each label. The share is NaN for label 0, for objects with few used pixels, and for objects with more
-        pixels without a reading.
+        Share of confirmed pixels for each label. The share is NaN for label 0, for objects with few used pixels, and
+        for objects with fewer used pixels than pixels without a reading.
     of_scene : float
-        Share of all objects together. The share is 1 if no pixel can be used.
+        Share of confirmed pixels for all objects. The share is 1 if no pixel can be used.
     """
     rendered, shown = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid).pixels
     would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])
@@ -178,7 +178,7 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
 
 
 def _interior(rendered: Rendering, size: float) -> np.ndarray:
-    """Pixels (H, W) bool at least half a voxel inside an outline. The edge of a voxel has `size` / depth pixels."""
+    """Pixels (H, W) bool at least half a voxel inside object outlines. A voxel edge is `size` / depth pixels long."""
     shown = rendered.labels > 0
     if not shown.any():
         return shown
@@ -189,10 +189,10 @@ def _interior(rendered: Rendering, size: float) -> np.ndarray:
 class Evidence(Checked, ABC):
     """A term in the score of candidate hypotheses.
 
-    The documentation of each term states the data that the term uses, so that users see which data count twice.
+    The documentation of each term lists the data that the term uses, so that users see whether terms share data.
     """
 
     @returns(lambda self, found, hypotheses, clip: check_array(found, (len(hypotheses),)).astype(np.float64))
     @abstractmethod
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
-        """Finite log scores (n,), in nats and up to a common constant, of hypotheses about the end of a clip."""
+        """Finite log scores (n,), in nats and up to a common constant, of hypotheses at the end of a clip."""

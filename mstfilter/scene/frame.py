@@ -40,7 +40,7 @@ def depth_sigma(z: ArrayLike) -> np.ndarray:
 
     The sensor measures disparity, so the standard deviation grows with the square of depth: sigma = 0.00185 m (z /
     m)^2. The factor 0.00185 m was fitted to image patches of tables in 45 Kinect v1 and Xtion frames (0.6 to 1.5 m).
-    Up to 1.2 m, the formula is within 10 % of the measured values.
+    Up to a depth of 1.2 m, the formula is within 10 % of the measured values.
     """
     z = np.asarray(z)
     return _SIGMA_AT_ONE_METRE * z * z
@@ -96,7 +96,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the first frame header. Raises struct.error if the data have no frame header."""
+    """Width and height in the first frame header of a JPEG file. Raises struct.error if no header is found."""
     at = 2
     while True:
         mark, kind, length = struct.unpack_from(">BBH", data, at)
@@ -112,7 +112,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
-    """Width and height in the first directory. Raises struct.error if the directory is not complete."""
+    """Width and height in the first directory of a TIFF file. Raises struct.error for an incomplete directory."""
     (at,) = struct.unpack_from(f"{order}I", data, 4)
     (n,) = struct.unpack_from(f"{order}H", data, at)
     found = {}
@@ -131,9 +131,9 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN where the file has 0.
+    """Depth image (H, W) float32 in metres. Pixels with the value 0 in the file become NaN.
 
-    Integers of 16 bits are multiplied by `scale`, in metres per unit. Floats (.npy, .tif) are in metres.
+    16-bit integers are multiplied by `scale` (metres per unit). Floating-point values (.npy, .tif) must be in metres.
     """
     import cv2
 
@@ -166,7 +166,7 @@ def read_labels(path: Path) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write a PNG: (H, W, 3) uint8 RGB, or (H, W) uint8 / uint16."""
+    """Write an image (H, W, 3) uint8 RGB, or (H, W) uint8 or uint16, as a PNG file."""
     import cv2
 
     data = image[..., ::-1] if image.ndim == 3 else image
@@ -196,13 +196,13 @@ class Frame:
     rgb : (H, W, 3) uint8
         Colour image.
     depth : (H, W) float
-        z-depth in metres. NaN, or any value that is not positive and finite, means no reading.
+        z-depth in metres. A value that is not positive and finite (NaN, 0) means that the pixel has no reading.
     camera : Camera
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
         Pixels that show the robot. The depth at robot pixels is treated as unknown.
     views : tuple of Frame
-        Simultaneous frames, without views, of other cameras. With views, all cameras need a pose in one world.
+        Simultaneous frames of other cameras. With views, all cameras need a pose in the same world axes.
     """
 
     rgb: np.ndarray
@@ -302,19 +302,18 @@ class Frame:
 class Clip:
     """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
 
-    `before` is the frame at the previous pause, and `after` is the frame at the pause that ends the clip. The frames
-    between the two pauses show the action. The first clip of a recording has one frame.
+    The frames between the pauses show the action. The first clip of a recording has one frame.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Frames in time order. The first and the last frame show the scene at rest. A lazy sequence is read on access.
+        Frames in time order. The first and the last frame show the scene at rest. Frames may be read on access.
     grid : VoxelGrid
         The workspace.
     index : int
         Number of the pause at the end of the clip, starting from 0.
     times : tuple of float, optional
-        Seconds, one per frame.
+        Time of each frame in seconds.
     """
 
     frames: Sequence[Frame]

@@ -6,8 +6,8 @@
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
-The noise of disparity does not depend on depth, so the support plane is a least-squares fit of disparity by an affine
-function. Disparity is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
+The noise of disparity does not depend on depth, so the support plane is found by a least-squares fit of an affine
+function to disparity. Disparity is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 
 def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel and z-depth (single and double precision) of every voxel centre, the same for all frames of a camera."""
+    """Pixel of every voxel centre in the images of a camera, and z-depth in single and in double precision."""
     u, v, z, inside = camera.pixels_of(grid.centres())
     pixel = np.where(inside & (z > 1e-6), v * camera.width + u, -1).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
@@ -88,7 +88,7 @@ class SupportPlane:
 
 
 def disparity(depth: np.ndarray) -> np.ndarray:
-    """Disparity (H, W) float64 in 1/8 pixel of a Kinect, from depth in metres. NaN stays NaN."""
+    """Disparity (H, W) float64 in 1/8 pixel of a Kinect, from depth in metres. NaN depth gives NaN disparity."""
     return 8.0 * _FOCAL * BASELINE / np.asarray(depth, dtype=np.float64)
 
 
@@ -99,9 +99,9 @@ _MIN_SHARE = 0.1  # smallest share of inliers among the readings
 
 
 def fit_support_plane(frame: Frame) -> SupportPlane:
-    """Find the plane with the most readings (RANSAC, then least squares). The result is cached.
+    """Find the plane with the most depth readings, by RANSAC and least squares. The result is cached.
 
-    The pose of the frame is not used. RANSAC samples with a constant seed, so the same frame gives the same plane.
+    The pose of the frame is not used. RANSAC uses a constant random seed, so the same frame gives the same plane.
     Raises InputError if there are too few readings or too few inliers.
     """
     return memo("support_plane", frame.key, lambda: _fit(frame))
@@ -147,7 +147,7 @@ def _fit(frame: Frame) -> SupportPlane:
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """Camera pose in a world with z up and the plane at z = 0. The plane has the disparity a u + b v + c."""
+    """Camera pose in world axes with z up and the plane at z = 0. On the plane, disparity is a u + b v + c."""
     scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K
@@ -168,10 +168,10 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
 
 
 def table_residual(frame: Frame) -> np.ndarray:
-    """Measured minus table disparity in 1/8 pixels, (H, W) float32. The result is cached.
+    """Measured disparity minus the disparity of the table, (H, W) float32 in 1/8 pixels. The result is cached.
 
-    The table is the plane z = 0 of the world. Positive values are above the table. NaN means no reading. The value
-    +inf means a reading on a ray that does not meet the table.
+    The table is the plane z = 0 of the world. Positive values mean readings above the table. Pixels without a reading
+    have the value NaN. Readings on rays that do not meet the table have the value +inf.
     """
 
     def compute() -> np.ndarray:
@@ -197,8 +197,8 @@ def workspace(frame: Frame) -> VoxelGrid:
     """A grid with voxels of 1 cm around the visible part of the table. The table is at z = 0.
 
     The grid is .5 m high, and each side is 1 to 2 m long. The grid covers as much of the table as possible. If the
-    table is shorter or longer than the grid along an axis, the grid is shifted towards the readings more than 1 cm
-    above the table. Readings outside the visible table, for example on a wall, are ignored.
+    table is shorter or longer than the grid along an axis, the grid is shifted towards the depth readings that are
+    more than 1 cm above the table. Readings outside the visible table, for example on a wall, are ignored.
     """
     voxel_size, height = 0.01, 50
     points = frame.points[frame.valid]

@@ -1,7 +1,7 @@
 """Partitions of voxels or pixels: renumbered labels, and the common refinement of several partitions.
 
-A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation. The
-number of cells is far smaller than the number of voxels.
+A cell of the common refinement contains voxels (or pixels) that belong to the same object in every segmentation.
+There are far fewer cells than voxels.
 
 >>> both = common_refinement([np.array([0, 1, 1, 2]), np.array([0, 7, 7, 7])])
 >>> both.cells, both.sizes
@@ -47,14 +47,14 @@ class CommonRefinement:
         return int(self.first[-1])
 
     def objects_in(self, cells: np.ndarray) -> np.ndarray:
-        """Whether each object contains at least one of the `cells`, (n_objects + 1,). Label 0 (free) gives False."""
+        """(n_objects + 1,) bool: whether each object contains at least one of the `cells`; False for free space."""
         present = np.zeros(self.n_objects + 1, bool)
         present[self.objects[:, cells]] = True
         present[0] = False
         return present
 
     def overlaps(self) -> np.ndarray:
-        """Number of positions that two objects share, (n_objects + 1, n_objects + 1). Row and column 0 are zero."""
+        """Number of voxels that two objects share, (n_objects + 1, n_objects + 1). Row 0 and column 0 are zero."""
         total = self.n_objects + 1
         shared = np.zeros((total, total))
         sizes = np.broadcast_to(self.sizes, self.objects.shape).ravel()
@@ -66,7 +66,7 @@ class CommonRefinement:
 
 
 def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
-    """The common refinement of n arrays of labels >= 0 of one shape, in which 0 is free."""
+    """The common refinement of n label arrays of the same shape. Labels are at least 0, and label 0 is free space."""
     occupied = np.logical_or.reduce([labels != 0 for labels in segmentations])
     count = int(occupied.sum())
     cell = np.zeros(count, np.int64)

@@ -4,9 +4,9 @@
 ...     print(finding.stop, finding.message, finding.hints)
 
 Some faults of the input give confident wrong hypotheses and no error: wrong units, a camera matrix of another image
-size, a moved camera, or unregistered depth. `examine` tests whether a camera over a table can have taken the frames
-at the pauses. A finding stops the run if the hypotheses cannot be correct. Other findings are warnings. The limits of
-the checks were chosen in ``experiments/plausibility``.
+size, a moved camera, or unregistered depth. `examine` tests whether the frames at the pauses are plausible for a
+camera above a table. A finding stops the run if the hypotheses cannot be correct. Other findings are warnings. The
+limits of the checks were chosen in ``experiments/plausibility``.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
 
     Findings that stop a run come first.
 
-    The frames are read one by one. Only reduced images (160 and 320 columns) and corners are kept in memory.
+    The frames are read one by one. Only reduced images (160 and 320 columns) and image corners are kept in memory.
     """
     found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
     if not any(finding.stop for finding in found):
@@ -89,7 +89,7 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
 
 
 def report_findings(findings: Iterable[Finding], where: str) -> None:
-    """Raise InputError for a finding that stops a run, or warn of each finding. Messages begin with `where`."""
+    """Raise InputError for a finding that stops a run; warn of the other findings. Messages begin with `where`."""
     for finding in findings:
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)
@@ -97,7 +97,7 @@ def report_findings(findings: Iterable[Finding], where: str) -> None:
 
 
 def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[Finding]:
-    """Findings about the hypotheses of a step and the frame at its pause."""
+    """Findings from a comparison of the hypotheses of a step with the frame at the end of the step."""
     grid, points = hypotheses[0].grid, _sampled(frame, 160).points
     raised = grid.contains(grid.index_of(points)) & (points[..., 2] > 2 * _MIN_HEIGHT)
     if raised.mean() > 0.005 and not any(h.n_objects for h in hypotheses):
@@ -113,7 +113,7 @@ def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[F
 
 
 class Look:
-    """Measurements in the frame at a pause, for the checks."""
+    """Measurements in the frame at a pause, which the plausibility checks use."""
 
     def __init__(self, frame: Frame, grid: VoxelGrid, index: int = 0) -> None:
         self.index, self.grid = index, grid
@@ -123,17 +123,17 @@ class Look:
 
     @cached_property
     def on_table(self) -> np.ndarray:
-        """(n,) bool: readings on the table."""
+        """(n,) bool: whether each depth reading is on the table."""
         return np.asarray(np.abs(self.points[:, 2]) < _ON_TABLE)
 
     @cached_property
     def in_columns(self) -> np.ndarray:
-        """(n,) bool: readings inside, above or below the workspace."""
+        """(n,) bool: whether each depth reading is inside, above or below the workspace."""
         return _in_columns(self.grid, self.points)
 
     @cached_property
     def inside(self) -> np.ndarray:
-        """(m, 3) readings inside the workspace."""
+        """World points (m, 3) of the depth readings inside the workspace."""
         return self.points[self.grid.contains(self.grid.index_of(self.points))]
 
     @cached_property
@@ -143,7 +143,7 @@ class Look:
         return float(np.median(depth[self.on_table] if self.on_table.mean() > _MIN_ON_TABLE else depth))
 
     def plane(self, chosen: np.ndarray) -> tuple[float, float, np.ndarray] | None:
-        """Tilt (degrees), height (m) and normal (3,) in camera axes of the plane through the chosen readings (n,)."""
+        """Tilt (degrees), height (m) and normal (3,) in camera axes of a plane fitted to `chosen` readings (n,)."""
         valid = np.zeros_like(self.frame.valid)
         valid[self.frame.valid] = chosen
         depth = np.where(valid, self.frame.depth, np.nan)
@@ -158,7 +158,7 @@ class Look:
 
     @cached_property
     def table(self) -> tuple[float, float] | None:
-        """Tilt (degrees) and height (m) of the table near z = 0; None if there is no plane."""
+        """Tilt (degrees) and height (m) of the plane of the table; None if no plane is found near z = 0."""
         near = np.abs(self.points[:, 2]) < _NEAR_TABLE
         plane = self.plane(near) if near.mean() > 0.03 else None
         return None if plane is None or plane[0] > _OTHER_PLANE else plane[:2]
@@ -177,7 +177,7 @@ def _sampled(frame: Frame, width: int) -> Frame:
 
 
 def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """(...) bool: points (..., 3) with x and y inside the grid."""
+    """(...) bool: whether x and y of points (..., 3) are inside the grid."""
     index = grid.index_of(points)[..., :2]
     return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
 
@@ -186,7 +186,7 @@ _Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
-    """A finding for a value outside the `usual` limits. Outside the `possible` limits, the finding stops the run."""
+    """A finding for a value outside the `usual` limits. A value outside the `possible` limits stops the run."""
     if not usual[0] <= value <= usual[1]:
         yield Finding(not possible[0] <= value <= possible[1], text, hints)
 
@@ -218,7 +218,7 @@ def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
-    """Findings about images without content. `which` names the frame in the messages."""
+    """Findings about images that are constant or fully masked. `which` names the frame in the messages."""
     depth = frame.depth[np.isfinite(frame.depth)]
     masked = 0.0 if frame.robot_mask is None else frame.robot_mask.mean()
     if masked > 0.95 or not frame.valid.any():
@@ -233,7 +233,7 @@ def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
 
 
 def _support(first: Look) -> Iterator[Finding]:
-    """Findings if the pose, intrinsics or support plane contradict the readings at the first pause."""
+    """Findings if the pose, intrinsics or support plane do not agree with the depth readings at the first pause."""
     free, camera, table = first.plane(np.ones(len(first.points), bool)), first.frame.camera, first.table
     hints = (
         f"{_CHECK_POSE}; without a pose it is found from the table",
@@ -257,7 +257,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
     A table is parallel to the floor, and its height above the floor is larger than the height of an object. A table
     is at a right angle to a wall and extends far from the wall. In the image, the normal of a table points up, and
-    the normal of a wall does not point up.
+    the normal of a wall does not.
     """
     raised = first.points[:, 2] > _ON_TABLE
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
@@ -327,7 +327,7 @@ class _Corners:
         self.points, self.camera = points[row, column], frame.camera
 
     def moved(self, other: _Corners) -> tuple[int, int, float]:
-        """Number of corners that agree with both camera poses, number that agree on another pose, and shift (m)."""
+        """Number of corners at rest, number of corners that moved together, and median shift (m) of these corners."""
         import cv2
 
         if self.features is None or other.features is None:
@@ -349,8 +349,8 @@ class _Corners:
 def drift(first: Look, look: Look) -> tuple[float, float, float]:
     """Tilt (degrees), height (m) and shift (m) of the camera relative to its given pose, between two pauses.
 
-    If few depth readings are near z = 0, tilt and height are computed from a plane that is fitted to the table. The
-    shift is measured at corners of the image on the table and outside the workspace.
+    Tilt and height are computed from a plane fitted to the table if few depth readings remain near z = 0, and are 0
+    otherwise. The shift is measured at image corners on the table and outside the workspace.
     """
     tilt = height = shift = 0.0
     left = look.on_table.mean() / max(first.on_table.mean(), 1e-9)
@@ -381,7 +381,7 @@ def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 class _Edges:
-    """Depth edges (H, W) float32, 0 or 1, and the ranks (H, W) of colour gradients, from 0 to 1."""
+    """Image of depth edges (H, W) float32, 0 or 1, and ranks (H, W) of the colour gradients of all pixels, 0 to 1."""
 
     def __init__(self, frame: Frame) -> None:
         import cv2
@@ -401,7 +401,7 @@ class _Edges:
         self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
 
     def under(self, other: _Edges) -> np.ndarray:
-        """Sum of the colour ranks of `other` at the depth edges, for each shift from -16 to 16 pixels, (33, 33)."""
+        """(33, 33): sum of the colour ranks of `other` at the depth edges, for each shift of -16 to 16 pixels."""
         import cv2
 
         inner = slice(_SHIFTS, -_SHIFTS)
@@ -414,9 +414,10 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """Agreement of depth edges and colour edges at all pauses.
 
-    The first value is the best agreement minus the median over shifts. The second value is the relative loss of
-    agreement without a shift. The third value is the best shift (rows, columns) of colour in pixels of 320 columns.
-    The fourth value is the increase of the agreement if depth belongs to other pauses.
+    The first value is the best agreement minus the median over all shifts. The second value is the relative loss of
+    agreement if colour is not shifted. The third value is the best shift (rows, columns) of colour, in pixels of an
+    image with 320 columns. The fourth value is the increase of the agreement if the depth images of pauses are
+    exchanged.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -440,7 +441,7 @@ def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int]
 
 
 def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A finding if depth does not belong to the colour at the same pixel or the same pause."""
+    """A finding if depth edges do not agree with colour edges at the same pixels and the same pause."""
     peak, lost, shift, rise = edge_agreement(looks)
     if peak < _PEAK:
         return
@@ -457,14 +458,14 @@ def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A finding if all pauses show the same image."""
+    """A finding if the images at all pauses are identical."""
     if len(looks) > 1 and len({content_key(look.frame.rgb, look.frame.depth) for look in looks}) == 1:
         text = f"the images of all {len(looks)} pauses are identical, which no camera gives"
         yield _warning(text, "check that every frame is read from its own file")
 
 
 def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
-    """A finding if the scene changes in a video with only one pause. The other images are then not used."""
+    """A finding if the scene changes in a video with only one pause, because the other frames are not used."""
     if len(pauses) > 1 or len(frames) == 1:
         return
     change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))

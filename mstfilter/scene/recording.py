@@ -5,8 +5,7 @@
 >>> for clip in recording.clips():
 ...     clip.before, clip.after                              # Frames, read when they are used
 
-If the camera pose is not given, the support plane at the first pause defines the world axes. The default workspace
-covers the visible table.
+If the camera pose is not given, the support plane at the first pause defines the world axes.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ _LONG = 20  # frames; more are probably not one clip
 
 
 class PauseRule(Bounded, ABC):
-    """Finds the pauses of a video. The module `mstfilter.formats` contains rules."""
+    """Finds the pauses of a video. The package `mstfilter.formats` contains pause rules."""
 
     @abstractmethod
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         """Ascending frame indices of the pauses.
 
-        `times` has the seconds of all frames. ``read_rgb(index)`` is the colour image (H, W, 3) uint8 of a frame.
+        `times` are the times of all frames in seconds. ``read_rgb(index)`` returns a colour image (H, W, 3) uint8.
         """
 
 
@@ -52,7 +51,7 @@ _rule_of_text = late("mstfilter.formats.sources:pause_rule", "The rule of a text
 
 
 class LazyFrames(Sequence[Frame]):
-    """Frames that ``read(index)`` reads on access. The last 40 frames are kept in memory."""
+    """Frames that ``read(index)`` reads on access. The 40 frames used last are kept in memory."""
 
     def __init__(self, read: Callable[[int], Frame], n: int) -> None:
         self._read = lru_cache(maxsize=40)(read)
@@ -80,13 +79,13 @@ class Recording:
     Parameters
     ----------
     frames : sequence of Frame
-        Frames in time order, which may be read on access.
+        Frames in time order, in memory or read on access.
     grid : VoxelGrid
         Workspace.
     pauses : tuple of int
         Indices of the frames at the pauses, ascending.
     times : tuple of float
-        Seconds, one per frame.
+        Time of each frame in seconds.
     name : str
         Name for messages and reports.
     path : Path, optional
@@ -100,7 +99,7 @@ class Recording:
     instance : callable
         ``instance(index)`` returns the true label image (H, W) of a frame, or None if unknown.
     poses : callable
-        ``poses(index)`` returns the true T_world_object (4, 4) of each object in a frame by label, or None.
+        ``poses(index)`` returns the true T_world_object (4, 4) in a frame for each label, or None if unknown.
     """
 
     frames: Sequence[Frame]
@@ -182,7 +181,7 @@ class Recording:
         Raises
         ------
         InputError
-            If the arrays cannot be used, or `examine` finds that hypotheses cannot be correct.
+            If the arrays are invalid, or `examine` finds that no hypothesis can be correct.
         """
         if depth is None:
             raise InputError(
@@ -264,8 +263,8 @@ class Recording:
 
         The first clip has the frame at the first pause. Each other clip has the frames from one pause to the next.
 
-        The first call warns if the input is not plausible. The first call raises InputError if no hypothesis can be
-        correct (`mstfilter.scene.examine`).
+        The first call warns if the input is not plausible, and raises InputError if no hypothesis can be correct
+        (`mstfilter.scene.examine`).
         """
         self._examined  # noqa: B018
         clips = []
@@ -275,11 +274,11 @@ class Recording:
         return tuple(clips)
 
     def in_world_of(self, other: Recording) -> Recording:
-        """This recording with the workspace and the first camera pose of another recording, without true volumes.
+        """A copy with the workspace and the first camera pose of another recording, without true volumes and poses.
 
-        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pauses:
-        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can then
-        update hypotheses of the other recording.
+        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pause of each
+        recording: ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can
+        then update hypotheses of the other recording.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()
@@ -299,7 +298,7 @@ class Recording:
 
     @cached_property
     def _examined(self) -> None:
-        """Warn or raise an error about the frames at the pauses. The checks run once."""
+        """Check the frames at the pauses (`examine`), and warn or raise InputError. The checks run once."""
         report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
@@ -332,7 +331,7 @@ def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
 
 
 def _stacked(images: Any, what: str) -> np.ndarray:
-    """Images as one array. Raises InputError if the images have different shapes."""
+    """Stack images into one array. Raises InputError if the images have different shapes."""
     try:
         return np.asarray(images)
     except ValueError as error:
@@ -358,7 +357,7 @@ def check_depth(depth: np.ndarray, where: str) -> None:
 
 
 def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """Camera with a pose, and workspace. A missing pose or workspace is computed from the `first` frame."""
+    """The camera with a pose, and the workspace. A missing pose or workspace is computed from the `first` frame."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:
@@ -371,7 +370,7 @@ def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]
 def truth_reader(
     labels: np.ndarray, frames: Sequence[int], pauses: tuple[int, ...]
 ) -> Callable[[int], np.ndarray | None]:
-    """The function `Recording.truth` from labels (S, X, Y, Z) at frame indices (S,)."""
+    """Make the function `Recording.truth` from true labels (S, X, Y, Z) at the frame indices `frames` (S,)."""
     row = {int(frame): s for s, frame in enumerate(frames)}
 
     def read(t: int) -> np.ndarray | None:

@@ -26,7 +26,7 @@ _Box = tuple[slice, ...]
 
 
 class Rendering(NamedTuple):
-    """Label image (H, W) uint16, and z-depth (H, W) float32 in metres. Without a hit: label 0, depth NaN."""
+    """Label image (H, W) uint16, and z-depth (H, W) float32 in metres. Pixels without an object have depth NaN."""
 
     labels: np.ndarray
     depth: np.ndarray
@@ -38,7 +38,7 @@ def project(hypothesis: Hypothesis, camera: Camera) -> np.ndarray:
 
 
 def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
-    """Label image and depth of a hypothesis, read-only. The result is cached."""
+    """Read-only label image and depth image of a hypothesis. The result is cached."""
 
     def compute() -> Rendering:
         image = np.zeros((camera.height, camera.width), np.uint16)
@@ -56,9 +56,9 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
 
 
 def _object_depth(mask: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray]:
-    """The image window that can show an object, and the depth (h, w) of the object in the window, inf without a hit.
+    """Image window around an object, and depth image (h, w) of the object in the window. Other pixels have depth inf.
 
-    `mask` (a, b, c) has the voxels of the object in a box of the grid.
+    `mask` (a, b, c) marks the voxels of the object in a box of the grid.
     """
 
     def compute() -> tuple[_Box, np.ndarray]:
@@ -87,7 +87,7 @@ def _cast(labels: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tup
     """Cast rays into a box of the grid. `labels` (a, b, c) are the labels in the box.
 
     Returns the image window that can show the box, and two arrays (h, w): the flat voxel index and the depth
-    (float32) of each pixel. Pixels without a hit have the values -1 and inf.
+    (float32) of each pixel. A pixel with no occupied voxel on its ray has index -1 and depth inf.
     """
     lower = np.array([side.start for side in box])
     # Ray: start + t * direction, in voxels of the box; the directions have z = 1 m, so that t is z-depth in metres.
@@ -105,7 +105,7 @@ def _cast(labels: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tup
 
 
 def _window(shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: Camera) -> tuple[slice, slice]:
-    """Image rows and columns that can show the box, or the whole image if a corner is not in front of the camera."""
+    """Image rows and columns that can show a box, or the whole image if a corner of the box is behind the camera."""
     corners = np.array(np.meshgrid(*[(0, n) for n in shape], indexing="ij")).reshape(3, -1).T
     uv, z = camera.project(grid.origin + (corners + lower) * grid.voxel_size)
     if (z < 1e-3).any():
@@ -119,7 +119,7 @@ def _window(shape: tuple[int, ...], grid: VoxelGrid, lower: np.ndarray, camera: 
 def _traverse(
     box: np.ndarray, start: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Follow rays (n, 3) from `start`. Returns the ray number, flat voxel index and ray parameter t of each hit."""
+    """Follow rays with directions (n, 3). Returns ray number, flat voxel index and ray parameter t of each hit."""
     distance = distance_transform_cdt(box == 0, metric="chessboard").astype(np.int32).ravel()
     shape = np.array(box.shape)
     strides = np.array([shape[1] * shape[2], shape[2], 1])

@@ -4,10 +4,10 @@
 >>> found.pixels                        # (H, W) bool, may belong to an object
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading
 
-Pixels with a reading are classified by depth. A reading on the table never belongs to an object. Single readings
-above the table are noise; regions of readings are objects. Dark and shiny surfaces and glare have no readings. A
-pixel without a reading belongs to an object if its colour differs from the table nearby. The table is z = 0 if the
-camera has a pose, else the plane that contains the most readings.
+Pixels with a depth reading are classified by depth. A reading on the table never belongs to an object. Isolated
+readings above the table are noise; connected regions of readings are objects. Dark or shiny surfaces often have no
+readings. A pixel without a reading belongs to an object if its colour differs from the nearby table. The table is the
+plane z = 0 if the camera has a pose, else the plane with the most depth readings.
 """
 
 from __future__ import annotations
@@ -52,30 +52,29 @@ _STANDS = 0.004  # metres: estimated readings are at least this much nearer than
 
 @dataclass(frozen=True, eq=False)
 class Foreground:
-    """The pixels that can belong to objects, and the frame with their depth."""
+    """The pixels that can belong to objects, and the frame with known or estimated depth at these pixels."""
 
     pixels: np.ndarray  #: (H, W) bool
     frame: Frame  #: the frame, with estimated depth at pixels of objects without a reading
 
 
 def above_table(frame: Frame) -> np.ndarray:
-    """Disparity minus table disparity, (H, W) float32 in sensor units (1/8 px at f = 525 px); NaN without reading.
+    """Disparity minus the disparity of the table, (H, W) float32 in sensor units; NaN at pixels without a reading.
 
-    One sensor unit is 3.2 mm of depth at 1 m. The table is z = 0 if the camera has a pose, else the plane that
-    contains the most readings.
+    One sensor unit is 1/8 px at f = 525 px, or 3.2 mm of depth at 1 m.
     """
     return fit_support_plane(frame).residual if frame.camera.T_world_camera is None else table_residual(frame)
 
 
 def filled_above_table(frame: Frame) -> np.ndarray:
-    """Disparity as in `above_table`. For a sparse sensor, holes have the value of the nearest reading."""
+    """The values of `above_table`. For a sparse sensor, missing pixels take the value of the nearest reading."""
     height = above_table(frame)
     beside = cv2.blur(frame.valid.astype(np.float32), (3, 3))[frame.valid]
     return fill_from_nearest(height, ~frame.valid) if len(beside) and beside.mean() < _DENSE else height
 
 
 def fill_from_nearest(depth: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Depth (H, W) with the pixels of `holes` set to the nearest reading."""
+    """Depth (H, W) in which each pixel of `holes` (H, W) bool has the depth of the nearest reading."""
     if not holes.any() or holes.all():
         return depth
     rows, columns = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
@@ -95,13 +94,13 @@ def pixels_above_table(frame: Frame) -> np.ndarray:
 
 
 def readings_above_table(frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
-    """The `pixels_above_table` with a reading in the grid, (H, W) bool. Without a grid, no pixel is excluded."""
+    """The `pixels_above_table` (H, W) bool with a reading in the grid. Without a grid, no pixel is excluded."""
     pixels = pixels_above_table(frame)
     return pixels if grid is None else pixels & grid.contains(grid.index_of(frame.points))
 
 
 def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
-    """The pixels of objects in the workspace, and their depth. The result is cached.
+    """The pixels of objects in the workspace, and the depth of these pixels. The result is cached.
 
     Parameters
     ----------
@@ -127,7 +126,7 @@ def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
 
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
-    """Pixels (H, W) bool with readings that form a region above the table."""
+    """Pixels (H, W) bool of connected regions of readings above the table."""
     raised = readings_above_table(frame, grid)
     height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
@@ -147,7 +146,7 @@ def _on_table(frame: Frame) -> np.ndarray:
 
 
 def _without_readings(frame: Frame) -> np.ndarray:
-    """Pixels (H, W) bool without a reading that do not show the robot and are not in a shadow of the projector."""
+    """Pixels (H, W) bool that have no reading, do not show the robot, and are not in the shadow of the projector."""
     missing = ~np.isfinite(frame.depth) & ~_shadows(frame)
     return missing if frame.robot_mask is None else missing & ~frame.robot_mask
 
@@ -156,7 +155,7 @@ def _shadows(frame: Frame) -> np.ndarray:
     """Pixels (H, W) bool in the shadow that a nearer surface casts in the light of the projector of the sensor.
 
     A shadow in an image row between depths z1 < z2 is at most f b (1 / z1 - 1 / z2) pixels wide. The symbol f is the
-    focal length, and b is the baseline of a Kinect. The test accepts a projector on either side of the camera.
+    focal length, and b is the baseline of a Kinect. The projector may be on the left or on the right of the camera.
     """
     read = np.isfinite(frame.depth)  # also of the robot, which casts shadows
     columns = np.broadcast_to(np.arange(frame.camera.width), read.shape)
@@ -176,11 +175,11 @@ def _shadows(frame: Frame) -> np.ndarray:
 
 
 def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """The pixels (H, W) bool without a reading that belong to objects, by colour or by outline.
+    """The pixels (H, W) bool without a depth reading that are assigned to objects by colour or by outline.
 
-    A pixel near the table must differ in colour from the table nearby. A pixel far from the table must differ from
-    the whole table, and its region must be enclosed by readings of objects (`measured`). A large gap in the readings
-    of the table, without glare, also belongs to an object, for example a glass.
+    A pixel near the table must differ in colour from the nearby table. A pixel far from the table must differ from
+    the colours of the whole table, and readings of objects (`measured`) must enclose its region. A large gap in the
+    readings of the table, without glare, also belongs to an object, for example a glass.
     """
     lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
@@ -195,7 +194,7 @@ def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.n
 def _compared_with_table(lab: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether the table is near a pixel, (H, W) bool, and two colour differences (H, W) between pixel and table.
 
-    The differences are the brightness in standard deviations, and the squared Mahalanobis distance of the colour.
+    The differences are the brightness in standard deviations, and the squared Mahalanobis distance of the colours.
     """
     share = _surroundings(table.astype(np.float32))
     near = share > _TABLE_NEAR
@@ -213,7 +212,7 @@ def _opened(pixels: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The regions of `pixels` (H, W) bool for which most readings around the region are in `by` (H, W) bool."""
+    """The connected regions of `pixels` (H, W) bool that are surrounded mostly by readings in `by` (H, W) bool."""
     regions, n = ndimage.label(pixels)
     kept = np.zeros(n + 1, bool)
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
@@ -225,7 +224,7 @@ def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarr
 
 
 def _measured_part(frame: Frame) -> np.ndarray:
-    """The rectangle of the image (H, W) bool that has readings. Registered depth images have empty margins."""
+    """The rectangle (H, W) bool of the image that contains readings. Registered depth images have empty margins."""
     part = np.zeros(frame.depth.shape, bool)
     rows, columns = (np.flatnonzero(frame.valid.mean(axis=axis) >= _EMPTY) for axis in (1, 0))
     if len(rows) and len(columns):
@@ -244,9 +243,9 @@ def _surroundings(image: np.ndarray) -> np.ndarray:
 
 
 def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Readings of objects, and regions without readings that touch an object or are surrounded by the table.
+    """Pixels of objects: readings of objects, and regions of missing readings beside objects or surrounded by table.
 
-    All images are (H, W) bool. Small gaps of missing readings are closed.
+    All images are (H, W) bool. Small gaps between the pixels of objects are closed.
     """
     either = (measured | silent).astype(np.uint8)
     closed = cv2.morphologyEx(either, cv2.MORPH_CLOSE, _ellipse(scaled_length(2, measured.shape[1]))) > 0
@@ -260,7 +259,7 @@ def _joined(measured: np.ndarray, silent: np.ndarray, table: np.ndarray, missing
 
 
 def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: np.ndarray) -> bool:
-    """Whether region `k` of a label image (H, W), without readings, is large enough and surrounded by the table."""
+    """Whether region `k` of a label image (H, W) of missing readings is large enough and surrounded by the table."""
     height, width = regions.shape
     rows, columns = box
     if (regions[box] == k).sum() < scaled_area(_SMALLEST_DARK, regions.size):
@@ -273,7 +272,7 @@ def _stands_alone(regions: np.ndarray, k: int, box: tuple[slice, slice], table: 
 
 
 def _ring(regions: np.ndarray, k: int, box: tuple[slice, slice]) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """Mask (h, w) bool of the pixels around region `k` of a label image in a window, and the slices of the window."""
+    """The pixels around region `k` of a label image: a mask (h, w) bool, and the rows and columns of the mask."""
     reach = _reach(regions.shape[1])
     rows, columns = (slice(max(0, side.start - reach), side.stop + reach) for side in box)
     inside = regions[rows, columns] == k
@@ -290,11 +289,11 @@ def _ellipse(radius: float) -> np.ndarray:
 
 
 def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
-    """Depth (H, W) with estimates at pixels of objects without a reading; None if no reading is missing.
+    """Depth (H, W) with estimates at object pixels without a reading; None if all object pixels have a reading.
 
-    In narrow gaps, an estimate is the nearest reading, because two objects can meet in a gap. In wide gaps, the
-    inverse of depth is a harmonic function, which is exact on planes. No estimate is behind the table. Missing pixels
-    of an object with fewer than ten readings get the smallest table depth at its pixels.
+    In a narrow gap, the estimate is the nearest reading, because two objects can meet in a gap. In a wide gap,
+    inverse depth is interpolated by a harmonic function, which is exact on planes. Estimates are never behind the
+    table. If an object has fewer than ten readings, the estimate is the smallest depth of the table at its pixels.
     """
     if not (pixels & ~frame.valid).any():
         return None
@@ -319,7 +318,7 @@ def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
 
 
 def _estimated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray, width: int) -> np.ndarray:
-    """Depth (n,) at the missing pixels of one connected region; `known` and `missing` are (H, W) bool.
+    """Estimated depth (n,) at the `missing` pixels of a region, from the `known` pixels; both (H, W) bool.
 
     `width` is the width of the whole image.
     """
@@ -334,7 +333,7 @@ def _estimated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray, width:
 def _interpolated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray) -> np.ndarray:
     """Depth (n,) at missing pixels. The inverse depth is the mean over the neighbours (Laplace's equation).
 
-    `known` and `missing` (H, W) bool are the pixels of one connected region. The outline adds no boundary condition.
+    `known` and `missing` (H, W) bool are the pixels of one connected region. Only `known` gives boundary conditions.
     """
     used, asked = known | missing, missing.ravel()
     graph = pixel_graph(used[:, :-1] & used[:, 1:], used[:-1] & used[1:])

@@ -107,7 +107,7 @@ class VoxelGrid:
 
     @property
     def upper(self) -> np.ndarray:
-        """Maximum corner, (3,) metres."""
+        """Corner of the grid with the largest coordinates, (3,) metres."""
         return self.origin + self.voxel_size * np.array(self.shape)
 
     def centres(self) -> np.ndarray:
@@ -125,7 +125,7 @@ class VoxelGrid:
         return np.where(np.isfinite(index), index, -1).astype(np.int64)
 
     def contains(self, index: np.ndarray) -> np.ndarray:
-        """(...) bool: indices (..., 3) that are inside the grid."""
+        """(...) bool: whether indices (..., 3) are inside the grid."""
         index = np.asarray(index)
         return np.asarray(((index >= 0) & (index < np.array(self.shape))).all(axis=-1))
 
@@ -169,7 +169,7 @@ class Crop:
 
     @classmethod
     def of(cls, mask: np.ndarray, probability: np.ndarray | None = None) -> Crop:
-        """The smallest crop of a boolean grid and a grid of probabilities. An empty mask gives an empty crop."""
+        """Crop a mask (X, Y, Z) and probabilities to the box of True voxels. An empty mask gives an empty crop."""
         box = occupied_box(mask if probability is None else mask | (probability > 0))
         if box is None:
             return cls(np.zeros((0, 0, 0), bool), np.zeros(3, np.int64))
@@ -178,13 +178,13 @@ class Crop:
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
-        """Slices of the crop in the grid."""
+        """Slices of the grid that select the box of the crop."""
         a, b, c = (slice(int(o), int(o) + n) for o, n in zip(self.offset, self.occupied.shape, strict=True))
         return a, b, c
 
 
 class Seen(IntFlag):
-    """Flags for the observation of a voxel in one frame, relative to one object (`ObjectView.bits`)."""
+    """Flags that say how one frame observes a voxel, relative to one object (`ObjectView.bits`)."""
 
     SURFACE = 1  #: visible surface of the object
     OTHER_SURFACE = 2  #: visible surface of another object or of the background
@@ -199,7 +199,7 @@ class Seen(IntFlag):
 
 @dataclass(frozen=True, eq=False)
 class ObjectView:
-    """The observation of an object in one frame, in a box of the grid, with the later motion of the object."""
+    """Observation of an object in one frame, for the voxels of a box, and motion of the object since the frame."""
 
     offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
     bits: np.ndarray  #: (a, b, c) uint8, flags of `Seen`
@@ -209,18 +209,18 @@ class ObjectView:
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
 
     def moved(self, T: RigidTransform) -> ObjectView:
-        """The view after the object has moved by T."""
+        """The view after a rigid motion T of the object."""
         return replace(self, motion=T * self.motion)
 
     @cached_property
     def name(self) -> tuple[str, bytes]:
-        """Key of the contents and of the motion."""
+        """Key that identifies the contents and the motion of the view."""
         return self.key, self.motion.as_matrix().tobytes()
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectRecord:
-    """The data of one object in a hypothesis."""
+    """Data of one object in a hypothesis: label, identity, motion and views."""
 
     label: int  #: value of the object in the label grid, 1 .. 65535
     id: int  #: identity of the object over time, within one lineage of hypotheses
@@ -240,16 +240,16 @@ class ObjectRecord:
     def born(
         cls, label: int, birth: int, completion_key: str | None = None, views: tuple[ObjectView, ...] = ()
     ) -> ObjectRecord:
-        """The record of a new object. Each pair of birth and label has a different id."""
+        """The `ObjectRecord` of a new object. Each pair of `birth` and `label` gives a different `id`."""
         return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key, views=views)
 
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
-        """The record after a motion T of the object. `source` has the voxels before all motions."""
+        """The `ObjectRecord` after a rigid motion T. `source` has the voxels before the first motion."""
         total = T if self.source is None else T * self.motion
         return replace(self, source=source, motion=total, views=tuple(view.moved(T) for view in self.views))
 
     def changed(self) -> ObjectRecord:
-        """The record after a change of the voxels other than a rigid motion."""
+        """The `ObjectRecord` after a change of the voxels that is not a rigid motion."""
         return replace(self, source=None, motion=_NO_MOTION)
 
 
@@ -280,7 +280,7 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
-    """The occupancy probability of each voxel, given the objects of a hypothesis and their positions."""
+    """Probability that each voxel is occupied, given the objects of a hypothesis and the positions of the objects."""
 
     #: (X, Y, Z) uint16, the most probable object, also where free space is more probable. Equal to the label where
     #: there is one.
@@ -297,7 +297,7 @@ class Occupancy:
         return content_key("occupancy", self.owner, self.probability)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
-        """The occupancy after a change of labels. Changed voxels are certain. Objects not in `known` are removed."""
+        """The occupancy for new labels. Changed voxels get probability 0 or 1. Only objects in `known` are kept."""
         changed = before != after
         owner = np.where(changed | (after > 0), after, self.owner)
         p = np.where(changed, after > 0, self.probability)
@@ -320,9 +320,9 @@ class Hypothesis:
     grid : VoxelGrid
         Positions of the voxels.
     objects : tuple of ObjectRecord
-        One record for each label, in ascending order of labels. `Hypothesis.from_labels` makes the records.
+        One `ObjectRecord` for each label, in ascending order of labels. `Hypothesis.from_labels` makes the records.
     occupancy : Occupancy, optional
-        Probabilities of the voxels. By default, all voxels are certain.
+        Occupancy probability of each voxel. By default, all probabilities are 0 or 1.
     """
 
     labels: np.ndarray
@@ -357,17 +357,17 @@ class Hypothesis:
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
-        """A hypothesis from a label grid. All objects are new."""
+        """A hypothesis from a label grid (X, Y, Z). Every object gets a new `ObjectRecord`."""
         labels = labels_on(grid, labels)
         present = np.flatnonzero(np.bincount(labels.ravel()))
         records = tuple(ObjectRecord.born(int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
-        """A hypothesis with the same objects and other voxels.
+        """A hypothesis with the same objects and a new label grid.
 
-        Objects with changed voxels lose `source` and `motion`. Records of objects without voxels are removed. Raises
-        InputError if a label has no record.
+        The fields `source` and `motion` of objects with changed voxels are reset. Objects without voxels are removed.
+        Raises InputError if a label has no `ObjectRecord`.
         """
         labels = labels_on(self.grid, labels)
         different = labels != self.labels
@@ -377,7 +377,7 @@ class Hypothesis:
         return self.relabelled(labels, tuple(record for record in records if present[record.label]))
 
     def relabelled(self, labels: np.ndarray, objects: tuple[ObjectRecord, ...]) -> Hypothesis:
-        """The hypothesis with other labels and records. Voxels with a changed label become certain."""
+        """The hypothesis with other labels and object records. Voxels with a changed label get probability 0 or 1."""
         occupancy = self.occupancy
         if occupancy is not None:
             known = np.array([0, *(record.label for record in objects)])
@@ -392,11 +392,11 @@ class Hypothesis:
 
     @property
     def shares(self) -> Occupancy:
-        """The occupancy. For a hypothesis without probabilities, every label has probability 1."""
+        """The occupancy. In a hypothesis without probabilities, every occupied voxel has probability 1."""
         return self.occupancy or Occupancy(self.labels, (self.labels > 0).astype(np.float16))
 
     def crop(self, label: int) -> Crop:
-        """The voxels of an object, with their probabilities if the hypothesis has them."""
+        """The voxels of an object, with probabilities if the hypothesis has probabilities."""
         mask = self.labels == label
         if self.occupancy is None:
             return Crop.of(mask)
@@ -413,7 +413,7 @@ class Hypothesis:
         return {int(k): int(counts[k]) for k in np.flatnonzero(counts) if k > 0}
 
     def volumes(self) -> dict[int, int]:
-        """Number of voxels of each object, by label, ascending."""
+        """Number of voxels of each object, by label in ascending order."""
         return dict(self._volumes)
 
     @property
@@ -422,7 +422,7 @@ class Hypothesis:
         return len(self.objects)
 
     def record(self, label: int) -> ObjectRecord:
-        """The record of a label."""
+        """The `ObjectRecord` of a label."""
         for record in self.objects:
             if record.label == label:
                 return record
@@ -446,7 +446,7 @@ class Hypothesis:
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:
         """Oriented bounding box of the voxels of an object.
 
-        Returns T_world_box and the lengths (3,) of the sides in metres. The origin of the box is its centre, and its
+        Returns T_world_box and the lengths (3,) of the sides in metres. The origin is the centre of the box, and the
         z axis points up. The horizontal sides are the smallest rectangle around the voxels in the top view.
         """
         import cv2
@@ -462,7 +462,7 @@ class Hypothesis:
 
 
 def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
-    """Raise InputError if a hypothesis has another grid."""
+    """Raise InputError if the grid of a hypothesis differs from `grid`."""
     if hypothesis.grid != grid:
         found, expected = (
             f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
@@ -475,6 +475,6 @@ def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
 
 
 def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
-    """Raise InputError if a hypothesis has another grid. `side` describes the hypotheses in the message."""
+    """Raise InputError if a hypothesis has a grid other than `grid`. `side` names the hypotheses in the message."""
     for k, hypothesis in enumerate(hypotheses):
         check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)

@@ -6,7 +6,7 @@
 >>> w = MergeLogOdds().values(tree, frame)                                            # doctest: +SKIP
 >>> cuts = MetropolisHastingsCuts(temperature=1).sample(rng, tree, w, 10).cuts        # doctest: +SKIP
 
-`TreeCutProposal` performs all four steps and completes the segments to 3-D.
+`TreeCutProposal` performs all four steps and completes the segments to 3-D shapes.
 
 ================  ====================================================================
 `boundary`        boundary maps from colour and depth

@@ -1,16 +1,14 @@
-"""The border network, a small 2-D U-Net that estimates the borders and the centres of objects.
-
-The module `border_network` imports torch.
+"""The border network, a small 2-D U-Net in torch that estimates the borders and the centres of objects.
 
 >>> network = load_border_network("border")
 >>> seen = network.look(frame)                     # maps of the frame's size
 >>> seen.border[row, column], seen.foreground[row, column], seen.centre[row, column]
 
 A frame is reduced to 320 pixels per row (`encode_image`), and the output maps are interpolated to the size of the
-frame. The blocks have a half, a quarter and an eighth of the reduced resolution. At the input and the output, 2 x 2
-pixels are packed as channels. Two outputs are the log odds that a pixel is at the border of an object, and that a
-pixel belongs to an object. Another output is the offset to the object's centre in the image (after Neven et al.,
-"Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. At the input and
+the output, 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's border,
+and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre (Neven
+et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations
@@ -60,7 +58,7 @@ def encode_image(frame: Frame) -> np.ndarray:
 
 
 def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarray:
-    """Normals (3, H, W) of a smoothed disparity image. The axes are the image rows, `up` and a third axis."""
+    """Normals (3, H, W) of a smoothed disparity image. The components are along image rows, `up` and a third axis."""
     smooth = cv2.GaussianBlur(disparity, (0, 0), 1.5)
     a = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8
     b = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
@@ -76,7 +74,7 @@ def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarra
 
 
 def near_objects(x: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool of a network input within eight pixels of a reading above the table."""
+    """Pixels (H, W) bool of a network input that are within eight pixels of a reading above the table."""
     raised = (x[0] > np.arcsinh(TABLE_TOLERANCE / _HEIGHT_UNIT) / 3) & (x[5] > 0)
     raised = cv2.morphologyEx(raised.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return np.asarray(cv2.dilate(raised, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (17, 17))) > 0)
@@ -146,7 +144,7 @@ class BorderNetwork:
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:
-        """The output maps for a frame of any size. A missing pose is fitted to the table (`fit_support_plane`)."""
+        """The output maps for a frame of any size. A missing pose is fitted to the plane of the table."""
         h, w = frame.depth.shape
         small = reduced(frame)
         x = encode_image(small)
@@ -169,5 +167,5 @@ def reduced(frame: Frame) -> Frame:
 
 @functools.lru_cache(maxsize=4)
 def load_border_network(name: str) -> BorderNetwork:
-    """Load the network of a model by name or folder. See `mstfilter.trained.open_model`."""
+    """Load the network of a trained model, given by name or folder. See `mstfilter.trained.open_model`."""
     return BorderNetwork(open_model(name, BORDER_ARCHITECTURE))

@@ -2,11 +2,11 @@
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 
-Most objects are convex, so depth has a concave crease or a step between objects that touch, and between an object and
-the table. A convex crease, such as the edge of a box, lies inside one object. On a plane, disparity D = 8 f b / z (f
+Most objects are convex, so depth has a concave crease or a step between two touching objects, or between object and
+table. A convex crease, such as the edge of a box, lies inside one object. On a plane, disparity D = 8 f b / z (f
 focal length, b baseline, z depth) is affine in the pixel coordinates. The noise of D does not depend on depth. The
 largest eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not
-visible in depth. Colour has a lower weight than depth, because print on a box is not a boundary.
+visible in depth. The weight of colour is low, because print on a box is not a boundary.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model for the clip's last frame. The `component_key` of the model includes the file content."""
+        """The model for the clip's last frame. The `component_key` of the model includes the content of the files."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,9 @@ class ColourDepthBoundary(BoundaryModel):
     colour_weight : float
         Weight of the colour edges. The weight 0 disables colour.
     quiet_table : float
-        Distance in pixels of a 640 px wide image. At pixels farther from all surfaces above the table, the boundary
-        is 0, so print, grain and shadows on the table are ignored. Negative values disable the rule.
+        Distance in pixels of a 640 px wide image. The boundary is 0 at pixels farther than `quiet_table` from all
+        surfaces above the table, so print and shadows on the table are ignored. With a negative distance, no pixel is
+        set to 0.
     """
 
     colour_weight: float = 0.4
@@ -96,7 +97,7 @@ class ColourDepthBoundary(BoundaryModel):
 
 
 def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
-    """e / (1 + e), where e is the strength of the Lab structure tensor, averaged over three scales."""
+    """e / (1 + e) for the strength e of the structure tensor of Lab colour, averaged over three scales."""
     lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     lab /= np.array([_LIGHTNESS_UNIT, _CHROMA_UNIT, _CHROMA_UNIT], np.float32)
     xx = np.zeros(rgb.shape[:2], np.float32)
@@ -116,7 +117,7 @@ def _colour_edges(rgb: np.ndarray, resize: float) -> np.ndarray:
 
 
 def filled_disparity(frame: Frame) -> np.ndarray:
-    """Disparity (H, W) float32 in sensor units. Missing readings take the nearest value."""
+    """Disparity (H, W) float32 in sensor units. Pixels without a reading take the nearest value."""
     return (8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)).astype(np.float32)
 
 
@@ -138,7 +139,7 @@ def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndar
 
 
 def _blur(resize: float) -> float:
-    """Standard deviation of the blur before the Hessian, pixels."""
+    """Standard deviation in pixels of the blur that is applied before the Hessian."""
     return max(1.0, 2.5 * resize)
 
 

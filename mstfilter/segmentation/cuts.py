@@ -1,7 +1,7 @@
 """Cuts of a segmentation tree: node values, the optimal cut, and exact samples.
 
-A `CutValue` gives every node a value w. The value of a cut is the sum over its nodes, v(c) = sum w. `optimal_cut`
-maximises this value, and a `CutSampler` draws cuts at random.
+A `CutValue` gives every node a value w. The value of a cut is the sum of the values of its nodes, v(c) = sum w.
+`optimal_cut` maximises this value, and a `CutSampler` draws cuts at random.
 
 >>> w = MergeLogOdds().values(tree, frame)                     # (N,), higher is better
 >>> best = optimal_cut(tree, w)                                # ascending nodes
@@ -53,14 +53,14 @@ class SceneCutObjectness(CutValue):
 
     ``s = 0.5 exp(-(start / 0.3)^2) exp(-((1 - end) / 0.7)^2)`` and ``w = ln(s) area^0.95``. A region smaller than
     1000 or larger than 150,000 pixels of a 640 x 480 image gets ``s = 0.001``. SceneCut's second term, a model of
-    planes with the size of furniture, is omitted. The support plane is removed as background.
+    planes with the size of furniture, is omitted. Pixels on the support plane are background.
 
     Parameters
     ----------
     background_weight : float
-        Area of a pixel that is not above the table. In SceneCut, the area is 1. With area 1, the table contributes
-        most of the optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives
-        more random cuts. With area 0, cuts of the table have no cost, and chains spend steps on these cuts.
+        Area of each pixel that is not above the table. With area 1, as in SceneCut, the table contributes most of the
+        optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives more random
+        cuts. With area 0, splits of the table do not change the value, and chains spend steps on splits.
     """
 
     background_weight: float = 0.003
@@ -85,8 +85,8 @@ class MergeLogOdds(CutValue):
     """Log likelihood of independent merge decisions.
 
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. The probability that exactly the merges above the
-    cut join different objects is proportional to exp(v(c)). The values are log probabilities, so cuts are sampled at
-    a temperature, without a scale sigma. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
+    cut join different objects is proportional to exp(v(c)). The values are log probabilities, so the sampler needs a
+    `temperature` but no scale `sigma2`. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
     `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
@@ -147,7 +147,7 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
     """The cut of largest value, as nodes (n,) in ascending order, for node values `w` (N,).
 
-    If a parent and its children have equal values, the parent is kept.
+    If a node has the same value as the best cut below the node, the node is kept.
     """
     best = check_values(tree, w).tolist()
     keep = [True] * tree.n_nodes
@@ -177,7 +177,7 @@ class OptimalCut(CutSampler):
 
 @dataclass(frozen=True, eq=False)
 class Gibbs:
-    """A Gibbs distribution over the cuts of a tree and of its subtrees. Lists have one entry per node."""
+    """A Gibbs distribution over the cuts of a tree and of its subtrees. A list has one entry per node of the tree."""
 
     tree: Tree
     b: float  #: inverse temperature, per unit of value
@@ -186,7 +186,7 @@ class Gibbs:
     stop: list[float]  #: probability that a cut without an ancestor of the node contains the node
 
     def draw(self, random: Callable[[], float], node: int) -> list[int]:
-        """Draw a cut of the subtree of `node`, with unordered nodes. `random` returns uniform numbers in [0, 1)."""
+        """Draw a cut of the subtree of `node`, with unordered nodes. ``random()`` is uniform in [0, 1)."""
         children, stop = self.tree.children, self.stop
         cut, stack = [], [node]
         while stack:

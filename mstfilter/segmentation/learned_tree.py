@@ -65,7 +65,7 @@ def quadric_residual(sums: np.ndarray) -> np.ndarray:
 
 
 class _RegionMeans:
-    """Measurements of k regions from rows of `Regions.sums` (k, C) and their borders with the table (k, B)."""
+    """Measurements of k regions, from their rows (k, C) of `Regions.sums` and their borders (k, B) with the table."""
 
     def __init__(self, sums: np.ndarray, table: np.ndarray) -> None:
         self.n = np.maximum(sums[:, REGION["pixels"].start], 1)
@@ -186,8 +186,8 @@ def pair_features(
 ) -> np.ndarray:
     """The named features (k, f) of k pairs of regions, from their rows `a` and `b` (k, C) of `Regions.sums`.
 
-    `border` (k, B) has the common borders of the pairs, with `a` first. `table_a` and `table_b` (k, B) have the
-    borders with the table, or zeros. `scale` is the image width / 640.
+    `border` (k, B) has the common borders of the pairs, with `a` first. `table_a` and `table_b` (k, B) are the
+    borders of `a` and `b` with the table, or zeros. `scale` is the image width / 640.
     """
     pair = _PairMeasures(a, b, border, table_a, table_b, scale)
     return np.stack([FEATURES[name](pair) for name in names], axis=1)
@@ -206,7 +206,7 @@ def check_weights(weights: Mapping[str, float], names: Iterable[str], where: obj
 
 
 class Agglomeration:
-    """Merging of regions, with the lowest log odds first. Region 0, the table, is never merged."""
+    """Merges pairs of regions in ascending order of log odds. Region 0, the table, is never merged."""
 
     def __init__(self, regions: Regions, log_odds: PairLogOdds) -> None:
         n = len(regions.sums)
@@ -271,36 +271,39 @@ class Agglomeration:
 class MergedTree(TreeBuilder):
     """Best-first merging of watershed regions by learned log odds.
 
-    One leaf has the table and all other pixels without an object. Only the root merges this leaf with other regions.
+    One leaf contains the table and all other background pixels. Only the root joins this leaf with other regions.
     """
 
     leaves: TreeBuilder = field(default_factory=UcmTree)
 
     @abstractmethod
     def model(self) -> tuple[Mapping[str, float], str]:
-        """Weights of the features, and key of the model files. Raises InputError for weights of other features."""
+        """Weights of the features, and key of the model files. Raises InputError for unknown or missing features."""
 
     @abstractmethod
     def look(self, frame: Frame) -> SeenBorders | None:
-        """The output of a network for the frame; None without a network."""
+        """The output of the border network for a frame; None if the tree uses no network."""
 
     @property
     def weights_key(self) -> str:
-        """Key of the contents of the files of the model."""
+        """Hash of the contents of the model files."""
         return self.model()[1]
 
     @property
     def bound_key(self) -> bytes:
-        """Key of the model. Cached values depend on the weights of the model."""
+        """Hash of the model, which is part of the keys of cached values."""
         return self.weights_key.encode()
 
     def regions(self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray) -> Regions:
-        """The measured leaves. `pixels` (H, W) bool are the pixels of objects."""
+        """The leaves with their measurements. `pixels` (H, W) bool are the pixels of objects."""
         leaves = object_leaves(self.leaves.build(boundary, frame).leaves, pixels)
         return measure_regions(leaves, frame, boundary, self.look(frame))
 
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
-        """Build the tree. `odds` has the log odds of merges, and `start` the largest probability inside a node."""
+        """Build the tree of merged regions.
+
+        `odds` has the log odds of each merge, and `start` the largest P(boundary) inside a node.
+        """
         if frame is None:
             raise InputError(
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
@@ -317,7 +320,7 @@ class MergedTree(TreeBuilder):
 
 @dataclass(frozen=True)
 class LearnedTree(MergedTree):
-    """A `MergedTree` with features of the image.
+    """A `MergedTree` that uses features of the image only.
 
     Parameters
     ----------
@@ -347,7 +350,7 @@ def read_tree_weights(name: str) -> tuple[Mapping[str, float], str]:
 
 @dataclass(frozen=True)
 class BorderTree(MergedTree):
-    """A `MergedTree` with features of the image and of the output of a border network.
+    """A `MergedTree` that uses features of the image and of the output of a border network.
 
     The network gives the log odds of a border between two regions, and the distance between the estimated centres of
     their objects. The scenes for fitting the weights were not used to train the network.

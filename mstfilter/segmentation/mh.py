@@ -1,8 +1,8 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
 The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with ``s2 =
-sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The form with a
-`temperature` is for values that are log odds (`MergeLogOdds`) and need no scale.
+sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The target with a
+`temperature` is for values that are log odds (`MergeLogOdds`), which need no scale.
 
 - ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain with MoveNode and subtree redraws.
 - ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
@@ -41,7 +41,7 @@ from mstfilter.segmentation.tree import Tree
 
 
 class Move(NamedTuple):
-    """Nodes that leave and enter the cut, and log g(back) - log g(forward) of the proposal."""
+    """Nodes that a move removes and adds, and log g(back) - log g(forward) of the move."""
 
     removed: tuple[int, ...] | list[int]
     added: tuple[int, ...] | list[int]
@@ -114,11 +114,11 @@ class CutState:
 
 
 class MoveRule(ABC):
-    """Proposes the next cut of a chain."""
+    """Proposes the next cut of a Metropolis-Hastings chain."""
 
     @abstractmethod
     def choose(self, random: Callable[[], float], state: CutState) -> Any:
-        """Draw a choice. `random` returns uniform numbers in [0, 1)."""
+        """Draw a choice. ``random()`` is uniform in [0, 1)."""
 
     @abstractmethod
     def outcome(self, state: CutState, choice: Any) -> Move | None:
@@ -130,7 +130,7 @@ class NodeMoves(MoveRule):
     """MoveNode of the paper: a random node of the cut moves up or down with equal probability, if possible."""
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool]:
-        """A node of the cut, and True for up."""
+        """A random node of the cut, and whether it moves up."""
         draw = random() * 2 * len(state.nodes)
         return state.nodes[int(draw) >> 1], bool(int(draw) & 1)
 
@@ -248,12 +248,12 @@ class CutChain:
         self.restart(cut)
 
     def restart(self, cut: np.ndarray) -> None:
-        """Continue from another cut."""
+        """Continue the chain from another cut."""
         self.state = CutState(self.tree, cut.tolist())
         self.value = sum(self.w[x] for x in self.state.nodes)
 
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
-        """Move of a choice (None: no change), value after the move, and log of the acceptance ratio."""
+        """Move of a choice (None: no change), value of the cut after the move, and log of the acceptance ratio."""
         move = rule.outcome(self.state, choice)
         if move is None or move.log_ratio == -inf:
             return None, self.value, -inf
@@ -265,7 +265,7 @@ class CutChain:
         return move, value, self.log_p(value) - self.log_p(self.value) + move.log_ratio
 
     def step(self, random: Callable[[], float], rule: MoveRule) -> None:
-        """Make one step under a rule."""
+        """Make one step of the chain with a move rule."""
         move, value, log_ratio = self.judge(rule, rule.choose(random, self.state))
         self.steps += 1
         if move is not None and (log_ratio >= 0 or random() < exp(log_ratio)):
@@ -285,24 +285,24 @@ class MetropolisHastingsCuts(CutSampler):
     Parameters
     ----------
     sigma2 : float
-        s2 relative to the squared value of the optimal cut, without unit. With a temperature, s2 is not used.
+        s2 divided by the squared value of the optimal cut. With a temperature, s2 is not used.
     burn_in : int
-        Steps before the first sample of each chain, in addition to `thinning`.
+        Number of steps before the first sample of each chain, in addition to `thinning`.
     thinning : int
         Number of steps between samples.
     moves : {"node", "authors"}
         Rule of the local moves: the exact rule of the paper, or the rule of the authors' program.
     redraw_share : float
-        Fraction of steps that redraw a random subtree instead of a local move; 0 without a temperature.
+        Fraction of steps that redraw a random subtree instead of making a local move; 0 if the temperature is 0.
     restart : bool
         If True, start a new chain at the optimal cut for each sample.
     include_optimal : bool
         If True, the first sample is the optimal cut.
     redraw_repeated : bool
-        If True and a cut was drawn before, draw once more and keep the second cut in any case.
+        If True, a cut that was sampled before is replaced by one further cut, which may also be a repetition.
     temperature : float
-        Temperature of the target exp(v / temperature), in units of value. With 0, the chain has the target of the
-        paper.
+        Temperature of the target exp(v / temperature), in units of value. If the temperature is 0, the chain has the
+        target of the paper.
     """
 
     sigma2: PositiveFloat = 1e-3

@@ -4,8 +4,8 @@
 >>> population = proposal.sample(np.random.default_rng(0), clip, 10)
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
 
-There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once. If
-several completed segments of a hypothesis contain a voxel, the voxel is assigned to one object.
+There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once to a 3-D
+shape. If several shapes contain the same voxel, the voxel is assigned to one of the objects.
 
 An `ObjectRule` decides which regions of a cut are objects:
 
@@ -65,14 +65,14 @@ class Segments:
 class ObjectRule:
     """Decides which regions are objects.
 
-    A region is background if most of its readings are on the table, behind the table or outside the workspace. A
-    region with fewer than `min_points` other readings is also background. `min_points` is for an image of 640 x 480
-    pixels and is scaled by the area of the image.
+    A region is background if most of its depth readings are on the table, behind the table or outside the workspace.
+    A region is also background if fewer than `min_points` readings are above the table and in the workspace.
+    `min_points` is for an image of 640 x 480 pixels and is scaled by the area of the image.
 
     Parameters
     ----------
     min_points : int
-        Readings of the smallest object.
+        Number of depth readings of the smallest object.
     mend : bool
         Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If
         False, every reading above the table can belong to an object, as published.
@@ -82,11 +82,11 @@ class ObjectRule:
     mend: bool = True
 
     def foreground(self, frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
-        """The pixels that can belong to an object, and the frame with their depth."""
+        """The pixels that can belong to an object, and the frame with known or estimated depth."""
         return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
-        """Test every node of a tree. Without a grid, the workspace is all space above the table."""
+        """Test which nodes of a tree are objects. Without a grid, the workspace is all space above the table."""
         found = self.foreground(frame, grid)
         pixels, frame = found.pixels, found.frame
         readings = tree.accumulate_pixels(frame.valid)
@@ -109,7 +109,7 @@ class ObjectRule:
 
 
 def _core(tree: Tree, pixels: np.ndarray, radius: int) -> np.ndarray:
-    """Number (N,) of pixels of each node with a square neighbourhood inside the node and inside `pixels`.
+    """For each node, number (N,) of pixels with a square neighbourhood inside the node and inside `pixels`.
 
     A neighbourhood lies in the lowest node that contains all its leaves, and in the ancestors of this node, so one
     pass over the pixels is sufficient. The lowest node is found from the first and the last leaf of the neighbourhood
@@ -139,7 +139,7 @@ class TreeCutProposal(Proposal):
         Decides which regions of a cut are objects.
     weight_rule : {"equal", "p"}
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is ``log
-        p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability counts twice.
+        p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability of a cut counts twice.
     threshold : float
         Smallest probability of an occupied voxel.
     """
@@ -156,7 +156,7 @@ class TreeCutProposal(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def tree_of(self, frame: Frame, grid: VoxelGrid | None = None) -> tuple[Tree, np.ndarray]:
-        """The tree of a frame in a workspace and its node values (N,). The result is cached."""
+        """The tree of a frame in a workspace, and the node values (N,) of the tree. The result is cached."""
 
         def compute() -> tuple[Tree, np.ndarray]:
             found = self.objects.foreground(frame, grid)
@@ -211,12 +211,12 @@ def complete_segments(
     completer: Completer,
     threshold: float = 0.5,
 ) -> tuple[tuple[Hypothesis, ...], dict[str, Any]]:
-    """Hypotheses from sampled segmentations of the last frame of a clip, and counts for the notes.
+    """Hypotheses from sampled segmentations of the last frame of a clip, and counts of objects and segments.
 
     Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
     segment is completed once, with the random stream ``"completion", segment``. The result for a segment does not
-    depend on the other segments. A stochastic completer completes a segment again for each further sample, with the
-    random stream ``"completion", segment, k``.
+    depend on the other segments. A stochastic completer completes a segment again for its k-th further sample, with
+    the random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()
@@ -247,8 +247,9 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from completed segments of a frame, at the pause `birth`.
 
-    Segments get the labels 1, 2, ... in order. Segments without voxels get no record. `threshold` is the smallest
-    probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments contain.
+    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. `threshold` is the
+    smallest probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments
+    contain.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

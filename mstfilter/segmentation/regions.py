@@ -1,7 +1,7 @@
 """Measurements of image regions and of their common borders.
 
-Each measurement is a sum over pixels, so the row of a merged region is the sum of two rows. Disparity is in sensor
-units (1/8 px at f = 525 px), and lengths are in metres.
+The row of a region has sums over pixels, so the row of a merged region is the sum of the rows of its parts. Disparity
+is in sensor units (1/8 px at f = 525 px), and lengths are in metres.
 
 >>> leaves = object_leaves(watershed, pixels)                 # objects do not share a leaf with the table
 >>> regions = measure_regions(leaves, frame, boundary)
@@ -106,7 +106,7 @@ def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def connected_pixels(right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Number (H, W) of the connected component of each pixel of an image.
+    """Index (H, W) of the connected component of each pixel of an image.
 
     `right` and `down` are the parameters of `pixel_graph`.
     """
@@ -137,7 +137,7 @@ def measure_regions(
 
 
 def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, seen: SeenBorders | None) -> np.ndarray:
-    """Sums (n, C), columns `REGION`, over the readings of each region (H, W), without the perimeter.
+    """Sums (n, C) over the depth readings of each region. The columns are `REGION`; the perimeter is 0.
 
     `bend` (H, W) is the concave minus the convex curvature.
     """
@@ -173,7 +173,7 @@ def _region_sums(region: np.ndarray, n: int, frame: Frame, bend: np.ndarray, see
 
 
 def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray) -> list[dict[int, np.ndarray]]:
-    """For every region, a mapping from neighbours to border rows (columns `BORDER`).
+    """For every region, a mapping from the number of a neighbour to the border row (columns `BORDER`).
 
     `maps` (H, W, 4) has the boundary strength, the concave and the convex curvature, and the log odds of a border.
     """
@@ -218,7 +218,7 @@ def _borders(region: np.ndarray, n: int, maps: np.ndarray, disparity: np.ndarray
 
 
 def _shifted(image: np.ndarray, at: tuple[np.ndarray, ...], axis: int, shift: int) -> np.ndarray:
-    """Values of an image (H, W) at pixels moved along an axis. Pixels outside the image have the edge value."""
+    """Values of an image (H, W) at pixels shifted along an axis. Pixels outside the image take the edge value."""
     index = list(at)
     index[axis] = np.clip(at[axis] + shift, 0, image.shape[axis] - 1)
     return image[tuple(index)]

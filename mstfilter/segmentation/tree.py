@@ -14,9 +14,9 @@ array([[1, 1],
        [1, 0]])
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
-in order of the mean strength of their common border. The height of a merge is the mean strength of the common border.
-A logistic curve maps the height to P(boundary), the probability that the merge joins different objects. `start` is
-P(boundary) of the merge that makes a node. `start` is near 0 for a node inside one object, and near 1 for several
+in order of the mean strength of their common border, which is the height of a merge. A logistic curve maps the height
+to P(boundary), the probability that the merge joins different objects. The field `start` of a node is P(boundary) of
+the merge that makes the node. `start` is near 0 for a node inside one object, and near 1 for a node with several
 objects.
 """
 
@@ -95,7 +95,7 @@ class Tree:
 
     @cached_property
     def end(self) -> np.ndarray:
-        """(N,) `start` of the parent: P(boundary) of the merge that absorbs the node, or 1 for the root."""
+        """(N,) P(boundary) of the merge that absorbs each node (`start` of the parent), or 1 for the root."""
         end = self.start[self.parent]
         end[self.root] = 1.0
         return read_only(end)
@@ -200,8 +200,8 @@ class TreeBuilder(Checked, ABC):
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         """The tree of a boundary map (H, W).
 
-        Some builders also need the frame and the pixels (H, W) bool that can belong to objects. The default pixels
-        are `pixels_above_table`.
+        Some builders also use the frame and `pixels` (H, W) bool, which marks the pixels that can belong to objects.
+        By default, `pixels` is the result of `pixels_above_table`.
         """
 
 
@@ -215,7 +215,7 @@ class UcmTree(TreeBuilder):
     Parameters
     ----------
     max_leaves : int
-        Largest number of leaves. The tree has fewer than twice as many nodes.
+        Largest number of leaves. The tree has fewer than 2 `max_leaves` nodes.
     centre : float
         Merge height (mean boundary strength 0 .. 1) at which P(boundary) = 0.5.
     slope : float
@@ -240,7 +240,7 @@ class UcmTree(TreeBuilder):
         return Tree(parent, leaves, start)
 
     def probability(self, height: np.ndarray) -> np.ndarray:
-        """P(boundary) of merge heights."""
+        """P(boundary) for each merge height."""
         return 1 / (1 + np.exp(-self.slope * (np.asarray(height) - self.centre)))
 
 
@@ -269,8 +269,8 @@ def linkage_tree(
     """Watershed and average linkage of a pixel graph. Returns higra's tree, merge heights (N,), leaf image (H, W).
 
     `weights` (E,) belong to the edges of the graph. ``strength(arcs)`` returns the strength of the borders between
-    the watershed regions. By default the strength is the mean weight of the edges of a border. `arcs` (E,) is the
-    border of each edge, or -1 within a region. Returns None if there is only one region.
+    the watershed regions. By default, the strength of a border is the mean of the `weights` of its edges. `arcs` (E,)
+    has the number of the border of each edge, or -1 for edges within a region. Returns None for a single region.
     """
     import higra as hg
 
@@ -292,7 +292,7 @@ def linkage_tree(
 def prune(
     parent: np.ndarray, altitude: np.ndarray, leaves: np.ndarray, max_leaves: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keep the `max_leaves - 1` highest merges of a binary tree. The nodes that the kept merges join become leaves.
+    """Keep the `max_leaves - 1` highest merges of a binary tree. Subtrees without a kept merge become leaves.
 
     Heights do not decrease towards the root, and parents come after children, so the kept merges contain the root and
     are connected.

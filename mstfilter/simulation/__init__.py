@@ -6,14 +6,14 @@ A scene family and a seed define a recording:
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 >>> folder = cached_recording("s1", seed=7)  # found again by the next call  # doctest: +SKIP
 
-The studies use the families `s1`, `s2` and `s3`. A scene can also be simulated step by step:
+A scene can also be simulated step by step:
 
 >>> from mstfilter.simulation import SimulatedScene, play_push
 >>> scene = SimulatedScene(scene_family("demo"), seed=7)  # doctest: +SKIP
 >>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
 >>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
 
-With a `PushLoop`, a filter chooses the pushes.
+With a `PushLoop`, a program chooses each push by the belief of a filter.
 
 The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
 (MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),
@@ -21,7 +21,7 @@ The lower modules, from bottom to top, are `solids` and `shapes` (objects), `fam
 
 The simulation has no camera motion, no glossy or transparent surfaces, no light reflected between objects, no
 articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges are
-calibrated to real frames. Within surfaces, noise is not correlated between pixels.
+calibrated to real frames. Within a surface, depth noise is not correlated between pixels.
 """
 
 from mstfilter.lazy import attach

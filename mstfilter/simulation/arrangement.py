@@ -1,7 +1,7 @@
-"""Placement of objects on the table: clusters, touching pairs of equal objects (twins), stacks and hidden objects.
+"""Placement of objects on the table: clusters, pairs of touching identical objects (twins), stacks, hidden objects.
 
-Each object is moved towards the cluster until the object nearly touches another object. Bisection on MuJoCo's
-contacts finds the position. After placement, the physics runs until all objects are at rest.
+Each object is moved towards the cluster until the object nearly touches another object. The position is found by
+bisection with MuJoCo's contact test. After placement, the physics runs until all objects are at rest.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _HIGHEST = 0.30  # top of a stack, metres: still in view
 
 @dataclass(frozen=True)
 class SceneObjects:
-    """The objects of a scene."""
+    """Shapes and textures of the objects of a scene."""
 
     shapes: tuple[Shape, ...]
     skins: tuple[Skin, ...]
@@ -38,7 +38,7 @@ class SceneObjects:
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw the shapes and textures of a scene. A shape family repeats only after all other families were drawn."""
+    """Draw shapes and textures of a scene from shuffled lists of all families, with cartons and cans repeated."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []
@@ -172,7 +172,7 @@ def _visible_pixels(world: PhysicsWorld, camera: Camera) -> np.ndarray:
 
 
 def _put_behind(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int], camera: Camera) -> bool:
-    """Put object k behind one of the tallest objects, at the tried place with the fewest visible pixels."""
+    """Put object k behind one of the tallest objects. Of the tried positions, the least visible position is used."""
     start, best = world.positions()[k], None
     tallest = sorted(placed, key=lambda j: -_top(world, j))[:5]
     for _ in range(_HIDING_PLACES):

@@ -96,7 +96,7 @@ class SceneFamily(Bounded):
         return 1 + self.n_actions * (self.frames_per_clip - 1)
 
     def pool(self, seed: int) -> Pool:
-        """The pool of sizes and textures for a seed."""
+        """The set of sizes and textures from which the scenes of a seed are drawn."""
         if self.catalogue == "by seed":
             return TUNING if seed < FIRST_REPORTED_SEED else REPORTED
         return _POOLS[self.catalogue]
@@ -123,7 +123,7 @@ class SceneFamily(Bounded):
         return Camera(K, self.width, self.height, kinect.T_world_camera)
 
     def contains_points(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3) lie above the table, in the workspace and in view, with a margin: (n,) bool."""
+        """(n,) bool: whether points (n, 3) are above the table, in the workspace and in the image, with a margin."""
         uv, depth = self.camera().project(points)
         size = np.array((self.width, self.height))
         with np.errstate(invalid="ignore"):

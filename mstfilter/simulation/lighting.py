@@ -1,8 +1,4 @@
-"""The rendered poses, and the light on the table and on bodies.
-
-`Stage` holds the poses that are rendered. `LightMap` holds the light on the table. `BodyColours` gives the colours of
-points on objects and on the finger.
-"""
+"""The rendered poses (`Stage`), and the light on the table (`LightMap`) and on bodies (`BodyColours`)."""
 
 from __future__ import annotations
 
@@ -23,11 +19,11 @@ _FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
 
 
 class Stage:
-    """The rendered poses: the poses of the physics without small vibrations.
+    """The poses at which bodies are rendered, without the small vibrations of the simulated poses.
 
     Soft contacts make bodies at rest move by micrometres between frames. A rendered pose changes only if a point of
     the body has moved by more than `tolerance` metres. Images, recorded poses and volumes agree exactly, because all
-    use the rendered poses. The physics is not changed.
+    use the rendered poses.
     """
 
     def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
@@ -42,7 +38,7 @@ class Stage:
         mujoco.mj_kinematics(world.model, self._data)
 
     def follow(self) -> None:
-        """Update the rendered poses from the poses of the physics, within the tolerance."""
+        """Update the rendered poses of the finger, and of objects that have moved by more than the tolerance."""
         world = self.world
         now, finger = world.poses(), world.finger_position()
         shift = np.linalg.norm(now[:, :3, 3] - self.poses[:, :3, 3], axis=1)
@@ -58,7 +54,7 @@ class Stage:
         self._mj.mj_kinematics(world.model, self._data)
 
     def save(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The rendered poses, for `restore`."""
+        """The rendered poses, as the parameter of `restore`."""
         return self.poses.copy(), self._finger.copy(), self._data.qpos.copy()
 
     def restore(self, saved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
@@ -70,7 +66,7 @@ class Stage:
     def cast(
         self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """`PhysicsWorld.cast` with the rendered poses."""
+        """Cast rays as in `PhysicsWorld.cast`, with bodies at the rendered poses."""
         return self.world.cast(origin, directions, groups, self._data)
 
 
@@ -88,9 +84,9 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 
 
 class LightMap:
-    """Raster of the light on the table: the mean of cosine times visibility over light sources (k, 3).
+    """Raster of the light on the table. A value is the mean of cosine times visibility over light sources (k, 3).
 
-    The raster has a `spacing` in metres. The number of shadow rays does not depend on the image size.
+    The raster has a `spacing` in metres.
     """
 
     def __init__(self, spacing: float, lights: np.ndarray) -> None:
@@ -104,7 +100,7 @@ class LightMap:
         self._values = np.zeros(nx * ny, np.float32)
 
     def update(self, stage: Stage) -> None:
-        """Cast the shadow rays."""
+        """Compute the raster from shadow rays at the rendered poses."""
         self._values[:] = 0
         for light, rays, cosine in zip(self._lights, self._rays, self._cosine, strict=True):
             _, distance, _ = stage.cast(light, rays, SHADOW_GROUPS)
@@ -113,7 +109,7 @@ class LightMap:
         self._values /= np.float32(len(self._lights))
 
     def sample(self, xy: np.ndarray) -> np.ndarray:
-        """Bilinear values (n,) at points (n, 2) of the table. Points outside the map have the value at the border."""
+        """Interpolated values (n,) at points (n, 2) of the table. Points outside the map take the border value."""
         place = np.clip((xy - _MAP_LOW) / self._spacing, 0, np.array(self._shape) - 1.001)
         at = place.astype(np.int64)
         share = (place - at).astype(np.float32)
@@ -131,7 +127,7 @@ class BodyColours:
         self._stage, self._atlas, self._room, self._eye = stage, atlas, room, eye
 
     def at(self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Linear colours (n, 3) float32 of points (n, 3) of geoms (n,) with normals (n, 3)."""
+        """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,)."""
         room, instance = self._room, self._stage.world.geom_object[geom]
         albedo, gloss, smooth = self._materials(instance, geom, points, normal)
         # Highlight by Blinn and Phong: the normal against the half vector between eye and lamp.
@@ -166,7 +162,7 @@ class BodyColours:
         return albedo, gloss, smooth
 
     def _light(self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Light (n, 3) of the lamp and of the ceiling at points."""
+        """Light (n, 3) from the lamp, and light (n, 3) from the ceiling, at points (n, 3)."""
         room, finger = self._room, instance == FINGER_ID
         lamp, sky = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
         for light in room.lamp:
@@ -197,7 +193,7 @@ def _rotate(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Smooth normals of a solid of revolution made of flat facets: the azimuth is taken from the point."""
+    """Smooth normals of a solid of revolution made of flat facets. A point gives the azimuth of its normal."""
     if shape.print_as != "lathe" or len(shape.pieces) == 1:
         return normal
     radius = np.hypot(points[:, 0], points[:, 1])

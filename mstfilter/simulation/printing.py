@@ -51,7 +51,7 @@ def shade(
 def noise(
     rng: np.random.Generator, shape: tuple[int, int], cell: tuple[float, float], octaves: int = 4
 ) -> np.ndarray:
-    """Smooth noise (H, W) float32, a sum of octaves, of mean about 0 and standard deviation about 1.
+    """Smooth noise (H, W) float32, a sum of octaves, with mean about 0 and standard deviation about 1.
 
     `cell` is the size (rows, columns) in pixels of the coarsest octave.
     """
@@ -75,7 +75,7 @@ def _tint(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
 
 
 def _ink(colour: _Rgb) -> _Rgb:
-    """Black or white, with the larger contrast to the ground colour."""
+    """Black or white: the ink with the larger contrast to the background colour."""
     return (28, 26, 30) if 0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2] > 125 else (240, 238, 232)
 
 
@@ -138,7 +138,7 @@ def _picture(rng: np.random.Generator, image: np.ndarray, centre: tuple[int, int
 
 
 def brand(rng: np.random.Generator, pool: Pool = ANY) -> tuple[str, str]:
-    """A brand name and a product."""
+    """A brand name and a product name."""
     return pool.name(rng, _WORDS), pool.name(rng, _KINDS)
 
 
@@ -240,7 +240,7 @@ def lid(rng: np.random.Generator, size: float, colour: _Rgb, ridges: bool, pool:
 def wood(
     rng: np.random.Generator, width: float, height: float, colour: _Rgb | None = None, dot: float = DOT
 ) -> np.ndarray:
-    """Wood with grain along the width, `dot` metres per pixel."""
+    """Texture of wood with the grain along the width. A pixel is `dot` metres wide."""
     if colour is None:
         r = rng.uniform(0.75, 1.0)
         colour = (int(215 * r), int(178 * r * rng.uniform(0.9, 1.03)), int(132 * r * rng.uniform(0.8, 1.1)))
@@ -280,7 +280,7 @@ def speckle(
 def glaze(
     rng: np.random.Generator, width: float, height: float, colours: tuple[_Rgb, _Rgb], motif: int
 ) -> np.ndarray:
-    """Glazed ceramic: plain (motif 0), stripes (1) or dots (2)."""
+    """Glazed ceramic: plain (motif 0), with stripes (1) or with dots (2)."""
     import cv2
 
     image = _canvas(width, height, colours[0])

@@ -9,8 +9,8 @@
 ...     push = belief.most_informative(pushes, lambda p: belief.push_information(p.swept(loop.grid), tolerance=50))
 ...     state, _ = mst.step(state, loop.play(push or pushes[0]))
 
-A policy chooses one of the candidate pushes from clips and beliefs. Only scores use the ground truth. The scene and
-its candidates depend on the family, the seed and the earlier pushes.
+A policy chooses one of the candidate pushes, using only clips and beliefs. The ground truth is for scores only. The
+scene and the candidate pushes depend on the family, the seed and the earlier pushes.
 """
 
 from __future__ import annotations
@@ -93,9 +93,10 @@ class PushLoop:
         return len(self.effects)
 
     def candidates(self, n: int) -> tuple[FingerPush, ...]:
-        """`n` random pushes towards objects. The start of each push is free of objects. The scene does not change.
+        """`n` random pushes towards objects. Each push starts at a free position. The scene does not change.
 
-        Pushes are drawn towards true objects, so most pushes move an object. Some pushes miss or drop an object.
+        Pushes are drawn towards true objects, so most pushes move an object. Some pushes miss all objects or drop an
+        object.
         """
         check_integer("number of candidates", n)
         rng = stream(self._scene.seed, "candidates", self.n_pushes)
@@ -121,7 +122,7 @@ class PushLoop:
         return self.clip
 
     def save(self) -> LoopState:
-        """The present state, for `restore`. A policy can try several pushes from a saved state."""
+        """A copy of the state of the scene. With `restore`, a policy can try several pushes from the same state."""
         world, stage = self._scene.world.save(), self._scene.stage.save()
         return LoopState(world, stage, tuple(self._recorded), tuple(self.effects), self.clip)
 

@@ -1,23 +1,22 @@
-"""Recording of simulated scenes. A call with an integer seed writes a recording folder.
+"""Recording of simulated scenes. `simulate_recording` writes a recording folder for an integer seed.
 
 >>> from mstfilter.simulation import scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 >>> recording.truth(0).shape  # doctest: +SKIP
 (80, 80, 30)
 
-The same family and seed give the same bytes on one machine with one build of the libraries. Each part of the
-simulation has a separate random stream, with a name and an index.
+The same family and seed give byte-identical recordings on one machine with the same library versions. Each part of
+the simulation has a separate random stream, with a name and an index.
 
-`cached_recording` stores recordings on disk and uses stored recordings again.
+`cached_recording` stores recordings on disk, and later calls return the stored recordings.
 
 >>> from mstfilter import open_recording
 >>> from mstfilter.simulation import cached_recording
 >>> recording = open_recording(cached_recording("s2", seed=7))  # doctest: +SKIP
 >>> small = cached_recording("s2", 7, width=160, height=120, n_actions=1)  # doctest: +SKIP
 
-The name of a cached folder has a hash of the fields of the family, the seed, and the versions of the simulator and of
-MuJoCo. A folder is written under a temporary name and renamed when the recording is complete. Several processes can
-ask for the same recording.
+The name of a cached folder contains a hash (`recipe_key`). A folder is written under a temporary name and renamed
+when the recording is complete. Several processes can request the same recording at the same time.
 """
 
 from __future__ import annotations
@@ -100,7 +99,7 @@ class SimulatedScene:
         return choose_push(stream(self.seed, "push", action), self.world, self.family)
 
     def play(self, push: FingerPush, on_frame: Callable[[float], None]) -> PushEffect:
-        """Simulate a push from one pause to the next. ``on_frame(time)`` is called at each frame in between."""
+        """Simulate a push from one pause to the next. ``on_frame(time)`` is called for each frame."""
         family, world = self.family, self.world
         before, began = world.poses(), world.time
         for step in range(1, family.frames_per_clip - 1):
@@ -124,7 +123,7 @@ class SimulatedScene:
         return label_voxels(self.objects.shapes, self.poses(), self.grid)
 
     def poses(self) -> np.ndarray:
-        """T_world_object (n, 4, 4) of the current state as rendered."""
+        """Rendered T_world_object (n, 4, 4) of the objects in the current state."""
         self.stage.follow()
         return self.stage.poses
 
@@ -218,7 +217,7 @@ def cache_folder() -> Path:
 
 
 def recipe_key(family: SceneFamily, seed: int) -> str:
-    """A hash of the family, the seed and the versions, which determine the bytes of a recording."""
+    """A hash of all values that determine a recording: the family, the seed and the software versions."""
     recipe = {
         "generator": GENERATOR_VERSION,
         "mujoco": version("mujoco"),

@@ -1,7 +1,7 @@
 """Colour, depth and instance images by ray casting. The renderer needs no display, GPU or OpenGL.
 
-One ray per pixel gives depth and instance. Colours come from a few shadow rays to a lamp and to the ceiling, and from
-the textures.
+One ray per pixel gives depth and instance. Colours are computed from textures and from shadow rays to a lamp and the
+ceiling.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _OFFSETS = ((-0.34, 0.14), (0.34, -0.14))  # of further rays within a pixel on a
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Images without noise."""
+    """Rendered images without sensor noise."""
 
     colour: np.ndarray  #: (H, W, 3) float32, linear intensity before exposure
     depth: np.ndarray  #: (H, W) float32 metres, z-depth of the first surface; NaN for none
@@ -38,8 +38,8 @@ def visible_texel(camera: Camera) -> float:
 class Renderer:
     """Renders the current state of a world.
 
-    There is one skin (texture) for each object. `supersample` casts additional rays for pixels on edges. The rendered
-    poses may differ from the physics by `tolerance` metres; see `Stage`.
+    Each object has one texture (`Skin`). `supersample` casts additional rays for pixels on edges. Rendered poses may
+    differ from simulated poses by `tolerance` metres; see `Stage`.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Renderer:
         self._lamp_map, self._sky_map = LightMap(fine, room.lamp), LightMap(2 * fine, room.sky)
 
     def _render_background(self) -> None:
-        """Render the room without objects. Between images, only the light on the table changes."""
+        """Render the room without objects. Later images recompute only the light on the table."""
         geom, z, normal = self.stage.cast(self._eye, self._rays, (ROOM_GROUP,))
         points = self._eye + self._rays * z[:, None]
         self._room_depth = np.where(geom >= 0, z, np.nan).astype(np.float32)
@@ -160,7 +160,7 @@ class Renderer:
 
 
 def _edge_pixels(ids: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Pixel indices (k,) on borders of instances (H, W), or at sharp changes of the normal (H, W, 3) of a body."""
+    """Indices (k,) of pixels at borders of the instance image `ids`, or at sharp changes of `normal` (H, W, 3)."""
     edge = np.zeros(ids.shape, bool)
     x, y, z = (np.ascontiguousarray(normal[..., i]) for i in range(3))
     for here, there in NEIGHBOURS:

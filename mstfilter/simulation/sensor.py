@@ -1,8 +1,8 @@
 """Models of a structured-light depth sensor and of a colour camera.
 
 The depth sensor shifts pixels on depth edges sideways, in small patches. Disparity has Gaussian noise and is rounded
-to eighths of a pixel of a Kinect's raster (f = 525 pixels, baseline 75 mm). Noise and rounding give sigma = 1.85 mm
-(z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the left of
+to eighths of a Kinect pixel (f = 525 pixels, baseline 75 mm). Noise and rounding give depth a standard deviation of
+1.85 mm (z / m)^2, as measured on real table tops. There is no reading in the shadow of the projector (to the left of
 objects), at some depth edges, on surfaces at a grazing angle, and out of range. The colour camera has optical blur,
 photon noise and the sRGB curve.
 
@@ -113,7 +113,7 @@ def _depth_edges(depth: np.ndarray) -> np.ndarray:
 
 
 def _patches(draw: Callable[..., np.ndarray], h: int, w: int, side: int) -> np.ndarray:
-    """Random values (h, w) that are equal within squares of side x side pixels."""
+    """Random values (h, w) that are constant within squares of side x side pixels."""
     small = draw(size=(-(-h // side), -(-w // side)))
     return np.repeat(np.repeat(small, side, axis=0), side, axis=1)[:h, :w]
 

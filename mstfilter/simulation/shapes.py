@@ -1,8 +1,7 @@
 """Household objects made of convex pieces: shapes, sizes and voxels.
 
-`draw_shape(rng, family)` returns a `Shape`: pieces in the frame of the body, the poses in which it rests, its mass
-and the layout of its texture. The origin of the frame is the middle of the bounding box. In the upright pose, z
-points up.
+`draw_shape(rng, family)` returns a `Shape` with convex pieces in body axes, rest poses, mass and texture layout. The
+origin of the body axes is the middle of the bounding box. In the upright pose, the z axis points up.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -10,12 +9,12 @@ points up.
 >>> len(shape.pieces), shape.family
 (1, 'can')
 
-Sizes and masses are rounded values of objects in the YCB set. The YCB set is described by Calli et al., "Benchmarking
-in manipulation research: the YCB object and model set", IEEE Robotics & Automation Magazine 22(3), 2015, table of
-objects. The objects from the set are cracker, sugar, pudding and gelatin box, soup, tuna and coffee can, mug, bowl,
-banana, ball. The crisps can is 0.20 m high (0.25 m in the set). Tea, biscuits, bricks, bottle, soap and angle are not
-in the set and have similar sizes. Each measure is scaled by up to 10 %. Walls of bowl and mug are 1 cm thick, more
-than real walls. A thinner wall could lie between the centres of 1 cm voxels and be missing in the true volume.
+Sizes and masses are rounded from the YCB set (Calli et al., "Benchmarking in manipulation research: the YCB object
+and model set", IEEE Robotics & Automation Magazine 22(3), 2015). The boxes of crackers, sugar, pudding and gelatin,
+cans of soup, tuna and coffee, mug, bowl, banana and ball are from the YCB set. The crisps can is 0.20 m high (0.25 m
+in the YCB set). Tea, biscuits, bricks, bottle, soap and angle are not in the YCB set but have similar sizes. Each
+length is scaled at random by up to 10 %. The walls of bowl and mug are 1 cm thick, thicker than real walls. A thinner
+wall could lie between the centres of 1 cm voxels and be missing in the true volume.
 
 `label_voxels` returns the true volume: all voxels of each object, visible or not.
 
@@ -56,8 +55,8 @@ _UP_X, _UP_Y, _UP_Z, _DOWN_Z = 1, 2, 3, -3
 class Pool:
     """A set of sizes, hues and names from which the objects of scenes are drawn.
 
-    Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range in alternate bands,
-    so that the pools are equally difficult.
+    Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range of sizes in
+    alternate bands, so that the pools are equally difficult.
     """
 
     half: int | None = None  #: {0, 1, None}: which of the two disjoint pools; None for all sizes, hues and names
@@ -80,7 +79,7 @@ class Pool:
         return (2 * k + self.half + _within_band(u * _N_HUES / 2 - k)) / _N_HUES
 
     def name(self, rng: np.random.Generator, names: Sequence[str]) -> str:
-        """One of the names in the pool."""
+        """Draw one of the `names` that belong to the pool."""
         available = names if self.half is None else names[self.half :: 2]
         return available[int(rng.integers(len(available)))]
 
@@ -129,7 +128,7 @@ class Shape:
         return self.mass / sum(piece.volume for piece in self.pieces)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (..., 3) of the body's frame lie in the object: (...) bool."""
+        """(...) bool: whether points (..., 3) in body axes are in the object."""
         points = np.asarray(points)
         found = np.zeros(points.shape[:-1], bool)
         for piece in self.pieces:
@@ -142,8 +141,8 @@ class Shape:
 def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, and 0 for other voxels.
 
-    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. A centre in two objects
-    gets the label of the first object.
+    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. If a voxel centre lies in
+    two objects, the voxel gets the label of the first object.
     """
     labels = np.zeros(grid.shape, np.uint16)
     for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
@@ -295,7 +294,7 @@ SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)  #: Names of the families of ob
 
 
 def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:
-    """Draw a member of one of `SHAPE_FAMILIES`. Each measure is scaled by a factor from the pool."""
+    """Draw a member of one of `SHAPE_FAMILIES`. Each length is scaled by a random factor from the pool."""
     if family not in _MAKERS:
         raise InputError(f"unknown family of shapes {family!r}", f"known: {', '.join(SHAPE_FAMILIES)}")
     return _MAKERS[family](rng, lambda: pool.factor(rng))

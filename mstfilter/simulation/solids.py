@@ -41,7 +41,7 @@ class Piece:
         return ConvexHull(self.vertices)
 
     def inside(self, points: ArrayLike) -> np.ndarray:
-        """Whether points (..., 3) of the body's frame lie in the solid or on its surface: (...) bool."""
+        """(...) bool: whether points (..., 3) in body axes are in the solid or on the surface of the solid."""
         p = (np.asarray(points, dtype=np.float64) - self.centre) @ self.rotation
         if self.kind == "box":
             return (np.abs(p) <= np.array(self.size) + _TOLERANCE).all(axis=-1)

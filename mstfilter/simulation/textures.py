@@ -1,8 +1,8 @@
 """Textures of objects, and the room around the objects.
 
-The skin of an object consists of a few flat texture images, called charts (`draw_skin`). Coordinates and normal of a
-surface point determine its chart and its place in the chart (`texture_coordinates`). An `Atlas` holds the charts of
-all objects in one array. Charts show the surface from outside with the upper edge up, so text is not mirrored.
+The texture (`Skin`) of an object consists of a few flat images, called charts. The coordinates and the normal of a
+surface point determine a chart, and coordinates in the chart (`texture_coordinates`). An `Atlas` holds the texture
+images of all objects in one array. A chart shows the surface from outside with the upper edge up.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape
@@ -34,9 +34,9 @@ _SIDE, _TOP, _BOTTOM, _INSIDE = range(4)
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Texture of a body: uint8 charts (h, w, 3), and the strength of the highlight, 0 .. 1.
+    """Texture of a body: flat images (h, w, 3) uint8, called charts, and the strength of the highlight, 0 .. 1.
 
-    The charts are six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart is plain.
+    Charts show six faces (-x, +x, -y, +y, -z, +z) or side, top, bottom and inside. The last chart has one colour.
     """
 
     charts: tuple[np.ndarray, ...]
@@ -58,7 +58,7 @@ def _face_axes(face: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
-    """Width and height in metres of each chart of a shape, without the plain chart."""
+    """Width and height in metres of each texture image of a shape, except the image with one colour."""
     if shape.print_as == "box":
         return [(2 * abs(r @ shape.half), 2 * abs(u @ shape.half)) for r, u in map(_face_axes, range(6))]
     across = 2 * float(min(shape.half[0], shape.half[1]))
@@ -69,10 +69,10 @@ def _chart_sizes(shape: Shape) -> list[tuple[float, float]]:
 def texture_coordinates(
     shape: Shape, points: np.ndarray, normals: np.ndarray, plain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chart number (n,) of surface points, and place (n, 2) in the chart, 0 .. 1 from the upper left corner.
+    """Texture image number (n,) and texture coordinates (n, 2) of surface points.
 
-    `points` and outward unit `normals` (n, 3) are in the body's frame, in metres. `plain` (n,) bool marks points with
-    the plain colour.
+    `points`, in metres, and outward unit `normals` (n, 3) are in body axes. `plain` (n,) bool marks points without
+    texture. Texture coordinates are 0 .. 1 from the upper left corner.
     """
     place = np.zeros((len(points), 2), np.float32)
     if shape.print_as == "box":
@@ -147,7 +147,7 @@ def draw_skin(rng: np.random.Generator, shape: Shape, pool: Pool = ANY) -> Skin:
 
 
 class Atlas:
-    """The charts of many skins in one array, averaged to pixels of `texel` metres."""
+    """The texture images of many objects in one array, averaged to pixels of `texel` metres."""
 
     def __init__(self, skins: list[Skin], texel: float) -> None:
         import cv2
@@ -166,7 +166,7 @@ class Atlas:
         self._texels = _linear(np.concatenate([chart.reshape(-1, 3) for chart in texels]))
 
     def colour(self, skin: int, chart: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Linear albedo (n, 3) float32 of a texture, interpolated at coordinates (n, 2) in its charts (n,)."""
+        """Linear albedo (n, 3) float32 of a texture, interpolated at the coordinates `place` (n, 2)."""
         chart = chart + self._base[skin]
         w, h = self._width[chart], self._height[chart]
         x = np.clip(place[:, 0] * w - 0.5, 0, w - 1.001)
@@ -182,7 +182,7 @@ class Atlas:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Surroundings of a scene. Colours are linear, float32."""
+    """Table, floor, wall and lights around a scene. Colours are linear, float32."""
 
     table: np.ndarray  #: (h, w, 3) albedo of the table top, row 0 at its far edge
     rim: np.ndarray  #: (3,) albedo of the table's edge
@@ -212,7 +212,7 @@ def _table_top(rng: np.random.Generator, texel: float) -> np.ndarray:
 
 
 def draw_room(rng: np.random.Generator, texel: float) -> Room:
-    """Draw the surroundings of a scene. `texel` is the resolution of the table top in metres."""
+    """Draw the surroundings of a scene. `texel` is the pixel size of the table's texture in metres."""
     table = _linear(_table_top(rng, texel))
     side = -1.0 if rng.uniform() < 0.5 else 1.0
     centre = np.array([side * rng.uniform(0.35, 0.8), rng.uniform(-0.7, 0.1), rng.uniform(1.3, 1.7)])

@@ -13,8 +13,8 @@ pieces with torsional and rolling friction. The finger is a capsule on three sli
 arm above the finger is visible but has no contacts.
 
 An action is a `FingerPush`: the finger comes down, moves in a straight line, and goes up and away. `choose_push`
-simulates candidate pushes from one state. `choose_push` takes the first push that moves enough objects and drops
-none. Physics is faster than rendering, so dozens of candidates are tried.
+simulates dozens of candidate pushes from one state, and takes the first push that moves enough objects and neither
+topples nor drops an object.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _model_xml(shapes: Sequence[Shape], arm: bool) -> str:
 class PhysicsWorld:
     """Objects on a table, and a finger.
 
-    Object k has the shape ``shapes[k]``. The id of the object in images, voxels and poses is k + 1. Objects start far
-    from the table. `place` puts one object on the table. The arm of the finger is visible but has no contacts.
+    Object k has the shape ``shapes[k]``, and the id k + 1 in images, voxels and poses. Objects start far from the
+    table. `place` puts one object on the table.
     """
 
     def __init__(self, shapes: Sequence[Shape], arm: bool = True) -> None:
@@ -211,25 +211,25 @@ class PhysicsWorld:
         return calm >= 5
 
     def contacts(self) -> list[tuple[int, int]]:
-        """Pairs (i, j), i < j, of objects that touch or are less than half a millimetre apart, after `forward`."""
+        """Pairs (i, j), i < j, of objects less than half a millimetre apart. Call `forward` before."""
         pairs = np.sort(self.geom_object[self.data.contact.geom.reshape(-1, 2)], axis=1)
         objects = (pairs[:, 0] >= 1) & (pairs[:, 1] < FINGER_ID)
         return [(i - 1, j - 1) for i, j in np.unique(pairs[objects], axis=0).tolist()]
 
     def overlaps(self, k: int | None = None) -> bool:
-        """Whether object k (None: the finger) overlaps an object, after `forward`."""
+        """Whether object k (None: the finger) overlaps another object. Call `forward` before."""
         body = FINGER_ID if k is None else k + 1
         pairs, distance = self.geom_object[self.data.contact.geom.reshape(-1, 2)], self.data.contact.dist
         return bool(((distance < 0) & (pairs == body).any(axis=1) & (pairs >= 1).all(axis=1)).any())
 
     def deepest_overlap(self) -> float:
-        """Greatest depth in metres at which objects overlap each other or the table, after `forward`."""
+        """Greatest depth (m) at which objects overlap each other or the table. Call `forward` before."""
         contact = self.data.contact
         objects = (self.geom_object[contact.geom.reshape(-1, 2)] > 0).any(axis=1)
         return float(-contact.dist[objects].min(initial=0.0))
 
     def save(self) -> np.ndarray:
-        """The full state of the simulation. After `restore`, the simulation gives bit-identical results."""
+        """The full state of the simulation. A restored simulation gives bit-identical results."""
         kind = self._mj.mjtState.mjSTATE_INTEGRATION
         state = np.empty(self._mj.mj_stateSize(self.model, kind))
         self._mj.mj_getState(self.model, self.data, state, kind)
@@ -245,10 +245,10 @@ class PhysicsWorld:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cast rays from one point (3,), in metres, along directions (n, 3) of any length.
 
-        `groups` are the visible geoms: 0 the room, 1 objects, 2 finger and arm. `data` is another state of the same
-        model. The default is the state of the world after `forward`. Returns the first geom (n,) int32 that each ray
-        hits (-1 for none), the distance (n,), and the normal (n, 3) of the surface. The distance is in units of the
-        length of the direction.
+        `groups` are the geoms that rays can hit: 0 for the room, 1 for objects, 2 for finger and arm. `data` is
+        another state of the same model. The default is the state of the world after `forward`. Returns the first geom
+        (n,) int32 that each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the surface. The
+        distance is in units of the length of the direction.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
@@ -295,7 +295,7 @@ class FingerPush:
 
 @dataclass(frozen=True)
 class PushEffect:
-    """The effect of a push."""
+    """The effect of a push on the objects."""
 
     displacement: np.ndarray  #: (n,) metres, distance that each object's origin moved
     turned: np.ndarray  #: (n,) radians, angle by which each object turned
@@ -336,7 +336,7 @@ def play_push(world: PhysicsWorld, push: FingerPush, family: SceneFamily) -> Pus
 
 
 def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: SceneFamily) -> PushEffect:
-    """The effect of a push, from the poses (n, 4, 4) before the push."""
+    """The effect of a push, computed from the poses `before` (n, 4, 4)."""
     after = world.positions()
     trace = np.einsum("nij,nij->n", before[:, :3, :3], world.rotations())
     kept = bool(family.contains_points(after).all())
@@ -380,8 +380,8 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate moves
-    fewer objects or topples an object, the best compromise is taken. Candidates that drop an object or leave an
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate fails, the
+    candidate with the best balance of moved and toppled objects is taken. Candidates that drop an object or leave an
     object in motion are discarded. Raises InputError if no candidate moves any object.
     """
     saved = world.save()
