@@ -12,8 +12,8 @@ independent, and their log densities are summed. `log_prob` returns an array (n,
 rows.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
-of the classes of this module (`as_distribution`). The classes of this module are three to six times as fast as
-scipy's. For a distribution of another library, write a `Distribution` whose `sample` draws from the given generator.
+of the classes of this module (`as_distribution`). This module is three to six times as fast as scipy. For a
+distribution of another library, write a `Distribution` whose `sample` draws from the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
 and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of

@@ -137,7 +137,7 @@ class AtStep(Bounded):
 
     @cached_property
     def _of_step(self) -> dict[str, dict[str, bool] | None]:
-        """Map each field that depends on the step to its ``t`` and ``u`` parameters; None for a component or model."""
+        """Map each field that depends on the step to its parameters `t` and `u`; None for a component or model."""
         found: dict[str, dict[str, bool] | None] = {}
         for name, n_arguments in self.step_functions.items():
             value = getattr(self, name)

@@ -356,7 +356,7 @@ class Infos(list[Info]):
     """
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per step: the numbers of `Info`, and the wall times in seconds of the step and of each component."""
+        """One row per step: the numbers of `Info`, and the wall time in seconds of the step and each component."""
         slots = dict.fromkeys(slot for info in self for slot in info.seconds)
         return [
             {

@@ -62,8 +62,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     In MST the weight of a candidate is known before the candidate is built, so only selected candidates are built.
     `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) are the
-    indices of the candidates in order; repeated indices are allowed. If `indices` is an integer n, the indices are 0
-    .. n-1.
+    indices of the candidates in order; repeated indices are allowed. An integer n stands for the indices 0 .. n-1.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     @property
     def n_built(self) -> int:
-        """Number of distinct candidates built so far. Candidates built through a selection by `take` are counted too."""
+        """Number of distinct candidates built so far, including candidates built through a selection by `take`."""
         return len(self._built)
 
     def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
@@ -321,13 +320,13 @@ class Population:
         return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
 
     def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
-        """The same particles and weights with the given `parents` ((n,) int64 arrays) and `notes` (empty by default)."""
+        """The same particles and weights with the given `parents`, (n,) int64 arrays, and `notes` (default empty)."""
         new = object.__new__(Population)  # checked already
         new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
         return new
 
     def traced_through(self, resampled: Population | None) -> Population:
-        """The same particles, with indices of parents in the population before the last resampling before the prediction.
+        """The same particles, with parents in the population from which `resampled` was selected.
 
         ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, the indices are converted to
         indices into the population before the resampling. The field `notes` of the result is empty.
@@ -341,7 +340,7 @@ class Population:
         return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
-        """Replace the particles by the same number of others. Weights and parents are kept, and `notes` is emptied."""
+        """Replace the particles by the same number of others, with the same weights and parents and empty `notes`."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")

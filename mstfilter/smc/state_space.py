@@ -152,7 +152,7 @@ class _OfModel(AtStep):
 
     @property
     def batched(self) -> bool | None:
-        """The value of the model. With a proposal, True becomes None, so that a batch of runs tests the proposal."""
+        """The `batched` of the model. With a proposal, True becomes None, so that `run_many` tests the proposal."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
@@ -366,7 +366,7 @@ def guided(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The guided filter moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
+    """The guided filter: moves by a proposal q(x_t | x_{t-1}, y_t), weights f p(y_t | x_t) / q.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def auxiliary(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The auxiliary filter (Pitt and Shephard 1999) selects by weight times priority, and divides by the priority.
+    """The auxiliary filter, which selects particles by weight times priority (Pitt and Shephard 1999).
 
     Parameters
     ----------

@@ -2,14 +2,14 @@
 
 A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
 ``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
-error, but its weights are wrong. `Guard` checks steps 1, 2, 9, 66, 515 and so on. These numbers 8^k + k have all
-remainders modulo 3, so a fault in every third step is also detected. A check has three parts:
+error, but its weights are wrong. Steps of each kind (first, later, without observation) are counted, and the steps 1,
+2, 9, 66, 515, ... are checked. The numbers 8^k + k have all remainders modulo 3, so a fault in every third step is
+detected. A check has three parts:
 
 1. The first two steps are repeated with the same random numbers. All values and log weights must agree.
 2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
-   change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. The
-   number of these particles differs from the number in the step, so an event axis is not mistaken for the particle
-   axis.
+   change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. A run
+   of few particles also detects an event axis used as the particle axis.
 3. If there is a guide, particles are also drawn from the model. The guide must be able to draw the values of the
    model, and the two estimates of the evidence must agree.
 
@@ -158,7 +158,7 @@ class Guard:
 
 
 class Schedule(Counter[Any]):
-    """Counts the steps of a model and its guide. Programs with the same functions share the counts."""
+    """Counts the steps of each kind for a model and its guide. Programs with the same functions share the counts."""
 
     @classmethod
     def of(cls, model: Any, guide: Any) -> Schedule:

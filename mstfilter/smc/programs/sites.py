@@ -22,7 +22,7 @@ _RECORDED: ContextVar[list[ProgramRun] | None] = ContextVar("runs that record th
 
 @contextmanager
 def recorded() -> Iterator[list[ProgramRun]]:
-    """Yields a list of the `ProgramRun` of each program that runs inside the block. Each run stores its `calls`."""
+    """List of the `ProgramRun` of each program that runs inside the block. Each run stores its `calls`."""
     runs: list[ProgramRun] = []
     token = _RECORDED.set(runs)
     try:
@@ -73,8 +73,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
         `observe` and `switch`. A name that several branches sample is one array. The entries of particles that do not
         reach the call are NaN (0 for integers). A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Arguments whose rows are split among the branches. A branch reads values that all particles share from its
-        closure.
+        Arguments whose rows are split among the branches. Values shared by all particles are read from the closure.
 
     Returns
     -------
