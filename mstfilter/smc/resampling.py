@@ -69,7 +69,7 @@ class Stratified(WeightResampler):
 
 @dataclass(frozen=True)
 class Systematic(WeightResampler):
-    """Makes floor or ceil of n W_i copies, with one uniform draw for all strata (Carpenter, Clifford, Fearnhead 1999)."""
+    """Makes floor or ceil of n W_i copies, by one uniform number for all (Carpenter, Clifford, Fearnhead 1999)."""
 
     batched: ClassVar[bool] = True
 
@@ -289,8 +289,8 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    If n < 2000, the indices are sorted. If n >= 2000, the time is O(m + n), and only indices of different strata are
-    in order.
+    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and indices ascend only from stratum to
+    stratum.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -317,7 +317,7 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight. Each point is first assigned to one of several strata of equal weight.
+    """(n,) indices drawn independently by weight. The points are first distributed among strata of equal weight.
 
     For 10^6 points, the function is four times as fast as a binary search.
 

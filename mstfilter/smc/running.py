@@ -69,8 +69,9 @@ def run_many(
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. The axis "arm" holds the filters. A
-        run ends if all weights are zero (`LostRunError`). From this step on its log evidence is -inf, and other
-        results are NaN. `History.lost` gives the reasons, and `History.single` the reasons for runs made one by one.
+        run ends if all weights are zero (`LostRunError`). From this step on, the log evidence of the run is -inf, and
+        other results are NaN. `History.lost` gives the reasons, and `History.single` the reasons for runs made one by
+        one.
 
     Warns
     -----
@@ -183,7 +184,7 @@ class _Job:
         return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost, single=dict(single))
 
     def joined(self, name: str, rows: list[np.ndarray], n_steps: int) -> np.ndarray:
-        """Values (run, time, ...) of a collector, -inf or NaN from the step at which all weights of a run are zero."""
+        """Values (run, time, ...) of a collector; -inf or NaN after all weights of a run became zero."""
         longest = max(rows, key=len)
         check_one_shape(name, [row.shape[1:] for row in rows if len(row)])
         complete = all(len(row) == n_steps for row in rows)

@@ -366,7 +366,7 @@ def guided(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The guided filter: moves by a proposal q(x_t | x_{t-1}, y_t), weights f p(y_t | x_t) / q.
+    """The guided filter, which moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def auxiliary(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The auxiliary filter, which selects particles by weight times priority (Pitt and Shephard 1999).
+    """Auxiliary filter (Pitt, Shephard 1999): selects by weight times priority, then divides weights by priority.
 
     Parameters
     ----------

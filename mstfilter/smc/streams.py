@@ -1,8 +1,7 @@
 """Random streams that are named by keys.
 
-All random numbers of a run are drawn from random streams with names (seed, slot, step, index). The slot is the
-component of the filter that draws. The streams do not depend on the number of workers, the order of work, or other
-components.
+All random numbers of a run are drawn from streams with names (seed, slot, step, index). A slot is a component of the
+filter. The streams do not depend on the number of workers, the order of work, or other components.
 
 >>> from mstfilter.smc import Key, child
 >>> rng = Key(seed=1).child("transition", 3).generator()     # of step 3, as `ParticleFilter` makes it
