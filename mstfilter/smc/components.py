@@ -189,8 +189,7 @@ class Kld(Size):
     With k occupied bins, the bound is n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
     size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` knows the
     weight W_b of each bin and chooses the least n with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected
-    number of bins that n draws occupy. The bound applies to any resampling scheme, and is slightly larger than Fox's
-    n.
+    number of bins that n draws occupy. The bound applies to any resampling scheme, and slightly exceeds Fox's n.
 
     Parameters
     ----------

@@ -207,7 +207,7 @@ class _Ancestry:
         self.weights = np.zeros(0)
 
     def begin(self, n: int) -> None:
-        """Set each of the n present particles as its own ancestor, drawn independently."""
+        """Start with the n present particles as ancestors. The particles must be independent draws."""
         self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
 
     def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:

@@ -18,7 +18,7 @@ distribution of another library, write a `Distribution` whose `sample` draws fro
 A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
 and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
 range is NaN. MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values
-have the log density NaN, and the move rejects these rows.
+have the log density NaN and are rejected.
 """
 
 from __future__ import annotations

@@ -188,8 +188,7 @@ class ClusterStratified(Resampler):
     of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n. The
     numbers are rounded by systematic resampling. The particles of a cluster share the weight of the cluster, so any
     numbers are unbiased. A cluster below `least_mass` gets W_g / c particles on average and may lose all particles.
-    If W_g / c < 1 and the cluster keeps a particle, the particle has weight c. ``notes["clusters"]`` is the number of
-    clusters.
+    If W_g / c < 1, a particle kept from the cluster has weight c. ``notes["clusters"]`` is the number of clusters.
 
     Parameters
     ----------

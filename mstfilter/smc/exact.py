@@ -69,7 +69,7 @@ def _matrices(
 
 
 def _varies(array: np.ndarray) -> dict[str, bool]:
-    """The keyword ``t`` if the matrix changes with time, in the form of `step_parameters`."""
+    """The parameters that `step_parameters` returns: ``t`` if the matrix changes with time."""
     return {"t": True} if array.ndim == 3 else {}
 
 

@@ -69,8 +69,7 @@ class ParticleFilter(AtStep):
     ----------
     initial : Proposal
         Draws the particles of the first step. The first observation updates the initial particles. The second step
-        makes the first prediction. If `initial` is None or equal to `proposal`, the first step has only proposed
-        particles.
+        makes the first prediction. If `initial` is None or equals `proposal`, step 0 has only proposed particles.
     transition : Transition
         Moves the particles from the previous time to the present time. None leaves the particles unchanged.
     proposal : Proposal, optional

@@ -84,7 +84,7 @@ class Candidates(Sequence[_T], Generic[_T]):
         return self._built[index]
 
     def built(self) -> tuple[_T, ...]:
-        """All candidates in order. Inside a block `parallel`, different candidates are built by several threads."""
+        """All candidates in order. Inside a block `parallel`, two candidates are built at the same time."""
         _, first = np.unique(self._indices, return_index=True)
         each(self.__getitem__, np.sort(first))
         return tuple(self)

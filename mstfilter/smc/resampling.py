@@ -1,8 +1,7 @@
 """Resampling schemes that use only the weights. The output weights are equal.
 
 W_i is the normalised weight of particle i, N_i the number of its copies among the n selected particles, and f =
-frac(n W_i). All schemes except `LargestWeights` are unbiased: E[N_i] = n W_i. The schemes differ in the variance of
-N_i.
+frac(n W_i). All schemes except `LargestWeights` are unbiased: E[N_i] = n W_i. The variances of N_i differ.
 
 ==============  =================================================  ====================================
 scheme          N_i                                                variance of N_i
@@ -21,8 +20,8 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 array([0, 0, 1, 2])
 
 Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from the number of
-weights. A particle of weight zero is never selected. `InputError` is raised if a log weight is NaN or +inf, or if all
-weights are zero.
+weights. A particle of weight zero is never selected. A log weight of NaN or +inf raises `InputError`. Weights that
+are all zero also raise `InputError`.
 
 Three functions invert the cumulative weights: `inverse_cdf` takes one point in each of n equal strata,
 `independent_draws` takes n independent points, and `draw_rows` takes one point for each row of a matrix. The `select`
@@ -289,8 +288,7 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and indices ascend only from stratum to
-    stratum.
+    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and the indices are partly sorted.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])

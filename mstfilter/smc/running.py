@@ -69,9 +69,9 @@ def run_many(
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. The axis "arm" holds the filters. A
-        run ends if all weights are zero (`LostRunError`). From this step on, the log evidence of the run is -inf, and
-        other results are NaN. `History.lost` gives the reasons, and `History.single` the reasons for runs made one by
-        one.
+        run ends if all weights are zero (`LostRunError`). From the step of the error, its log evidence is -inf, and
+        other results are NaN. `History.lost` gives the reasons, and `History.single` gives the reasons for runs made
+        one by one.
 
     Warns
     -----

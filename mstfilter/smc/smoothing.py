@@ -121,8 +121,7 @@ def backward_paths(
     Parameters
     ----------
     transition : DensityTransition
-        The transition of the model, ``Dynamics(model)``. A transition with a proposal has another density and cannot
-        be used.
+        The transition of the model, ``Dynamics(model)``. A transition with a proposal must not be used.
     method : "exact" or "mcmc"
         "exact" (Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 

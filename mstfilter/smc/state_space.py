@@ -401,8 +401,8 @@ def auxiliary(
     log_priority : callable
         ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}). The filter is exact for any finite priority.
     proposal, initial : callable, optional
-        As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
-        adapted.
+        As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal, the filter is "fully
+        adapted".
     **components
         As in `guided`.
     """

@@ -10,7 +10,7 @@ True
 
 A `Key` consists of an integer and a tuple, and can be stored in a file. The generator of a key is numpy's PCG64. The
 256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys are independent if
-the hash behaves like a random function. The probability that two of a billion streams have the same seed is below
+the hash behaves like a random function. The probability that two of a billion streams have equal seeds is below
 1e-50.
 
 A batched component is called once for R runs of n particles. The particles are `Rows`: arrays (R n, ...), with the n
@@ -99,7 +99,7 @@ def _digest(seed: int, path: tuple[int | str, ...], block: int | None) -> bytes:
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
-    """A generator of the stream named `parts` below the stream of `rng`, for example ``"object", 7``.
+    """A generator of the child stream `parts` of the stream of `rng`, for example ``"object", 7``.
 
     `rng` must be made from a seed, for example by numpy.random.default_rng or `Key`. `rng` is not advanced.
     """

@@ -41,7 +41,7 @@ class Program:
         return self._filter(None, n, components)
 
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
-        """Guided filter, which draws from the guide and weights by model / guide and the observations.
+        """Guided filter, which draws from the guide and weights by the density ratio of model and guide.
 
         The guide is a program that samples every name of the model, given the observation. If the observation is
         missing, particles are drawn from the model.

@@ -73,7 +73,8 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
         `observe` and `switch`. A name that several branches sample is one array. The entries of particles that do not
         reach the call are NaN (0 for integers). A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Arguments whose rows are split among the branches. Values shared by all particles are read from the closure.
+        Arguments whose rows are split among the branches. A branch reads values shared by all particles from its
+        closure.
 
     Returns
     -------

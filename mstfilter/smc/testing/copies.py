@@ -117,9 +117,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expected weight of each particle and group.
 
-        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is within four standard
-        errors of the expectation. The limit includes 16 additional copies over all calls, for rarely selected
-        particles.
+        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is near the expectation. Near
+        means within four standard errors, plus 16 copies over all calls.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)

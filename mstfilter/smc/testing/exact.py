@@ -48,8 +48,7 @@ class ExactContract(Contract):
         Distribution functions are compared at several quantiles. The sums detect columns that share a random number.
 
         The bounds assume a normal difference of two weighted means, with a false-alarm rate 20 times smaller than
-        needed. A tail is compared only if its probability is so large that single large weights do not decide the
-        test.
+        needed. A tail is compared only if its probability is so large that no single weight decides the test.
         """
         samples = []
         for log_weights in (lw, exact_lw):

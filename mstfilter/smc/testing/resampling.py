@@ -1,7 +1,7 @@
 """Contracts of resamplers.
 
 A particle of normalised weight W_i must get n W_i copies on average if the resampler is properly weighted. If output
-weights differ, its copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test
+weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test
 cases: n = m, n < m and n > m, ties, zeros, heavy and light weights.
 """
 
@@ -159,7 +159,7 @@ class WeightResamplerContract(ResamplerContract):
         )
 
     def _light_copies(self, component: WeightResampler, n_light: int, calls: int) -> np.ndarray:
-        """Copies of light particles among 100 000 copies. All light particles have a thousandth of the other weight."""
+        """Copies of light particles among 100 000 copies. Light particles have .1 % of the weight of particle 0."""
         n, rng, copies = 100_000, seeded(n_light), []
         weights = np.append(1.0, np.full(n_light, 1e-3 / n_light))
         population = Population(np.arange(float(len(weights))), np.log(weights))
