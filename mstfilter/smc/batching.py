@@ -2,7 +2,7 @@
 
 `mstfilter.smc.run_many` uses this module if all components can process the particles of several runs in one call.
 
-The components are called once per step with the particles of all runs, as one population of R n particles. Runs are
+Each component is called once per step with the particles of all runs, as one population of R n particles. Runs are
 batched if the attribute `batched` of each component is True or None. Programs and models of `StateSpaceModel.of` have
 ``batched=None``: batching is tried. The arrays of a call have no axis of runs. A component must treat each row
 independently, and draw arrays in the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``.

@@ -8,8 +8,7 @@
 
 The first axis is the axis of the particles. Parameters of shape () or (n,) give values of shape (n,): the event shape
 is (). Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The entries of an event are
-independent, and their log densities are summed. `log_prob` returns an array (n,), or a number if no argument has
-rows.
+independent, and their log densities are summed. `log_prob` returns (n,) values, or one value if no argument has rows.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
 of the classes of this module (`as_distribution`). This module is three to six times as fast as scipy. For a

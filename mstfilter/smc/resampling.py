@@ -307,7 +307,7 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
 
 
 def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) indices: the interval of the cumulative weights (m,), scaled to [0, 1), that contains each point."""
+    """(n,) indices of the intervals of the cumulative weights (m,), scaled to [0, 1), that contain the points."""
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
@@ -319,8 +319,8 @@ def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> n
 
     For 10^6 points, the function is four times as fast as a binary search.
 
-    Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. Bounds
-    below the index are increased.
+    The index of a point is at least the number of cumulative weights in bins below the bin of the point. Bounds below
+    the index are increased.
     """
     # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
     bits = 62 - max(n.bit_length() - 14, 0)

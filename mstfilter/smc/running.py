@@ -68,8 +68,8 @@ def run_many(
     Returns
     -------
     History
-        Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. The axis "arm" holds the filters. A
-        run ends if all weights are zero (`LostRunError`). From the step of the error, its log evidence is -inf, and
+        Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. Axis "arm" has one entry per filter.
+        A run ends if all weights are zero (`LostRunError`). From the step of the error, the log evidence is -inf, and
         other results are NaN. `History.lost` gives the reasons, and `History.single` gives the reasons for runs made
         one by one.
 

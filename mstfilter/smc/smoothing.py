@@ -128,9 +128,9 @@ def backward_paths(
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
         leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
         record must have parents. A small number of steps adds no bias (Dau and Chopin 2023). If a bootstrap filter
-        selects by `Multinomial`, the parent of x_{t+1} already has the distribution of "exact". With other
-        selections, the error is of order 1 / N. More steps reduce the variance. Without accepted steps, the paths
-        equal the paths of `genealogy`.
+        selects by `Multinomial`, the parent of x_{t+1} already has the distribution of "exact". With other schemes,
+        the error of the distribution is of order 1 / N. More steps reduce the variance. Without accepted steps, the
+        paths equal the paths of `genealogy`.
     steps : int
         Number of Metropolis steps of "mcmc".
     """

@@ -250,7 +250,8 @@ class RandomWalkMove(Rejuvenation):
     model : StateSpaceModel
         The model with its log densities. Particles are float arrays (n,) or (n, d), or mappings of such arrays.
     scale : float or array_like
-        Standard deviation of a step, in the units of the state. A fixed scale keeps the evidence unbiased.
+        Standard deviation of a step, in the units of the state. A scale that does not depend on the particles keeps
+        the evidence unbiased.
     steps : int
         Number of Metropolis steps per move.
     """
@@ -401,8 +402,8 @@ def auxiliary(
     log_priority : callable
         ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}). The filter is exact for any finite priority.
     proposal, initial : callable, optional
-        As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal, the filter is "fully
-        adapted".
+        As in `guided`. With priority p(y_t | x_{t-1}) and proposal p(x_t | x_{t-1}, y_t), the filter is fully
+        adapted.
     **components
         As in `guided`.
     """

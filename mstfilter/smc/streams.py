@@ -10,8 +10,7 @@ True
 
 A `Key` consists of an integer and a tuple, and can be stored in a file. The generator of a key is numpy's PCG64. The
 256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys are independent if
-the hash behaves like a random function. The probability that two of a billion streams have equal seeds is below
-1e-50.
+the hash behaves like a random function. Two of a billion streams have equal seeds with probability below 1e-50.
 
 A batched component is called once for R runs of n particles. The particles are `Rows`: arrays (R n, ...), with the n
 rows of run 0 first. `RunGenerators` draws the rows of run r from the generator of run r.

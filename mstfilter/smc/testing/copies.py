@@ -150,7 +150,7 @@ def groups_of(case: Case) -> np.ndarray:
 
 
 def fault_message(sample: Sample, column: int) -> str:
-    """Message: how the mean weight of a particle or group differs from the expected weight."""
+    """Error message that states how the mean weight of a particle or group differs from the expected weight."""
     case, expected, mean = sample.case, sample.expected[column], sample.carried[:, column].mean()
     m, n = len(case.weights), case.n
     who = f"particle {column}"

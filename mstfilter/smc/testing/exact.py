@@ -20,11 +20,11 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 class ExactContract(Contract):
     """Properties of components that are tested with exact draws.
 
-    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. The method returns
-    a population of `n` particles before the call, a population of exact draws (or with exact weights) after the call,
-    and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the weights of both
-    populations, so that the weights f / q of a guided move vary less. The test is skipped if one particle has more
-    than 1 % of the total weight.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` in the module of the component. The
+    method returns a population of `n` particles before the call, a population of exact draws (or with exact weights)
+    after the call, and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the
+    weights of both populations, so that the weights f / q of a guided move vary less. The test is skipped if one
+    particle has more than 1 % of the total weight.
 
     The rows of `exact` must be independent draws, but the states x_{t-1} may lie on a grid. With 200,000 rows, the
     tests detect an error of 3 % in the standard deviation, and a shift by 3 % of the standard deviation. The tests
@@ -47,8 +47,9 @@ class ExactContract(Contract):
 
         Distribution functions are compared at several quantiles. The sums detect columns that share a random number.
 
-        The bounds assume a normal difference of two weighted means, with a false-alarm rate 20 times smaller than
-        needed. A tail is compared only if its probability is so large that no single weight decides the test.
+        The bounds assume that the difference of two weighted means is normal. The false-alarm rate is set 20 times
+        smaller than required. A tail is compared only if its probability is so large that no single weight decides
+        the test.
         """
         samples = []
         for log_weights in (lw, exact_lw):
