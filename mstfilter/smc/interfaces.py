@@ -57,10 +57,9 @@ class Component(AtStep, ABC):
     def properly_weighted(self) -> bool:
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author of a component declares if the component is properly weighted. The default is True; write
-        ``properly_weighted = False`` in the class to change the default. `mstfilter check` tests the property of
-        resamplers. A filter reports the log evidence only if it has no `proposal` and all its components are properly
-        weighted.
+        The author declares if the component is properly weighted. The default is True; write ``properly_weighted =
+        False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
+        reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
 

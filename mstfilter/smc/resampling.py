@@ -20,8 +20,8 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 array([0, 0, 1, 2])
 
 Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from the number of
-weights. A particle of weight zero is never selected. A log weight of NaN or +inf raises `InputError`. Weights that
-are all zero also raise `InputError`.
+weights. A particle of weight zero is never selected. Log weights of NaN or +inf, or only zero weights, raise
+`InputError`.
 
 Three functions invert the cumulative weights: `inverse_cdf` takes one point in each of n equal strata,
 `independent_draws` takes n independent points, and `draw_rows` takes one point for each row of a matrix. The `select`

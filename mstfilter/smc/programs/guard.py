@@ -6,8 +6,7 @@ error, but its weights are wrong. Steps of each kind (first, later, without obse
 2, 9, 66, 515, ... are checked. The numbers 8^k + k have all remainders modulo 3, so a fault in every third step is
 detected. A check has three parts:
 
-1. The first two steps are repeated with the same random numbers. All values and log weights must agree up to
-   rounding.
+1. The first two steps are repeated with the same random numbers. Values and log weights must agree up to rounding.
 2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
    change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. A run
    of few particles also detects an event axis used as the particle axis.

@@ -47,9 +47,8 @@ class ExactContract(Contract):
 
         Distribution functions are compared at several quantiles. The sums detect columns that share a random number.
 
-        The bounds assume that the difference of two weighted means is normal. The false-alarm rate is set 20 times
-        smaller than required. A tail is compared only if its probability is so large that no single weight decides
-        the test.
+        The bounds assume that the difference of two weighted means is normal. The false-alarm rate is a twentieth of
+        the required rate. A tail is compared only if so probable that no single weight decides the test.
         """
         samples = []
         for log_weights in (lw, exact_lw):
