@@ -1,16 +1,16 @@
 """Many runs of one filter together, as arrays (run, particle, ...).
 
-`mstfilter.smc.run_many` uses this module where possible.
+`mstfilter.smc.run_many` uses this module if all components can process the particles of several runs in one call.
 
-The components are called once per step with the particles of all runs, as one population of R n particles. Runs are
-batched if the `batched` of each component is True or None. Programs and models of `StateSpaceModel.of` have None:
-batching is tried. Components get arrays without an axis of runs. A component treats each row independently, and its
-draws have the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of a
-run from its stream.
+Each component is called once per step with the particles of all runs, as one population of R n particles. Runs are
+batched if the attribute `batched` of each component is True or None. Programs and models of `StateSpaceModel.of` have
+``batched=None``: batching is tried. The arrays of a call have no axis of runs. A component must treat each row
+independently, and draw arrays in the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``.
+`RunGenerators` draws the rows of a run from the random stream of the run.
 
-The batch compares some runs with single runs at steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the number
-of runs changes. If results differ by more than rounding and the component states ``batched=True``, InputError is
-raised. For any other difference, `NotTogether` gives the reason, and the runs must be made one by one.
+Some runs of the batch are compared with single runs at steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the
+number of runs changes. If results differ by more than rounding and the component states ``batched=True``, InputError
+is raised. For any other difference, `NotTogether` is raised with the reason, and the runs must be made one by one.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ def run_together(
     check: bool = True,
     rounding: bool = False,
 ) -> list[Collected]:
-    """The runs of some seeds with the observations `ys`.
+    """Results of the runs with the given seeds and the observations `ys`.
 
-    If `check` is True, some runs are compared with single runs. `rounding` allows differences by rounding.
+    If `check` is True, some runs are compared with single runs. With `rounding`, results may differ by rounding.
 
     Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component states ``batched=True``
     but mixes runs.
@@ -96,7 +96,7 @@ def run_together(
 
 
 class _RunInfo(Info):
-    """The record of one step of a batched run."""
+    """The `Info` of one step of a batched run, which collectors read."""
 
     def __getattr__(self, name: str) -> Any:
         if name in ("notes", "seconds"):
@@ -105,7 +105,7 @@ class _RunInfo(Info):
 
 
 class _Sweep:
-    """The steps of R runs. Row r holds one run that is not lost: particles (R, n, ...), log weights (R, n)."""
+    """The steps of R runs. Particles are (R, n, ...) and log weights (R, n); row r is a run of positive weight."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class _Sweep:
         self.found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in collectors}
 
     def run(self) -> list[Collected]:
-        """All steps."""
+        """Make all steps of the runs."""
         for t in range(self.n_steps):
             self.step(t)
             if not len(self.runs):
@@ -195,7 +195,7 @@ class _Sweep:
             self.ancestors = None if self.ancestors is None else self.ancestors[rows]
 
     def together(self, t: int, slot: str) -> tuple[Any, np.ndarray]:
-        """Particles and log weights of a component that is called once for all runs."""
+        """Particles and log weights that a component returns in one call for all runs."""
         (y, u), n = self.given[t], self.filter.n
         component = getattr(self.filters.rows(self.runs).at_step(t, u), slot)
         rng = RunGenerators(self.streams.generators(slot, t, self.runs), n) if component.draws else None
@@ -230,7 +230,7 @@ class _Sweep:
             raise NotTogether(slot, f"step {t}: a run raises {type(error).__name__}") from error
 
     def lose(self, t: int, slot: str, rows: np.ndarray) -> None:
-        """Record why some runs are lost (no particle explains the observation)."""
+        """Record the reason why all weights of the given runs are zero after a component."""
         for row in rows.tolist():
             try:
                 self.alone(t, slot, row)
@@ -241,7 +241,7 @@ class _Sweep:
 
     # --- checks ---------------------------------------------------------------------------------------------------
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
-        """Compare the first and the last run, or the next run in turn, with single runs."""
+        """At some steps, compare one or two of the runs with single runs."""
         last, count = self.checked.get(slot, (0, 0))
         if t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == len(rows):
             return
@@ -263,7 +263,7 @@ class _Sweep:
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
 
     def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
-        """Raise an error if the result of a run differs from that of the single run."""
+        """Raise an error if the batch and the single run give different results for a run."""
         found = _difference(ours, alone)
         if found is None or (found[0] and self.rounding):
             return
@@ -272,7 +272,7 @@ class _Sweep:
         self.refuse(t, slot, f"the {what} of run {run} are {found[1]} in the batch, {found[2]} alone")
 
     def refuse_error(self, t: int, slot: str, error: Exception) -> NoReturn:
-        """Raise `NotTogether` if a single run raises an error too; otherwise call `refuse`."""
+        """Raise `NotTogether` if a single run also raises an error; otherwise call `refuse`."""
         for row in range(len(self.runs)):
             with suppress(LostRunError):
                 self.alone(t, slot, row)
@@ -364,7 +364,7 @@ class _Sweep:
         return State(t + 1, population, self.streams.keys[self.runs[row]], filter.properly_weighted), info
 
     def table(self, name: str) -> np.ndarray:
-        """Results (T, R, ...) of a collector. Entries of a run are undefined once all its weights are zero."""
+        """Results (T, R, ...) of a collector. The entries of a run are undefined after all its weights are zero."""
         steps = self.found[name]
         check_one_shape(name, [values.shape[1:] for _, values in steps])
         shape = steps[0][1].shape[1:] if steps else ()
@@ -394,7 +394,7 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 
 def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
-    """Whether the first difference of arrays (or mappings) is rounding, and both values; None if equal."""
+    """Whether the first difference of two arrays (or mappings) is rounding, and both values; None if identical."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

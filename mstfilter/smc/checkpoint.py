@@ -7,8 +7,8 @@
 
 The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
 then renamed. If the process is killed, the file holds the state of a complete step. All draws depend on the seed and
-the step only, so a continued run equals an uninterrupted run. The file stores no filter and no observations: pass the
-same filter and observations again.
+the step only, so a continued run has the results of an uninterrupted run. The file stores no filter and no
+observations: pass both to the continued run.
 
 `ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another type need a `Codec`. Loading
 a file never imports code.

@@ -66,7 +66,7 @@ class Branching(Transition):
 
     Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. If n
     particles are selected from n candidates, all candidates are kept, and the filter degenerates. If the branches of
-    a discrete state are all its successors, the filter is that of Fearnhead and Clifford (2003):
+    a discrete state are all its successors, the filter is the algorithm of Fearnhead and Clifford (2003):
 
     >>> filter = replace(
     ...     bootstrap(model, n=50),
@@ -157,7 +157,7 @@ def first_seen(keys: Iterable[Hashable]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ExactEquality(Equivalence):
-    """Array particles are equal if their bytes are equal, and objects if ``==`` and hash agree."""
+    """Array particles are equal if their bytes are identical. Objects are equal if ``==`` and hashes agree."""
 
     def classes(self, particles: Any) -> np.ndarray:
         if isinstance(particles, np.ndarray) and particles.dtype != object:
@@ -189,8 +189,7 @@ class Kld(Size):
     With k occupied bins, the bound is n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
     size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` knows the
     weight W_b of each bin and chooses the least n with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected
-    number of bins that n draws occupy. The bound holds for any resampling scheme, and is slightly larger than Fox's
-    n.
+    number of bins that n draws occupy. The bound applies to any resampling scheme, and slightly exceeds Fox's n.
 
     Parameters
     ----------
@@ -214,7 +213,7 @@ class Kld(Size):
         check_integer("n_max", self.n_max, f"n_min is {self.n_min}", at_least=self.n_min)
 
     def choose(self, population: Population) -> int:
-        """The least sufficient number of particles, from `n_min` to `n_max`."""
+        """The least number of particles that meets the error bound, within `n_min` and `n_max`."""
         population = population.realised()
         mass = np.bincount(self.equivalence.classes(population.particles), population.weights)
         mass = np.minimum(mass[mass > 0], 1.0)
@@ -230,7 +229,7 @@ class Kld(Size):
         return min(n, self.n_max)
 
     def bound(self, k: float) -> float:
-        """Number of draws that k occupied bins need; 0 for one bin."""
+        """Number of draws that k occupied bins require for the error bound; 0 for one bin."""
         from scipy.special import chdtri
 
         return float(chdtri(k - 1, self.delta) / (2 * self.epsilon)) if k > 1 + 1e-9 else 0.0

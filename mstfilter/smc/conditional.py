@@ -5,7 +5,7 @@
 
 `conditional_path` is a Markov kernel that leaves the smoothing distribution invariant for any number of particles
 (Andrieu, Doucet, Holenstein 2010). Programs are supported too. `path_log_prob` is the joint log density of a path and
-the observations. `particle_gibbs` uses `conditional_path`; its `draw` may use `path_log_prob`.
+the observations. `particle_gibbs` uses `conditional_path`, and its argument `draw` may use `path_log_prob`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def conditional_path(
     One particle follows `path`, and the filter draws the other particles. The result is the path of one final
     particle, drawn by weight. Ancestors are drawn multinomially at every step; `resampler` and `trigger` of the
     filter are not used. If the density of the transition is known, the particle that follows the path also draws its
-    ancestors (ancestor sampling). For ancestor sampling, a program may return only values of its sites.
+    ancestors (ancestor sampling). A program that returns values is used without ancestor sampling.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _log_density(transition: Transition | None, old: Particles, new: Particles, 
 def _moved(
     filter: ParticleFilter, streams: Key, past: Population | None, given: Particles | None, y: Any
 ) -> Population:
-    """The particles of a step before the update. Particle 0 is the given particle, with its weight."""
+    """The particles of a step before the update. Particle 0 is the given particle with the weight of its move."""
     component: Any
     slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
     particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
@@ -166,7 +166,7 @@ def _drawn(
 
 
 def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:
-    """The given particle (one row) with the values that the program returns, and its log weight."""
+    """The given particle (one row), with the values that the program returns, and the log weight of the particle."""
     if component.guide is None or y is None:
         particle, gain = run_program(component.model, GivenHandler(given, weigh=False), old, y, 1)
         return particle, gain[0]
@@ -187,7 +187,7 @@ def _with_first(particles: Particles, first: Particles) -> Particles:
 
 
 def _joined(rows: list[Particles]) -> Particles:
-    """Join one particle of each time to a path. Values that a program lacks at some time are NaN or 0."""
+    """Join one particle of each time to a path. Variables that do not exist at a time are NaN, or 0 for integers."""
     if isinstance(rows[0], np.ndarray):
         return np.concatenate(rows)
     if not isinstance(rows[0], Mapping):

@@ -4,8 +4,8 @@
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
 
 `run_variance` follows ancestors, so all particles of the filter must have known parents. `energy_distance` compares
-two populations, such as before and after a resampling. Half of the distance of a population to the true state is its
-energy score (Gneiting and Raftery 2007). A lower score is better:
+two populations, such as the populations before and after a resampling. Half of the energy distance between a
+population and the true state is the energy score (Gneiting and Raftery 2007). A lower score is better:
 
 >>> energy_distance(population, Population(np.array([truth]))) / 2
 """
@@ -37,8 +37,8 @@ def energy_distance(
     0 if both populations represent the same distribution, and positive otherwise.
 
     ``distance(particles)`` returns an (n, n) array, for example ``lambda p: 1 - Gaussian().matrix(p)``. The distance
-    must be of negative type (Sejdinovic et al. 2013). For other distances, the result can be 0 for different
-    distributions. The default is the Euclidean distance of arrays and mappings of arrays.
+    must be of negative type (Sejdinovic et al. 2013). With other distance functions, the result can be 0 for
+    different distributions. The default is the Euclidean distance of arrays and mappings of arrays.
     """
     both = union(first.realised().labelled({}), second.realised().labelled({}))
     return _energy(both.particles, np.concatenate([first.weights, -second.weights]), distance)
@@ -84,34 +84,33 @@ def run_variance(
     lag: int | None = None,
     function: Callable[[Any], np.ndarray] | None = None,
 ) -> RunVariance:
-    """Run a filter and estimate the variance of its estimates from their ancestors.
+    """Run a filter, and estimate the variances of its estimates from the ancestors of the particles.
 
-    Let A_e be the total weight of the particles at time t whose ancestor at time 0 is e; all weights sum to 1. The
-    variance of the log evidence (to first order, the relative variance of the evidence) is estimated by
+    Let A_e be the total weight of the particles at time t with ancestor e at time 0. The weights at time t sum to 1.
+    The variance of the log evidence (to first order, the relative variance of the evidence) is estimated by
 
         V = 1 - f (1 - sum_e A_e^2), where f = N / (N - 1) * product of f_s over the selections s.
 
     The variance of a weighted mean is estimated by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the
-    particles of A_e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1) makes V
-    unbiased. For other schemes, which make fewer duplicates, f_s is computed from the weights:
+    particles with ancestor e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1)
+    makes V unbiased. For other schemes, which make fewer duplicates, f_s is computed from the weights:
 
         f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
 
-    W_e and V_e are the weights of the descendants of e before and after the selection. The factor f_s is the ratio of
-    the probabilities that two draws have different ancestors. For independent selections of particles with different
-    ancestors, the mean of f_s is N / (N - 1). For schemes other than `Multinomial`, f_s is an approximation. The
-    approximation assumes that pairs of particles with different ancestors are selected in proportion to their
-    weights.
+    W_e and V_e are the total weights of the descendants of e before and after the selection. The numerator and the
+    denominator are the probabilities that two draws have different ancestors. For independent selections, the mean of
+    1 / f_s is (N - 1) / N. For schemes other than `Multinomial`, f_s is an approximation. The approximation assumes
+    that pairs of particles with different ancestors are selected in proportion to their weights.
 
     With a lag L (Olsson and Douc 2019), the estimate for the mean uses ancestors L steps earlier instead of ancestors
     at time 0. For the evidence, the part of V that arises at time s is evaluated at time s + L instead of t, and the
-    parts are added. The lag reduces the noise of the estimates. The estimates stay valid when all particles share one
-    ancestor. The bias is small if x_t hardly depends on x_{t-L}.
+    parts are added. The lag reduces the noise of the estimates. With a lag, the variances can be estimated even if
+    all particles share one ancestor at time 0. The bias from the lag is small if x_t hardly depends on x_{t-L}.
 
-    The variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are within 15
-    % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated variances of
-    means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the log evidence has a
-    variance above 0.3.
+    The estimated variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are
+    within 15 % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated
+    variances of means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the log evidence
+    has a variance above 0.3.
 
     Parameters
     ----------
@@ -122,8 +121,8 @@ def run_variance(
     lag : int, optional
         Number of steps L, at least 1. By default, L covers all steps. Time and memory grow with n times the lag.
     function : callable, optional
-        ``(particles) -> (n, ...)``: the values that are averaged. By default, the values are the particles if they
-        are an array. For particles of another type, means have the shape (T, 0).
+        ``(particles) -> (n, ...)``: the values that are averaged. By default, array particles are averaged. For
+        particles of another type, means then have the shape (T, 0).
 
     Returns
     -------
@@ -180,7 +179,7 @@ class _Selection(NamedTuple):
 
 @dataclass(frozen=True)
 class _Watched(ResamplerWrapper):
-    """Records the resamplings of a step."""
+    """Resamples by `scheme`, and stores each resampling of a step in `selections`."""
 
     selections: list[_Selection] = field(default_factory=list)
 
@@ -208,7 +207,7 @@ class _Ancestry:
         self.weights = np.zeros(0)
 
     def begin(self, n: int) -> None:
-        """Start with the present particles as n independent draws."""
+        """Start with the n present particles as ancestors. The particles must be independent draws."""
         self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
 
     def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:
@@ -226,7 +225,7 @@ class _Ancestry:
         self.weights = weights
 
     def _relative(self, place: int) -> float:
-        """Relative variance of the evidence that arises from time `place` of the window to the present."""
+        """Relative variance of the evidence that arises between entry `place` of the window and the present."""
         index, f = self.window[place]
         return 1.0 - f * _differ(index, self.weights)
 

@@ -6,19 +6,18 @@
 >>> Normal(x, 1.0).log_prob(0.3).shape
 (5,)
 
-The first axis is the axis of the particles. Parameters of shape () or (n,) give values (n,): the event shape is ().
-Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The entries of an event are independent, and
-their log densities are summed. `log_prob` is always (n,), or a number if no argument has rows.
+The first axis is the axis of the particles. Parameters of shape () or (n,) give values of shape (n,): the event shape
+is (). Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The entries of an event are
+independent, and their log densities are summed. `log_prob` returns (n,) values, or one value if no argument has rows.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
-of the classes of this module (`as_distribution`). Distributions of scipy take three to six times as long. This module
-has the classes used most often. For a distribution of another library, write a `Distribution` whose `sample` draws
-from the given generator.
+of the classes of this module (`as_distribution`). This module is three to six times as fast as scipy. For a
+distribution of another library, write a `Distribution` whose `sample` draws from the given generator.
 
 A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
 and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
 range is NaN. MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values
-have the log density NaN, and the move rejects these rows.
+have the log density NaN and are rejected.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class _Checked(Distribution):
             self._check(name, parameters)
 
     def _check(self, name: str, allowed: Range) -> None:
-        """Raise InputError at the first entry of a parameter out of range. In `hypothetical`, the rows become NaN."""
+        """Raise InputError at the first entry of a parameter out of range. In `hypothetical`, rows become NaN."""
         value = getattr(self, name)
         if allowed.surely_contains(value):  # a third of the time of the rest
             return
@@ -307,9 +306,9 @@ def _cholesky(cov: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class MultivariateNormal(_Checked):
-    """Gaussian vectors.
+    """Distribution of Gaussian vectors.
 
-    The mean `loc` is (d,) for all particles or (n, d). The covariance `cov` (d, d) or (n, d, d) is positive definite.
+    The mean `loc` has shape (d,) or (n, d). The covariance `cov`, of shape (d, d) or (n, d, d), is positive definite.
     """
 
     loc: Any
@@ -427,7 +426,7 @@ class Categorical(Distribution):
 
 
 def as_distribution(value: Any) -> Distribution:
-    """Return a `Distribution`, or convert a frozen distribution of scipy.stats. InputError for other types."""
+    """Return a `Distribution`, or convert a frozen distribution of scipy.stats. Raises InputError for other types."""
     if isinstance(value, Distribution):
         return value
     if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):
@@ -440,7 +439,7 @@ def as_distribution(value: Any) -> Distribution:
 
 @dataclass(frozen=True, eq=False)
 class FromScipy(Distribution):
-    """A frozen distribution of scipy.stats, uni- or multivariate."""
+    """A univariate or multivariate frozen distribution of scipy.stats."""
 
     wrapped: Any
 

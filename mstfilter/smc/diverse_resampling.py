@@ -33,10 +33,10 @@ from mstfilter.smc.resampling import Systematic, checked_weights, inverse_cdf, s
 
 @dataclass(frozen=True)
 class FearnheadClifford(WeightResampler):
-    """Optimal resampling. Keeps particles with w_i >= c, and lighter particles with probability w_i / c and weight c.
+    """Optimal resampling. Keeps particles with w_i >= c, and others with probability w_i / c and new weight c.
 
     c is the solution of sum min(1, w_i / c) = n. The lighter particles are selected systematically, so there are no
-    duplicates. The total weight is kept exactly. Among all unbiased random weights with at most n positive weights,
+    duplicates. The total weight does not change. Among all unbiased random weights with at most n positive weights,
     the output weights have the least expected squared error. If at most n particles have positive weight, all of them
     are kept, and fewer than n particles may be returned. A filter that selects n of n particles therefore
     degenerates. Use more candidates than particles (`Branching`).
@@ -98,9 +98,9 @@ class Chopthin(WeightResampler):
     - 1 if w is between a and ratio a / 2, and the copy has weight w;
     - 2 w / (ratio a) if w is larger, and the copies share w equally.
 
-    The threshold a is the solution of sum h(w_i) = n. Systematic resampling rounds each h(w) to floor or ceil.
-    Exactly n particles are returned, and all output weights lie in [a, ratio a]. If n of n particles are selected and
-    the largest weight is at most ratio / 2 times the smallest, the result equals the input.
+    The threshold a is the solution of sum h(w_i) = n. Systematic resampling rounds each h(w) up or down. Exactly n
+    particles are returned, and all output weights lie in [a, ratio a]. If n of n particles are selected and the
+    largest weight is at most ratio / 2 times the smallest, the result equals the input.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class Chopthin(WeightResampler):
 
 
 def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
-    """The threshold a with sum h(w_i) = n (see `Chopthin`) for (m,) positive weights; any solution if not unique."""
+    """The threshold a with sum h(w_i) = n (see `Chopthin`) for positive weights (m,), or one of several solutions."""
     w = np.sort(weights)
     # For a between neighbours among all w and 2 w / ratio, sum h = share / a + middle: particles below the index
     # `thinned` have w < a, those from `unchopped` on have w > ratio a / 2.
@@ -165,7 +165,7 @@ MAX_PARTICLES = 10_000
 
 
 def checked_similarity(similarity: Similarity, population: Population) -> np.ndarray:
-    """(m, m) float64 symmetric similarities of the particles; raises InputError if the matrix is not valid."""
+    """(m, m) float64 similarities, made symmetric. InputError if a shape is wrong or a value is not finite."""
     m = len(population)
     if m > MAX_PARTICLES:
         raise InputError(
@@ -186,9 +186,9 @@ class ClusterStratified(Resampler):
 
     If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
     of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n. The
-    numbers are rounded systematically. The particles of a cluster share its weight, so any allocation is unbiased. A
-    cluster below `least_mass` gets W_g / c particles on average and may lose all particles. If W_g / c < 1 and the
-    cluster keeps a particle, the particle has weight c. ``notes["clusters"]`` is the number of clusters.
+    numbers are rounded by systematic resampling. The particles of a cluster share the weight of the cluster, so any
+    numbers are unbiased. A cluster below `least_mass` gets W_g / c particles on average and may lose all particles.
+    If W_g / c < 1, a particle kept from the cluster has weight c. ``notes["clusters"]`` is the number of clusters.
 
     Parameters
     ----------
@@ -252,10 +252,10 @@ class ClusterStratified(Resampler):
 
 
 def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float) -> np.ndarray:
-    """(m,) cluster of each particle; -1 if the particle has no weight.
+    """(m,) cluster of each particle; -1 if the weight of the particle is zero.
 
-    The heaviest unassigned particle becomes the leader of a new cluster. All unassigned particles that are similar
-    enough to the leader join the cluster. The procedure ends when all particles are assigned.
+    The heaviest unassigned particle becomes the leader of a new cluster. All unassigned particles with a similarity
+    to the leader of `at_least` or more join the cluster. The procedure ends when all particles are assigned.
     """
     cluster = np.full(len(weights), -1, np.int64)
     number = 0
@@ -272,7 +272,7 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
 
 
 def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
-    """Mean particles of each cluster, with sum n: max(1, mass / c) if `sure` (at most n clusters), else mass / c."""
+    """Mean number of particles of each cluster, sum n: mass / c, but at least 1 if `sure` (at most n clusters)."""
     ordered = np.sort(mass[sure])[::-1]
     heavy = np.append(0.0, np.cumsum(ordered)) + mass[~sure].sum()
     # If the A heaviest of S sure clusters exceed 1, they and the unsure ones share n - (S - A) particles by mass.

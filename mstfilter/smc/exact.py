@@ -33,7 +33,7 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = N
     after the first needs an input (j,), see `WithInput`. `Q` and `P0` may be singular (see `nonlinear_gaussian`).
     `kalman_filter` computes the exact posteriors.
 
-    Raises InputError if shapes do not fit, or if a step has no entry of a matrix or no required input.
+    Raises InputError if shapes do not fit, if a matrix has no entry for a step, or if a required input is missing.
     """
     m = _matrices(F, Q, H, R, m0, P0, B)
 
@@ -69,7 +69,7 @@ def _matrices(
 
 
 def _varies(array: np.ndarray) -> dict[str, bool]:
-    """The keyword ``t`` if the matrix changes with time, in the form of `step_parameters`."""
+    """The parameters that `step_parameters` returns: ``t`` if the matrix changes with time."""
     return {"t": True} if array.ndim == 3 else {}
 
 
@@ -130,7 +130,7 @@ def kalman_filter(
 
 
 def _inverse(cov: np.ndarray) -> np.ndarray:
-    """The inverse of a covariance; for a singular covariance, the pseudo-inverse on its range."""
+    """The inverse of a covariance; the pseudo-inverse if the covariance is singular."""
     values = np.linalg.eigvalsh(cov)
     if values.min() > 1e-12 * values.max():
         return np.linalg.inv(cov)
@@ -160,8 +160,8 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
     """A hidden Markov model with K states. Particles are (n,) int from 0 to K - 1.
 
     `initial` (K,) holds the probabilities of x_0. Row i of `transition` (K, K) holds the probabilities of x_t given
-    x_{t-1} = i. ``log_likelihood(y)`` (K,) returns log p(y_t | x_t) for each state, -inf if impossible. The function
-    may also have the parameters ``t`` and ``u``. `forward_backward` computes the exact posteriors.
+    x_{t-1} = i. ``log_likelihood(y)`` (K,) returns log p(y_t | x_t) for each state; -inf if the state cannot produce
+    y_t. The function may also have the parameters ``t`` and ``u``. `forward_backward` computes the exact posteriors.
     """
     start, moves = _chain(initial, transition)
     # The last positive entry is 1 exactly, so that u < 1 never selects a state of probability 0.
@@ -211,7 +211,7 @@ class Marginals(NamedTuple):
 def forward_backward(
     initial: Any, transition: Any, log_likelihood: Callable[..., Any], observations: Iterable[Any]
 ) -> Marginals:
-    """The forward-backward algorithm (Rabiner 1989). Takes the arguments of `hidden_markov`.
+    """The forward-backward algorithm (Rabiner 1989), with the arguments of `hidden_markov`.
 
     Raises InputError if a shape does not fit, or if an observation has probability 0.
     """

@@ -4,7 +4,7 @@
 >>> state, infos = filter.run(observations, seed=0)
 >>> state.population.weights, state.log_evidence
 
-One step for an observation y::
+A step for an observation y makes these calls::
 
     past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
@@ -12,12 +12,12 @@ One step for an observation y::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-With "before", a step that ends with more than n particles also resamples after the update.
+With ``resample="before"``, a step that ends with more than n particles also resamples after the update.
 
 `ParticleFilter.step` has one line for each stage, and `_Step` has one method for each stage. Textbook filters have no
-`proposal`; MST (Price, Huang, Berenson 2021) has all four components. Guided filters have a transition that weights
-its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a pure
-function of a `State`, so a run can be stopped, stored and resumed at any step.
+`proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided filters have a transition
+that weights its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a
+pure function of a `State`, so a run can be stopped, stored and resumed at any step.
 """
 
 from __future__ import annotations
@@ -69,8 +69,7 @@ class ParticleFilter(AtStep):
     ----------
     initial : Proposal
         Draws the particles of the first step. The first observation updates the initial particles. The second step
-        makes the first prediction. If `initial` is None or equal to `proposal`, the first step has only proposed
-        particles.
+        makes the first prediction. If `initial` is None or equals `proposal`, step 0 has only proposed particles.
     transition : Transition
         Moves the particles from the previous time to the present time. None leaves the particles unchanged.
     proposal : Proposal, optional
@@ -80,7 +79,7 @@ class ParticleFilter(AtStep):
     resampler : Resampler
         Selects particles by weight.
     trigger : Trigger
-        Decides whether a step resamples. More than `n` particles are always resampled.
+        Decides whether a step resamples. A population of more than `n` particles is always resampled.
     lookahead : Lookahead, optional
         Auxiliary filter: particles are selected by weight times priority. Requires ``resample="before"``.
     rejuvenation : Rejuvenation, optional
@@ -90,7 +89,7 @@ class ParticleFilter(AtStep):
     n : int
         Number of particles at the start and after each resampling (unless `size` chooses another).
     n_proposed : int
-        Number of particles that `proposal` draws at each step. 0 means `n`.
+        Number of particles that `proposal` draws at each step. If 0, `proposal` draws `n` particles.
     resample : {"after", "before"}
         With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
         before the next prediction, as in textbooks, and a step returns the weights of its update.
@@ -157,7 +156,7 @@ class ParticleFilter(AtStep):
         return step.finish(past, fused, chosen, resampled_before, resampled_after)
 
     def iterate(self, observations: Iterable[Any], state: State | int = 0) -> Iterator[tuple[State, Info]]:
-        """Yield the state and the info of every step.
+        """Yield the `State` and the `Info` of every step.
 
         Parameters
         ----------
@@ -180,7 +179,7 @@ class ParticleFilter(AtStep):
         *,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
-        """Run all steps, and return the last state and the infos. Takes the parameters of `iterate`.
+        """Run all steps, and return the last `State` and the `Infos`. Takes the parameters of `iterate`.
 
         ``progress=True`` shows a progress bar. A function `progress` is called as ``progress(done, total)``.
 
@@ -356,7 +355,7 @@ class _Step:
         resampled_before: bool,
         resampled_after: bool,
     ) -> tuple[State, Info]:
-        """The next state and the record of the step."""
+        """The next `State` and the `Info` of the step."""
         with self.slot("build"):
             chosen = chosen.realised()
         ess = fused.ess  # stored in the population, where the trigger of the next step reads it
@@ -402,7 +401,7 @@ class _Slot:
             error.add_note(f"in step {self.t}, {name}")
 
     def record(self, notes: Mapping[str, Any]) -> None:
-        """Store the notes of the component, if there are any."""
+        """Store the `notes` (extra values) that a component returned in its population."""
         if notes:
             self.notes[self._here.name] = notes
 
@@ -433,7 +432,7 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Free one large block, once per process.
+    """Free one large block of memory, once per process.
 
     After the call, glibc keeps freed arrays of up to 32 MB and does not return them to the system after every step.
     Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of the time of

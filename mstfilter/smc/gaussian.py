@@ -14,8 +14,8 @@ other part z_t is linear and Gaussian:
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
 A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_0 .. y_t. The particles are a mapping
-of arrays. The transition draws u_t and predicts z_t. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) and
-corrects z_t. Reference: Doucet, de Freitas, Murphy, Russell (2000).
+of arrays. The transition draws u_t and predicts the mean and covariance of z_t. The update weights by p(y_t | u_0 ..
+u_t, y_0 .. y_{t-1}) and corrects the mean and covariance. Reference: Doucet, de Freitas, Murphy, Russell (2000).
 
 `mstfilter.smc.exact` has linear models and their exact posteriors.
 """
@@ -154,7 +154,7 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
 
 
 class Linear(NamedTuple):
-    """Matrices of the linear part for each particle, without the particle axis if all particles share a matrix."""
+    """Matrices of the linear part, one per particle. A matrix that all particles share has no particle axis."""
 
     F: Any  #: (n, d, d)
     Q: Any
@@ -199,7 +199,7 @@ class _Predict(Transition):
     step_functions: ClassVar = {"model": None}
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
-        """Draw u_t, then predict mean and covariance."""
+        """Draw u_t, then predict the mean and covariance of z_t."""
         u = self.model.sample_transition(rng, population.particles["u"])
         m = self.model.linear(u)
         F, n = np.asarray(m.F, np.float64), len(population)
@@ -218,7 +218,7 @@ class _Correct(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Any
     ) -> Population:
-        """Weight by the predictive density N(y; H m, S), then correct mean and covariance (Joseph form)."""
+        """Weight by the predictive density N(y; H m, S), then correct mean and covariance of z_t (Joseph form)."""
         population = union(predicted, proposed)
         p: Any = population.particles
         y = np.atleast_1d(np.asarray(observation, dtype=np.float64))
@@ -251,7 +251,7 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> 
 def ukf_proposal(
     f: _Map, Q: Any, h: _Map, R: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
-    """A proposal for `guided`: the update of the unscented Kalman filter from each particle.
+    """A proposal for `guided`: draws from the update of an unscented Kalman filter for each particle.
 
     Given x_{t-1}, the predicted state is N(f(x_{t-1}), Q). The proposal needs no derivatives (van der Merwe, Doucet,
     de Freitas, Wan 2000). `alpha` (spread of the sigma points), `beta` (weight of the central point) and `kappa`

@@ -1,4 +1,4 @@
-"""Records quantities of a run.
+"""Collectors, which record quantities of a run at every step.
 
 A collector is a function ``(state, info) -> number or array``. The run calls each collector after every step. `ess`,
 `unique_ancestors`, `log_evidence`, `mean` and `resampled` are collectors.
@@ -26,7 +26,7 @@ Collector = Callable[[State, Info], Any]
 
 
 def ess(state: State, info: Info) -> float:
-    """Effective sample size after the update."""
+    """Effective sample size of the particles after the update."""
     return info.ess
 
 
@@ -61,7 +61,7 @@ def mean(state: State, info: Info) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class History(Mapping[str, np.ndarray]):
-    """The arrays of the collectors, by name."""
+    """The results of the collectors as arrays, by name."""
 
     values_: Mapping[str, np.ndarray]  #: name -> array whose first axes are `dims`
     dims: tuple[str, ...] = ("time",)  #: ("time",) for one run, ("seed", "time") or ("arm", "seed", "time") for many

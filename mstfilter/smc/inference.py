@@ -11,11 +11,11 @@ A model with parameters is a function that returns a filter:
 - `pmmh` is a Metropolis chain that uses the filter's unbiased estimate of the likelihood. The estimate for the
   current parameters is kept until a proposal is accepted. The chain then converges to the exact posterior for any
   number of particles (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` uses the estimates of the likelihood with the walkers of emcee. The walkers need no scale of steps.
+- `ensemble` moves the walkers of emcee by estimates of the likelihood. The user sets no scale of the steps.
 - `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
   the transition has a density, the particle on the path also draws its ancestors (Lindsten, Jordan, Schön 2014).
-  Without ancestor sampling the early states hardly change.
+  Without ancestor sampling the early states of the path hardly change.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class _Posterior:
     n_sweeps: int = 0
 
     def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """``theta`` (R, d) with ``log_density`` and ``log_evidence`` (R,)."""
+        """Mapping with the given ``theta`` (R, d), ``log_density`` (R,) and ``log_evidence`` (R,)."""
         seeds = rng.integers(2**63, size=len(theta))
         log_prior = np.array([float(self.log_prior(row)) for row in theta])
         if np.isnan(log_prior).any():
@@ -175,8 +175,9 @@ def pmmh(
     batched : bool
         Whether ``filter_of`` also accepts parameters (d, m), one column for each of m particles of several chains.
         The filters of all chains then run as one batch, see `mstfilter.smc.batching`. To combine a parameter with
-        particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs and must be equal
-        up to rounding. If estimates differ, InputError is raised, or the runs are made one by one with a warning.
+        particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs. If estimates
+        differ by more than rounding, the runs are made one by one with a warning; if the component states
+        ``batched=True``, InputError is raised.
 
     Raises
     ------
@@ -202,7 +203,7 @@ def pmmh(
 
 
 def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
-    """The first parameters with their log densities. Estimates of zero are drawn again."""
+    """The first parameters with their log densities. Estimates of the evidence that are zero are drawn again."""
     state = posterior(key.generator(), theta)
     for attempt in range(1, _N_STARTS + 1):
         lost = np.flatnonzero(~np.isfinite(state["log_density"]))
@@ -291,7 +292,7 @@ def particle_gibbs(
     Parameters
     ----------
     filter_of : callable
-        ``(theta) -> ParticleFilter`` that `conditional_path` accepts.
+        ``(theta) -> ParticleFilter``. The filter must be supported by `conditional_path`.
     draw : callable
         ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. Examples are an exact
         draw if the prior is conjugate, and a Metropolis step with `path_log_prob`.

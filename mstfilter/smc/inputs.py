@@ -11,7 +11,7 @@ A function of a model with a parameter named ``t`` or ``u`` gets the time or the
 observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
 
 `Component.at_step` returns a component for step t with input u. `step_functions` names the fields of a component or
-model that are functions. Other components override `at_step`, or ignore time and inputs.
+model that are functions. Components without such fields override `at_step`, or ignore time and inputs.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ def split_input(observation: Any) -> tuple[Any, Any]:
 
 
 def check_observations(observations: Iterable[Any], where: str = "") -> Any:
-    """Return the observations unchanged if they are valid.
+    """Check the type and the values of observations, and return the observations unchanged.
 
     Raises InputError for a table, a mapping or a string, and for an observation whose entries are all NaN.
 
-    Iteration over a data frame or a mapping yields names of columns. `where` is the start of the error message.
+    Iteration over a data frame or a mapping would yield names of columns. `where` is the start of the error message.
     """
     if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
         raise InputError(
@@ -137,7 +137,7 @@ class AtStep(Bounded):
 
     @cached_property
     def _of_step(self) -> dict[str, dict[str, bool] | None]:
-        """Map each field that depends on the step to its parameters, or to None for a component or model."""
+        """Map each field that depends on the step to its parameters `t` and `u`; None for a component or model."""
         found: dict[str, dict[str, bool] | None] = {}
         for name, n_arguments in self.step_functions.items():
             value = getattr(self, name)

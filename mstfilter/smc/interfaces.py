@@ -45,7 +45,7 @@ class Component(AtStep, ABC):
     """A component that takes part in a step.
 
     At step t with input u, the filter uses ``component.at_step(t, u)`` (see `mstfilter.smc.inputs`). Class attributes
-    can override `properly_weighted`, `draws` and `batched`: ``properly_weighted = False``.
+    can override `properly_weighted`, `draws` and `batched`, as in ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
@@ -57,8 +57,8 @@ class Component(AtStep, ABC):
     def properly_weighted(self) -> bool:
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author of a component declares if it is properly weighted. The default is True; write ``properly_weighted
-        = False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
+        The author declares if the component is properly weighted. The default is True; write ``properly_weighted =
+        False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
         reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
@@ -72,9 +72,9 @@ class Component(AtStep, ABC):
     def batched(self) -> bool | None:
         """Whether the component treats each particle independently, so that it can process several runs together.
 
-        With True, the author states that particles are independent. With None, `run_many` tries a batch, and makes
-        the runs one by one if results differ (see `mstfilter.smc.batching`). With False, the default, the runs are
-        made one by one.
+        True states that the component treats each particle independently. With None, `run_many` tries a batch, and
+        makes the runs one by one if results differ (see `mstfilter.smc.batching`). With False, the default,
+        `run_many` makes the runs one by one.
         """
         return False
 
@@ -119,7 +119,7 @@ class Update(Component):
 
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
         `proposed` are new particles; None if the filter has no proposal. Each particle of the result keeps the
-        ``parents`` of the particles from which it was made (see `union`).
+        ``parents`` of the particles from which the particle was made (see `union`).
         """
 
 
@@ -180,11 +180,11 @@ class Trigger(Bounded, ABC):
 
     @abstractmethod
     def wants(self, population: Population, t: int) -> bool:
-        """True to resample at step `t`."""
+        """Whether the filter resamples at step `t`."""
 
 
 class Size(Bounded, ABC):
-    """Chooses the number of particles to select. The `n` of a filter with a size is only the number at the start."""
+    """Chooses the number of particles to select. The field `n` of the filter is then only the number at the start."""
 
     @abstractmethod
     def choose(self, population: Population) -> int:
@@ -234,8 +234,8 @@ class Rejuvenation(Component):
     ) -> Population:
         """Move x_t without changing its distribution.
 
-        `population` holds the weighted particles x_t after the observation. `previous` holds the x_{t-1} of each
-        particle in the same row; None at the first step. The result has the same number of particles in the same
+        `population` holds the weighted particles x_t after the observation. `previous` holds the parent x_{t-1} of
+        each particle in the same row; None at the first step. The result has the same number of particles in the same
         order, with unchanged log weights. The kernel must leave p(x_t | x_{t-1}, y_t) invariant. `observation` is
         y_t, or None if missing.
         """
@@ -298,7 +298,7 @@ class Codec(ABC):
 
     @abstractmethod
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
-        """Convert the particles of a population to named arrays, not of objects."""
+        """Convert the particles of a population to named arrays, which must not have the dtype object."""
 
     @abstractmethod
     def decode(self, arrays: Mapping[str, np.ndarray]) -> Any:
@@ -331,7 +331,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Record of a step, of a size that does not depend on n. The `State` holds the weights and parents."""
+    """Summary of a step; its size does not depend on n. The weights and parents are in the `State`."""
 
     t: int  #: index of the observation, from 0
     n: int  #: particles after the step
@@ -349,14 +349,14 @@ class Info:
 
 
 class Infos(list[Info]):
-    """The records of the steps of a run: a list that can be read as a table.
+    """The `Info` objects of the steps of a run: a list with the method `rows`, which makes a table.
 
     >>> state, infos = filter.run(observations)
     >>> pandas.DataFrame(infos.rows())
     """
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row for each step: its numbers, and the wall time in seconds of the step and of each slot."""
+        """One row per step: the numbers of `Info`, and the wall time in seconds of the step and each component."""
         slots = dict.fromkeys(slot for info in self for slot in info.seconds)
         return [
             {

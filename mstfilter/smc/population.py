@@ -11,8 +11,8 @@ array([0.25, 0.25, 0.5 ])
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
 particles on access. `take` selects particles of any type: array rows are copied, and objects are shared.
 
-A population is immutable. A population does not copy the given arrays but holds read-only views of them. If you write
-to an array later, pass ``array.copy()`` to the population.
+A population is immutable. A population does not copy the given arrays but stores read-only views of the arrays. If
+you write to an array later, pass ``array.copy()`` to the population.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Candidates(Sequence[_T], Generic[_T]):
 
     In MST the weight of a candidate is known before the candidate is built, so only selected candidates are built.
     `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) are the
-    indices of the candidates in order; repeated indices are allowed. An integer n means the indices 0 .. n-1.
+    indices of the candidates in order; repeated indices are allowed. An integer n stands for the indices 0 .. n-1.
     """
 
     def __init__(
@@ -84,14 +84,14 @@ class Candidates(Sequence[_T], Generic[_T]):
         return self._built[index]
 
     def built(self) -> tuple[_T, ...]:
-        """All candidates in order; different ones are built two at a time in a block `parallel`."""
+        """All candidates in order. Inside a block `parallel`, two candidates are built at the same time."""
         _, first = np.unique(self._indices, return_index=True)
         each(self.__getitem__, np.sort(first))
         return tuple(self)
 
     @property
     def n_built(self) -> int:
-        """Number of distinct candidates built so far. A selection by `take` uses the same built candidates."""
+        """Number of distinct candidates built so far, including candidates built through a selection by `take`."""
         return len(self._built)
 
     def map(self, function: Callable[[_T], _U]) -> Candidates[_U]:
@@ -148,7 +148,7 @@ def frozen_view(array: np.ndarray) -> np.ndarray:
 
 
 def _freeze(particles: Particles) -> Particles:
-    """Make read-only views of arrays, and a tuple of objects."""
+    """Replace arrays by read-only views, and a sequence of objects by a tuple."""
     if isinstance(particles, np.ndarray):
         return frozen_view(particles)
     if isinstance(particles, (dict, Mapping)):
@@ -206,9 +206,9 @@ class Population:
         Unnormalised natural log weights, by default 0. NaN and +inf raise InputError; -inf means a weight of 0.
     parents : mapping
         ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 for none. The filter sets the indices, and an update keeps the indices. A resampler
-        adds ``"ancestor"``, the index before the resampling. A population after a step has ``"ancestor"`` if the step
-        resampled after its update.
+        proposed particles, -1 if there is no parent. The filter sets the indices, and an update keeps the indices. A
+        resampler adds ``"ancestor"``, the index before the resampling. A population after a step has ``"ancestor"``
+        if the step resampled after its update.
     notes : mapping
         Values that a component records: numbers, strings and lists.
     """
@@ -311,25 +311,25 @@ class Population:
         )
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
-        """The population after a resampling: a `take` with ``parents["ancestor"]`` and additional notes."""
+        """Select particles as `take` does, set ``parents["ancestor"]``, and add the given values to `notes`."""
         return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
-        """The same particles with ``parents["ancestor"]`` set and additional notes."""
+        """The same particles with the given ``parents["ancestor"]``, and the given values added to `notes`."""
         parents = {**self.parents, "ancestor": _integers("ancestors", ancestors)}
         return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
 
     def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
-        """The same particles and weights with other parents ((n,) int64 arrays) and notes (none by default)."""
+        """The same particles and weights with the given `parents`, (n,) int64 arrays, and `notes` (default empty)."""
         new = object.__new__(Population)  # checked already
         new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
         return new
 
     def traced_through(self, resampled: Population | None) -> Population:
-        """The same particles, with parents before the resampling that preceded the prediction.
+        """The same particles, with parents in the population from which `resampled` was selected.
 
         ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, the indices are converted to
-        indices into the population before the resampling. The result has no notes.
+        indices into the population before the resampling. The field `notes` of the result is empty.
         """
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         index = self.parents.get("previous")
@@ -340,7 +340,7 @@ class Population:
         return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
-        """Replace the particles by as many new particles. Weights and parents are kept; notes are dropped."""
+        """Replace the particles by the same number of others, with the same weights and parents and empty `notes`."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")

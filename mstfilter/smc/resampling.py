@@ -1,7 +1,7 @@
 """Resampling schemes that use only the weights. The output weights are equal.
 
-W_i is the normalised weight of particle i, N_i its number of copies among the n selected particles, and f = frac(n
-W_i). The schemes are unbiased, E[N_i] = n W_i, except `LargestWeights`. The schemes differ in the variance of N_i.
+W_i is the normalised weight of particle i, N_i the number of its copies among the n selected particles, and f =
+frac(n W_i). All schemes except `LargestWeights` are unbiased: E[N_i] = n W_i. The variances of N_i differ.
 
 ==============  =================================================  ====================================
 scheme          N_i                                                variance of N_i
@@ -20,8 +20,8 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 array([0, 0, 1, 2])
 
 Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from the number of
-weights. A particle of weight zero is never selected. `InputError` is raised if a log weight is NaN or +inf, or if all
-weights are zero.
+weights. A particle of weight zero is never selected. Log weights of NaN or +inf, or only zero weights, raise
+`InputError`.
 
 Three functions invert the cumulative weights: `inverse_cdf` takes one point in each of n equal strata,
 `independent_draws` takes n independent points, and `draw_rows` takes one point for each row of a matrix. The `select`
@@ -47,7 +47,7 @@ from mstfilter.smc.interfaces import WeightResampler
 
 @dataclass(frozen=True)
 class Multinomial(WeightResampler):
-    """Independent draws by weight (Gordon, Salmond, Smith 1993). The variance is the largest of all schemes."""
+    """Independent draws by weight (Gordon, Salmond, Smith 1993). N_i has the largest variance of all schemes."""
 
     batched: ClassVar[bool] = True
 
@@ -57,7 +57,7 @@ class Multinomial(WeightResampler):
 
 @dataclass(frozen=True)
 class Stratified(WeightResampler):
-    """Draws one uniform in each of n equal strata (Kitagawa 1996)."""
+    """Draws one uniform point in each of n equal strata of [0, 1) (Kitagawa 1996)."""
 
     batched: ClassVar[bool] = True
 
@@ -68,7 +68,7 @@ class Stratified(WeightResampler):
 
 @dataclass(frozen=True)
 class Systematic(WeightResampler):
-    """Makes floor or ceil of n W_i copies, by one uniform for all strata (Carpenter, Clifford, Fearnhead 1999)."""
+    """Makes floor or ceil of n W_i copies, by one uniform number for all (Carpenter, Clifford, Fearnhead 1999)."""
 
     batched: ClassVar[bool] = True
 
@@ -116,9 +116,9 @@ class Ssp(WeightResampler):
 
     Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability down / (up +
     down), a increases and b decreases by `up`. With the remaining probability, a decreases and b increases by `down`.
-    One of the fractions is then 0 or 1 and final; the other is paired again. All pairs of a round are processed
-    together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative association, ordering and
-    convergence of resampling methods").
+    One of the fractions is then 0 or 1 and final; the other fraction is paired again. All pairs of a round are
+    processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative association,
+    ordering and convergence of resampling methods").
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -173,9 +173,9 @@ class Killing(WeightResampler):
     """A particle keeps its position with probability w_i / max w. Draws by weight fill the other positions.
 
     Most particles keep their positions if the weights are nearly equal. The reference for n = m is Del Moral (2004),
-    "Feynman-Kac formulae", section 5.6. For n != m, each particle has floor(n / m) of the n positions, or one more at
-    random. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n. For n = m and p = w /
-    max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
+    "Feynman-Kac formulae", section 5.6. For n != m, each of the m particles has floor(n / m) of the n positions, or
+    one more at random. The particle of each position is then kept or replaced. E[N_i] = n W_i for any n. For n = m
+    and p = w / max w, var N_i = p_i (1 - p_i) (1 - 2 W_i) + W_i^2 sum p (1 - p) + (m - sum p) W_i (1 - W_i).
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -288,7 +288,7 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and indices ascend only between strata.
+    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and the indices are partly sorted.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -307,7 +307,7 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
 
 
 def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) indices: the interval of the cumulative weights (m,), scaled to [0, 1), that contains each point."""
+    """(n,) indices of the intervals of the cumulative weights (m,), scaled to [0, 1), that contain the points."""
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
@@ -315,12 +315,12 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight. The points are first distributed to strata of equal weight.
+    """(n,) indices drawn independently by weight. The points are first distributed among strata of equal weight.
 
-    For 10^6 points, the method is four times as fast as a search.
+    For 10^6 points, the function is four times as fast as a binary search.
 
-    Inside a stratum, the number of cumulative weights in lower bins is a lower bound of the index of a point. Bounds
-    that are too small are increased.
+    The index of a point is at least the number of cumulative weights in bins below the bin of the point. Bounds below
+    the index are increased.
     """
     # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
     bits = 62 - max(n.bit_length() - 14, 0)
@@ -353,7 +353,7 @@ def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> n
 def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
     """(m,) int64 cumulative weights that end at `total`, at most 2^62.
 
-    Sums of integers are exact, and four times as fast as sums of floats.
+    Sums of integers are exact, and are computed four times as fast as sums of floats.
     """
     cumulative = np.empty(len(weights), np.int64)
     np.multiply(weights, total / weights.sum(), out=cumulative, casting="unsafe")

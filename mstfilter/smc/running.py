@@ -1,4 +1,4 @@
-"""Many runs of several filters (arms) and seeds.
+"""Runs of one or several filters with many seeds.
 
 >>> runs = run_many(bootstrap(model, n=100), observations, seeds=range(200), ess=ess, log_evidence=log_evidence)
 >>> runs["ess"].shape                                  # (seed, time)
@@ -9,10 +9,10 @@
 >>> runs["log_evidence"].shape                         # (arm, seed, time)
 (2, 20, 50)
 
-Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other arms. If the
-components of an arm treat each particle independently, its runs are processed together as arrays (see
-`mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every arm has the same seed and random
-streams, so differences between arms have less noise.
+Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other filters. If
+the components of a filter treat each particle independently, the runs of the filter are processed together as arrays
+(see `mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every filter has the same seed and
+random streams, so differences between filters have less noise.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ def run_many(
     progress: bool | Callable[[int, int | None], None] = False,
     **collectors: Collector,
 ) -> History:
-    """Run one filter, or each of several filters (arms), with each seed.
+    """Run one filter, or each of several filters, with each seed.
 
     Parameters
     ----------
     filters : ParticleFilter or mapping
-        A filter, or a mapping from names of arms to filters. All arms get the same observations and seeds.
+        A filter, or a mapping from names to filters. All filters get the same observations and seeds.
     observations : iterable
         T observations, the same for all runs. A missing observation is None. Use `WithInput` for an input.
     seeds : iterable of int
         Different non-negative integers.
     workers : int
-        Number of processes; 1 uses the calling process. joblib's loky starts workers as new interpreters. The workers
-        get the filters by cloudpickle and limit the numerical libraries to one thread. If a worker dies, InputError
-        names the runs that may have ended the process.
+        Number of processes. With 1, all runs are made in the calling process. joblib's loky starts workers as new
+        interpreters. The workers get the filters by cloudpickle and limit the numerical libraries to one thread. If a
+        worker dies, InputError names the runs that may have ended the process.
     progress : bool or callable
         True shows a progress bar. When runs finish, a function is called as ``progress(done, total)``.
     **collectors
@@ -68,14 +68,15 @@ def run_many(
     Returns
     -------
     History
-        Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. A run is lost if no particle explains
-        an observation (`LostRunError`). After a run is lost, its log evidence is -inf and its other results are NaN.
-        `History.lost` explains lost runs. `History.single` explains runs made one by one.
+        Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. Axis "arm" has one entry per filter.
+        A run ends if all weights are zero (`LostRunError`). From the step of the error, the log evidence is -inf, and
+        other results are NaN. `History.lost` gives the reasons, and `History.single` gives the reasons for runs made
+        one by one.
 
     Warns
     -----
     InputWarning
-        If the runs of an arm were made one by one because of a component that states ``batched=True``.
+        If runs were made one by one because a component that states ``batched=True`` cannot process them together.
     """
     arms = dict(filters) if isinstance(filters, Mapping) else {_ALONE: filters}
     if not arms:
@@ -127,7 +128,7 @@ class _Job:
     collectors: dict[str, Collector]
 
     def where(self, arm: str, seed: int | None = None) -> str:
-        """Name of arm and seed for error messages. A single filter has no name."""
+        """Name of the filter and seed for error messages. A single filter has no name."""
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
     def chunks(self, workers: int) -> list[_Chunk]:
@@ -144,13 +145,13 @@ class _Job:
         return chunks
 
     def run(self, arm: str, seeds: list[int]) -> _Part:
-        """Make some runs of an arm."""
+        """Make the runs of a filter with some seeds."""
         runs, why = self.made(arm, seeds)
         found = {(arm, seed): run for seed, run in zip(seeds, runs, strict=True)}
         return _Part(found, {arm: why} if why else {})
 
     def made(self, arm: str, seeds: list[int]) -> tuple[list[Collected], str]:
-        """Some runs of an arm, and the reason if several runs were made one by one, or else ""."""
+        """Runs of a filter, and the reason if several runs were made one by one, or else ""."""
         filter, why = self.arms[arm], ""
         try:
             check_together(filter)
@@ -163,14 +164,14 @@ class _Job:
         return [self.single(arm, seed) for seed in seeds], why
 
     def single(self, arm: str, seed: int) -> Collected:
-        """One run, up to the step at which the run is lost."""
+        """One run, up to the step at which all weights are zero."""
         lost: list[str] = []
         with naming(self.where(arm, seed)):
             steps = _until_lost(self.arms[arm].iterate(self.ys, seed), lost)
             return Collected(dict(collect(steps, **self.collectors)), "".join(lost))
 
     def history(self, found: Mapping[_Task, Collected], single: Mapping[str, str], has_arms: bool) -> History:
-        """The results of all runs. For a single filter, the axis of arms is omitted."""
+        """The results of all runs. For a single filter, the axis "arm" of the filters is omitted."""
         sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys)}
         coords = {"arm": list(self.arms), "seed": np.asarray(self.seeds), "time": np.arange(sizes["time"])}
         runs = [found[task] for task in product(self.arms, self.seeds)]
@@ -183,7 +184,7 @@ class _Job:
         return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost, single=dict(single))
 
     def joined(self, name: str, rows: list[np.ndarray], n_steps: int) -> np.ndarray:
-        """Values (run, time, ...) of a collector. Values after a run is lost are -inf or NaN."""
+        """Values (run, time, ...) of a collector; -inf or NaN after all weights of a run became zero."""
         longest = max(rows, key=len)
         check_one_shape(name, [row.shape[1:] for row in rows if len(row)])
         complete = all(len(row) == n_steps for row in rows)
@@ -196,7 +197,7 @@ class _Job:
 
 
 def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterable[tuple[State, Info]]:
-    """The steps of a run. If no particle explains an observation, the reason is appended to `lost`."""
+    """The steps of a run. If all weights become zero, the steps end and the reason is appended to `lost`."""
     try:
         yield from steps
     except LostRunError as error:
@@ -205,7 +206,7 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
 
 # --- processes ----------------------------------------------------------------------------------------------------
 def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
-    """Results of chunks of runs in the order in which they finish.
+    """Results of chunks of runs, in the order in which the chunks finish.
 
     Workers are new processes, because a fork of a process with threads can deadlock.
     """

@@ -1,4 +1,4 @@
-"""Smoothing estimates the states given all observations from the populations of a filter.
+"""Smoothers, which use the populations of a run to estimate the states given all observations.
 
 >>> record = keep(bootstrap(model, n=500), observations, seed=0)
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
@@ -11,9 +11,9 @@ Three smoothers take a `Record` and return a tuple with one population per time:
 - `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` keeps
   more distinct particles, but is biased if a state depends on observations more than `lag` steps later.
 - `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
-  path degeneracy. A step evaluates N densities per path, or a few with ``method="mcmc"``.
+  path degeneracy. A step evaluates N densities per path, or a few densities with ``method="mcmc"``.
 
-The paths are valid for any properly weighted filter, also with guided moves, a lookahead or rejuvenation.
+The smoothers accept any properly weighted filter, including filters with guided moves, a lookahead or rejuvenation.
 
 `mstfilter.smc.conditional` draws single paths of models and of programs.
 """
@@ -84,7 +84,7 @@ def genealogy(record: Record) -> tuple[Population, ...]:
 
 
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
-    """For each time t, the ancestors of the particles at t + `lag` (or the end), weighted by these later particles.
+    """For each time t, the ancestors of the particles at t + `lag` (or the end), with the weights of these particles.
 
     A lag of 0 returns the populations of the filter.
     """
@@ -121,17 +121,16 @@ def backward_paths(
     Parameters
     ----------
     transition : DensityTransition
-        The transition of the model, ``Dynamics(model)``. A transition with a proposal has another density and cannot
-        be used.
+        The transition of the model, ``Dynamics(model)``. A transition with a proposal must not be used.
     method : "exact" or "mcmc"
         "exact" (Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
         leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
-        record must have parents. A small number of steps adds no bias (Dau and Chopin 2023). The parent of x_{t+1}
-        already has the distribution of "exact" after independent selections of a bootstrap filter. After other
-        selections, the error is of order 1 / N. More steps reduce the variance. Without accepted steps, the paths
-        equal the paths of `genealogy`.
+        record must have parents. A small number of steps adds no bias (Dau and Chopin 2023). If a bootstrap filter
+        selects by `Multinomial`, the parent of x_{t+1} already has the distribution of "exact". With other schemes,
+        the error of the distribution is of order 1 / N. More steps reduce the variance. Without accepted steps, the
+        paths equal the paths of `genealogy`.
     steps : int
         Number of Metropolis steps of "mcmc".
     """
@@ -153,7 +152,7 @@ def backward_paths(
 
 @dataclass(frozen=True)
 class _Move:
-    """All moves from a population at time t to n later particles."""
+    """All moves from a population at time t to n particles at time t + 1."""
 
     population: Population
     later: Particles
@@ -173,7 +172,7 @@ class _Move:
         return density
 
     def exact(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """(n,) indices of predecessors, drawn from their exact distribution."""
+        """(n,) indices of predecessors at time t, drawn from the exact distribution."""
         m, drawn = len(self.population), []
         for rows in np.split(np.arange(n), range(max(1, _PAIRS // m), n, max(1, _PAIRS // m))):
             density = self._log_density(np.tile(np.arange(m), len(rows)), np.repeat(rows, m))

@@ -152,7 +152,7 @@ class _OfModel(AtStep):
 
     @property
     def batched(self) -> bool | None:
-        """The value of the model. With a proposal, True becomes None, so that a batch of runs tests the proposal."""
+        """The `batched` of the model. With a proposal, True becomes None, so that `run_many` tests the proposal."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
@@ -250,7 +250,8 @@ class RandomWalkMove(Rejuvenation):
     model : StateSpaceModel
         The model with its log densities. Particles are float arrays (n,) or (n, d), or mappings of such arrays.
     scale : float or array_like
-        Standard deviation of a step, in the units of the state. A fixed scale keeps the evidence unbiased.
+        Standard deviation of a step, in the units of the state. A scale that does not depend on the particles keeps
+        the evidence unbiased.
     steps : int
         Number of Metropolis steps per move.
     """
@@ -366,7 +367,7 @@ def guided(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The guided filter moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
+    """The guided filter, which moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
 
     Parameters
     ----------
@@ -392,7 +393,7 @@ def auxiliary(
     initial: Callable[[Any], Any] | None = None,
     **components: Any,
 ) -> ParticleFilter:
-    """The auxiliary filter (Pitt and Shephard 1999) selects by weight times priority, and divides by the priority.
+    """Auxiliary filter (Pitt, Shephard 1999): selects by weight times priority, then divides weights by priority.
 
     Parameters
     ----------
@@ -401,7 +402,7 @@ def auxiliary(
     log_priority : callable
         ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}). The filter is exact for any finite priority.
     proposal, initial : callable, optional
-        As in `guided`. With p(y_t | x_{t-1}) as priority and p(x_t | x_{t-1}, y_t) as proposal the filter is fully
+        As in `guided`. With priority p(y_t | x_{t-1}) and proposal p(x_t | x_{t-1}, y_t), the filter is fully
         adapted.
     **components
         As in `guided`.

@@ -1,20 +1,19 @@
 """Random streams that are named by keys.
 
-All random numbers of a run are drawn from streams named by their use: (seed, slot, step, index). A slot is a
-component of the filter. The streams do not depend on the number of workers, the order of work, or other components.
+All random numbers of a run are drawn from streams with names (seed, slot, step, index). A slot is a component of the
+filter. The streams do not depend on the number of workers, the order of work, or other components.
 
 >>> from mstfilter.smc import Key, child
 >>> rng = Key(seed=1).child("transition", 3).generator()     # of step 3, as `ParticleFilter` makes it
 >>> child(rng, "object", 7).random() == child(rng, "object", 7).random()    # does not consume `rng`
 True
 
-A `Key` is data (an integer and a tuple) and can be stored. Generators are not stored. The generator of a key is
-numpy's PCG64. The 256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys
-are independent as far as a cryptographic hash behaves like a random function. The probability that two of a billion
-streams have the same seed is below 1e-50.
+A `Key` consists of an integer and a tuple, and can be stored in a file. The generator of a key is numpy's PCG64. The
+256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys are independent if
+the hash behaves like a random function. Two of a billion streams have equal seeds with probability below 1e-50.
 
-A batched component is called once for R runs of n particles. The particles are `Rows`: arrays (R n, ...), run by run.
-`RunGenerators` draw `Rows`; the generator of run r draws the rows of run r.
+A batched component is called once for R runs of n particles. The particles are `Rows`: arrays (R n, ...), with the n
+rows of run 0 first. `RunGenerators` draws the rows of run r from the generator of run r.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class Key:
 
 
 class _KeySequence(ISpawnableSeedSequence):
-    """The seed of the generator of a key."""
+    """The seed of the generator of a key, as a seed sequence of numpy."""
 
     def __init__(self, key: Key) -> None:
         self.key, self._n_spawned = key, 0
@@ -99,7 +98,7 @@ def _digest(seed: int, path: tuple[int | str, ...], block: int | None) -> bytes:
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
-    """A generator of the stream named `parts` below the stream of `rng`, for example ``"object", 7``.
+    """A generator of the child stream `parts` of the stream of `rng`, for example ``"object", 7``.
 
     `rng` must be made from a seed, for example by numpy.random.default_rng or `Key`. `rng` is not advanced.
     """
@@ -129,7 +128,7 @@ def _part(part: int | str) -> int | str:
 
 # --- many runs -----------------------------------------------------------------------------------------------------
 class Rows(np.ndarray):
-    """Arrays (R n, ...) of the particles of R runs, run by run, in the functions of batched components.
+    """Arrays (R n, ...) of the particles of R runs, sorted by run, for the functions of batched components.
 
     Products with a matrix are computed for each run, since the rounding of BLAS depends on the number of rows.
     """
@@ -150,7 +149,7 @@ def rows_of(n: int) -> type[Rows]:
 
 
 class RunKeys:
-    """The keys of R runs. Makes generators of several runs in half the time of `Key.generator`."""
+    """The keys of R runs. `generators` makes generators in half the time of `Key.generator`."""
 
     def __init__(self, keys: list[Key]) -> None:
         self.keys = keys
@@ -167,7 +166,7 @@ class RunKeys:
 
 
 class _SeedsInTurn(ISeedSequence):
-    """Gives k generators their seeds (k, 4) in turn. One object takes less time than k objects."""
+    """Gives k generators their seeds (k, 4) in turn, which is faster than k seed sequences."""
 
     def __init__(self, words: np.ndarray) -> None:
         self._rows = iter(words)

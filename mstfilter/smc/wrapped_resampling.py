@@ -123,8 +123,8 @@ class Coalesced(ResamplerWrapper):
     """Merges particles that are equal by `equivalence`, and sums their weights, before the selection.
 
     The first of the heaviest particles of each class is kept. The result represents the same distribution with fewer
-    particles. The population grows again only if a transition or update makes more candidates. ``notes["distinct"]``
-    is the number of different particles of positive weight.
+    particles. The number of particles grows again only if a transition or update makes more candidates.
+    ``notes["distinct"]`` is the number of different particles of positive weight.
     """
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
@@ -143,8 +143,8 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
     """Select the heaviest particle of each class, with the total weight of the class.
 
     Returns the representatives (k,) in ascending order and their log weights (k,). If several particles have equal
-    weights, the first is the representative. The log weights are ``log(w k / m)`` for class weights w, so the mean
-    weight does not change. Classes of weight zero are omitted.
+    weights, the first is the representative. The output log weight of a class of total weight w is ``log(w k / m)``,
+    so the mean weight does not change. Classes of weight zero are omitted.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)
@@ -159,7 +159,7 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Tempered(ResamplerWrapper):
-    """Selects by w^power and multiplies selected weights by w^(1 - power), so light particles are kept more often.
+    """Selects by w^power and multiplies output weights by w^(1 - power), so light particles are kept more often.
 
     `power` is in [0, 1]. A power of 1 leaves the wrapped scheme unchanged. With a power of 0 all particles of
     positive weight are equally likely.
@@ -182,7 +182,7 @@ class Tempered(ResamplerWrapper):
 class KeepWeights(ResamplerWrapper):
     """The selected particles keep their weights, as in the program of the MST authors.
 
-    The evidence counts twice (in the selection and the weights), so the scheme is not properly weighted.
+    The weights count twice, in the selection and in the output weights, so the scheme is not properly weighted.
     """
 
     scheme: Resampler = Multinomial()  # noqa: RUF009 (frozen)

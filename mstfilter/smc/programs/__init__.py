@@ -10,11 +10,11 @@
 
 The function runs once per step for all particles. `previous` is a mapping from names to arrays with one row per
 particle, None at the first step. The new particles are also a mapping of arrays: one array for each `sample`, and one
-for each entry of a mapping that the function returns. `observe` adds log p(value) to the log weights, or nothing if
-the value is None (missing). ``switch(name, probs, branches, ...)`` draws a branch for each particle and runs each
-branch on its particles. For particles with different numbers of variables, use a `StateSpaceModel` of objects.
+for each entry of a mapping that the function returns. `observe` adds log p(value) to the log weights; a value of None
+(missing) has no effect. ``switch(name, probs, branches, ...)`` draws a branch for each particle and runs each branch
+on its particles. For particles with different numbers of variables, use a `StateSpaceModel` of objects.
 
 The methods of `Program` make a bootstrap filter or a guided filter from the function. A guided filter needs a guide:
-a program that samples the same names. One pass makes all calls of `sample` and `observe`, so a program is a
-transition that weights its particles, and the filter has no update.
+a program that samples the same names. A run of the program moves and weights the particles. The program is therefore
+the transition of the filter, and the filter has no update.
 """

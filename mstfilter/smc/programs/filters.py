@@ -41,7 +41,7 @@ class Program:
         return self._filter(None, n, components)
 
     def guided(self, guide: Model, n: int, **components: Any) -> ParticleFilter:
-        """Guided filter, which draws from the guide.
+        """Guided filter, which draws from the guide and weights by the density ratio of model and guide.
 
         The guide is a program that samples every name of the model, given the observation. If the observation is
         missing, particles are drawn from the model.
@@ -65,7 +65,7 @@ class _ProgramStep(Component):
 
     @cached_property
     def schedule(self) -> Schedule:
-        """The `Schedule` of the steps that are checked."""
+        """The `Schedule` that determines which steps are checked."""
         return Schedule.of(self.model, self.guide)
 
     def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
@@ -191,7 +191,7 @@ _RAW_ERRORS = {
 
 
 def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
-    """The error of a program with its line and a hint. Only errors of Python, numpy or scipy are changed."""
+    """The error of a program with the line of the program and a hint. Errors of other libraries are unchanged."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
     place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
     if frames:

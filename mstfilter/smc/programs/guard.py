@@ -2,15 +2,16 @@
 
 A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
 ``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
-error, but its weights are wrong. `Guard` checks some steps of each kind: steps 1, 2, 9, 66, 515 and so on. The
-numbers 8^k + k also detect a fault of every third step. A check has three parts:
+error, but its weights are wrong. Steps of each kind (first, later, without observation) are counted, and the steps 1,
+2, 9, 66, 515, ... are checked. The numbers 8^k + k have all remainders modulo 3, so a fault in every third step is
+detected. A check has three parts:
 
-1. The first two steps are repeated with the same random numbers. All values and log weights must agree.
+1. The first two steps are repeated with the same random numbers. Values and log weights must agree up to rounding.
 2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
-   change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. The
-   number of particles differs from the step, so an event axis cannot pass for the particle axis.
-3. If there is a guide, the model also draws a step. The guide must be able to draw the values of the model, and the
-   two estimates of the evidence must agree.
+   change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. A run
+   of few particles also detects an event axis used as the particle axis.
+3. If there is a guide, particles are also drawn from the model. The guide must be able to draw the values of the
+   model, and the two estimates of the evidence must agree.
 
 The results of a filter do not depend on these checks.
 """
@@ -157,7 +158,7 @@ class Guard:
 
 
 class Schedule(Counter[Any]):
-    """Counts the steps of a model and its guide, by kind. Programs with the same functions share the counts."""
+    """Counts the steps of each kind for a model and its guide. Programs with the same functions share the counts."""
 
     @classmethod
     def of(cls, model: Any, guide: Any) -> Schedule:
@@ -211,7 +212,7 @@ def _groups(run: ProgramRun) -> list[np.ndarray]:
 
 
 def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
-    """Choose some particles of `part`: at least two, because one row could be broadcast, but not all."""
+    """Choose some, but not all, particles of `part`: at least two, because one row could be broadcast."""
     rows = list(part[[len(part) // 2, 0, len(part) // 4]])
     for call in run.calls or ():
         if call.rows is not None and len(rows) < 8:

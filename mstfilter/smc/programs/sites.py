@@ -22,7 +22,7 @@ _RECORDED: ContextVar[list[ProgramRun] | None] = ContextVar("runs that record th
 
 @contextmanager
 def recorded() -> Iterator[list[ProgramRun]]:
-    """The `ProgramRun` of each program run inside the block. Each run records its `calls`."""
+    """List of the `ProgramRun` of each program that runs inside the block. Each run stores its `calls`."""
     runs: list[ProgramRun] = []
     token = _RECORDED.set(runs)
     try:
@@ -53,8 +53,8 @@ def observe(name: str, distribution: Any, value: Any) -> None:
     """Weight the particles by the density of an observed value; None (a missing value) has no effect.
 
     `distribution` is the distribution of the observation given the particle. The value has the event shape of the
-    distribution, or shape ``(n, *event_shape)`` if each particle has its own value, such as the reading that it
-    associates with an object. Error messages use `name`.
+    distribution, or shape ``(n, *event_shape)`` if each particle has its own value, such as the measurement that the
+    particle associates with an object. Error messages use `name`.
     """
     _current().observe(name, distribution, value)
 
@@ -70,10 +70,11 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
         Probabilities of the k branches.
     branches : sequence of callables
         Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
-        `observe` and `switch`. A name that several branches sample is one array. The entries of particles that do not
-        reach the call are NaN (0 for integers). A branch without particles is also called.
+        `observe` and `switch`. Several branches may sample one name, and their values form one array. The entries of
+        particles that do not reach the call are NaN (0 for integers). A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
-        Arguments whose rows are split among the branches. Branches get values shared by all particles by closure.
+        Arguments whose rows are split among the branches. A branch reads values shared by all particles from its
+        closure.
 
     Returns
     -------

@@ -34,7 +34,7 @@ _Test = TypeVar("_Test", bound=Callable[..., None])
 
 
 def statistical(test: _Test) -> _Test:
-    """Mark a test with random samples. For a correct component, the test fails with probability `FALSE_ALARM`."""
+    """Mark a test with random samples, which fails for a correct component with probability `FALSE_ALARM`."""
     test.statistical = True  # type: ignore[attr-defined]
     return test
 
@@ -93,7 +93,7 @@ class Contract:
         return [few] if objects else [few, self.inputs(1)]
 
     def fresh(self) -> Any:
-        """A component that has not been used: a copy of the result of `make`, if copying is possible."""
+        """A component that has not been called: a copy of the result of `make`, if the component can be copied."""
         return copied(self.make())
 
     @prerequisite
@@ -168,7 +168,7 @@ def _selected(population: Population) -> list[np.ndarray]:
 
 
 def copied(component: Any) -> Any:
-    """A deep copy of a component, or the component if it cannot be copied."""
+    """A deep copy of a component, or the component if copying fails."""
     try:
         return copy.deepcopy(component)
     except Exception:  # for example a lock or a module in a field
@@ -265,7 +265,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def skips_errors() -> Iterator[None]:
-    """Skip a general test if the component raises an exception; the tests of its interface report the exception."""
+    """Skip a general test if the component raises an exception, which the tests of the interface report."""
     try:
         yield
     except Exception as error:
@@ -289,7 +289,7 @@ def close(a: Any, b: Any) -> bool:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two values are equal: arrays bit by bit, dataclasses by field. True for types without ``==``."""
+    """Whether two values are equal: arrays bit by bit, dataclasses field by field. True for types without ``==``."""
     if a is b:
         return True
     if type(a) is not type(b):

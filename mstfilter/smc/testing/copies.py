@@ -1,4 +1,4 @@
-"""Tests of the weight of particles after a resampling: cases, statistics, and messages.
+"""Tests of the weights of particles after a resampling: test cases, statistics, and error messages.
 
 A `Case` is a list of weights and a number of particles to select. A `Sample` collects, over many resamplings, the
 share of the weight that the copies of each particle and of each group have. `fault_message` compares the mean with
@@ -27,10 +27,10 @@ class Case:
 
 
 def _mixed(m: int, heavy: float) -> tuple[float, ...]:
-    """(m,) weights: one heavy weight, zeros, ties and light weights. The second half has more weight.
+    """(m,) weights: one heavy weight, zeros, ties, light weights. The second half is heavier than the first.
 
-    The first weight of the second half is the fraction `heavy` of the total. An eighth of the other weights is zero,
-    and a quarter is at most 5e-4 of the heaviest weight.
+    The first weight of the second half is the fraction `heavy` of the total. One in eight of the other weights is
+    zero, and two in eight are at most 5e-4 of the heaviest weight.
     """
     kind = np.arange(m) % 8
     weights = np.select(
@@ -84,11 +84,11 @@ class Sample:
     """The weight of the copies of particles and of groups of particles in many resamplings of a case.
 
     Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
-    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let s be any stake from -1 / (b - mu) to 1 /
-    mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, the largest product
-    over any number of calls exceeds 1 / p with probability at most p. The test assumes no normal distribution, so an
-    unbiased scheme passes even if it makes very many copies in rare calls. Calls may be added if the result is not
-    clear.
+    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let a stake s be any number from -1 / (b -
+    mu) to 1 / mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, the
+    largest product over any number of calls exceeds 1 / p with probability at most p. The test assumes no normal
+    distribution, so an unbiased scheme passes even if it makes very many copies in rare calls. Calls may therefore be
+    added until the result is clear.
     """
 
     def __init__(self, case: Case) -> None:
@@ -105,7 +105,7 @@ class Sample:
 
     @property
     def carried(self) -> np.ndarray:
-        """(calls, m + k) fraction of the total weight for the copies of each particle and each of k groups."""
+        """(calls, m + k) fraction of the total weight that the copies of each particle and each of k groups have."""
         rows = np.array(self._rows)
         return np.concatenate([rows, rows @ groups_of(self.case).T], axis=1)
 
@@ -117,8 +117,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expected weight of each particle and group.
 
-        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is within four standard
-        errors of the expectation. For particles that are rarely selected, the limit is 16 copies larger.
+        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is near the expectation. Near
+        means within four standard errors, plus 16 copies over all calls.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
@@ -150,7 +150,7 @@ def groups_of(case: Case) -> np.ndarray:
 
 
 def fault_message(sample: Sample, column: int) -> str:
-    """Message: how the mean weight of a particle or group differs from the expected weight."""
+    """Error message that states how the mean weight of a particle or group differs from the expected weight."""
     case, expected, mean = sample.case, sample.expected[column], sample.carried[:, column].mean()
     m, n = len(case.weights), case.n
     who = f"particle {column}"
@@ -169,7 +169,7 @@ def fault_message(sample: Sample, column: int) -> str:
 
 
 class ConstantGenerator(np.random.Generator):
-    """A generator whose `random` always returns one value. The test is skipped if the scheme does not end."""
+    """A generator whose `random` always returns one value. Skips the test after 10,000 calls."""
 
     def __init__(self, value: float) -> None:
         super().__init__(np.random.PCG64(0))

@@ -20,15 +20,15 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 class ExactContract(Contract):
     """Properties of components that are tested with exact draws.
 
-    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` beside the component. The method returns
-    a population of `n` particles before the call, a population of exact draws (or with exact weights) after the call,
-    and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the weights of both
-    populations, so that the weights f / q of a guided move vary less. The test is skipped if a weight exceeds 1 % of
-    the total.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` in the module of the component. The
+    method returns a population of `n` particles before the call, a population of exact draws (or with exact weights)
+    after the call, and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the
+    weights of both populations, so that the weights f / q of a guided move vary less. The test is skipped if one
+    particle has more than 1 % of the total weight.
 
-    The rows of `exact` must be independent draws, or x_{t-1} may lie on a grid. With 200,000 rows, the tests detect
-    an error of 3 % in the standard deviation, and a shift by 3 % of the standard deviation. The tests also detect
-    missing tails of probability 0.1 %, and a correlation of 0.02 between particles.
+    The rows of `exact` must be independent draws, but the states x_{t-1} may lie on a grid. With 200,000 rows, the
+    tests detect an error of 3 % in the standard deviation, and a shift by 3 % of the standard deviation. The tests
+    also detect missing tails of probability 0.1 %, and a correlation of 0.02 between particles.
     """
 
     returns = Population
@@ -37,7 +37,7 @@ class ExactContract(Contract):
     n_draws: ClassVar[int] = 200_000  #: rows of `exact` in a test; fewer for a slow component find larger faults only
 
     def exact_case(self, seed: int, n: int) -> tuple[Any, ...]:
-        """Exact draws. Skips the test if no `exact` is defined."""
+        """The result of `exact`. Skips the test if no `exact` is defined."""
         if self.exact is None:
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
         return self.exact(seeded(seed), n)
@@ -47,9 +47,8 @@ class ExactContract(Contract):
 
         Distribution functions are compared at several quantiles. The sums detect columns that share a random number.
 
-        The bounds assume a normal difference of two weighted means, with a false-alarm rate 20 times smaller than
-        needed. A tail is compared only if its probability is so large that single large weights do not decide the
-        test.
+        The bounds assume that the difference of two weighted means is normal. The false-alarm rate is a twentieth of
+        the required rate. A tail is compared only if so probable that no single weight decides the test.
         """
         samples = []
         for log_weights in (lw, exact_lw):
@@ -84,7 +83,7 @@ class ExactContract(Contract):
             )
 
     def check_independent(self, x: np.ndarray) -> None:
-        """Check rank correlations between particles: of neighbours, of halves, and of mirrored positions."""
+        """Check rank correlations between neighbouring particles, between halves, and between mirrored positions."""
         half = len(x) // 2
         pairs = {
             "neighbours": (x[::2], x[1::2]),

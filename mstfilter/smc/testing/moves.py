@@ -66,7 +66,7 @@ class TransitionContract(ScaleContract, ExactContract):
         component = skip_unless_properly_weighted(self.make())
 
         def moved(n: int, missing: bool = False) -> tuple[Population, Population]:
-            """Particles and their moves."""
+            """Particles before and after their moves."""
             population, _, observation, *_ = self.exact_case(1, n)
             population = population.take(seeded(4).permutation(n)).reweighted(seeded(5).standard_normal(n))
             inputs = {"population": population, "observation": None if missing else observation}
@@ -86,7 +86,7 @@ class TransitionContract(ScaleContract, ExactContract):
     def _compare_moves(
         self, before: Population, after: Population, other: Population, fresh: Population, likelihood: list[Any]
     ) -> None:
-        """Compare moves and weight changes with exact moves. `likelihood` weights the found and the exact moves."""
+        """Compare moves and weight changes with exact moves. Both samples are weighted by `likelihood`."""
         lw, exact_lw = (
             new.log_weights - old.log_weights + sum(log_g(new.particles) for log_g in likelihood)
             for old, new in ((before, after), (other, fresh))
@@ -147,8 +147,8 @@ class DensityTransitionContract(TransitionContract):
         """The moves of `predict` have the density of `log_prob`, up to a constant factor.
 
         Let x' be a move from particle a or b, with probability 1/2 each. Then p = f(x' | a) / (f(x' | a) + f(x' | b))
-        is the probability of a given x'. If p is the probability of the true origin, (1 - p) log(p / (1 - p)) has
-        mean 0. The test pairs particles a number of positions apart in the order of the first coordinate.
+        is the probability that x' was moved from a. If p is the probability of the true origin, (1 - p) log(p / (1 -
+        p)) has mean 0. A pair is 4, 8, ... or 8192 positions apart in the order of the first coordinate.
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
@@ -246,7 +246,7 @@ class UpdateContract(ScaleContract, ExactContract):
         return component.update(rng, **inputs)
 
     def variants(self) -> list[dict[str, Any]]:
-        """Inputs with predicted particles, with proposed particles, and with both."""
+        """Inputs with predicted particles, with proposed particles, and with predicted and proposed particles."""
         return [{**self.inputs(_N), **absent} for absent in ({"proposed": None}, {"predicted": None}, {})]
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:

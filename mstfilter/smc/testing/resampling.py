@@ -1,8 +1,8 @@
 """Contracts of resamplers.
 
-A properly weighted resampler makes n W_i copies on average of a particle of normalised weight W_i. If output weights
-differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test cases: n =
-m, fewer and more particles, ties, zeros, heavy and light weights.
+A particle of normalised weight W_i must get n W_i copies on average if the resampler is properly weighted. If output
+weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test
+cases: n = m, n < m and n > m, ties, zeros, heavy and light weights.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 class ResamplerContract(ScaleContract):
     """The contract of every `Resampler`. The statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    The particles of `example` must differ. The tests detect a deviation of a mean of about six standard errors in the
-    calls of a `Case`, and at least 0.3 % of the particle's weight.
+    The particles of `example` must differ. The tests detect that a mean deviates by about six standard errors over
+    the calls of a `Case`, if the deviation is at least 0.3 % of the particle's weight.
     """
 
     returns = Population
@@ -113,7 +113,7 @@ class ResamplerContract(ScaleContract):
     def _carried(self, component: Resampler, case: Case, seed: int) -> Sample:
         """The weight of the copies of each particle and each group in many calls.
 
-        Calls are added while a mean deviates but the evidence is not sufficient.
+        Calls are added while a mean deviates but the evidence against the mean is below the bound.
         """
         given = self.population(case.weights)
         population = Population(given.particles, given.log_weights + 3.0)  # faster without parents
@@ -159,7 +159,7 @@ class WeightResamplerContract(ResamplerContract):
         )
 
     def _light_copies(self, component: WeightResampler, n_light: int, calls: int) -> np.ndarray:
-        """Copies of light particles among 100 000 copies. The first particle has 1000 times their total weight."""
+        """Copies of light particles among 100 000 copies. Light particles have .1 % of the weight of particle 0."""
         n, rng, copies = 100_000, seeded(n_light), []
         weights = np.append(1.0, np.full(n_light, 1e-3 / n_light))
         population = Population(np.arange(float(len(weights))), np.log(weights))

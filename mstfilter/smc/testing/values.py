@@ -21,7 +21,7 @@ _SELECTIONS: dict[str, tuple[np.ndarray, ...]] = {
 
 
 class RowsContract(Contract):
-    """Properties of components whose result depends on the particles, but not on the order of the particles."""
+    """Properties of components with a result that depends on the particles, but not on their order."""
 
     compared: ClassVar[tuple[str, ...]] = ("in another order", "if there are copies")  #: keys of the selections
 
@@ -30,7 +30,7 @@ class RowsContract(Contract):
         return np.asarray(result)
 
     def of_rows(self, relation: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """The entries `rows` of a relation of nine particles: one answer (), scores (9,) or pairs (9, 9)."""
+        """The entries `rows` of a result for nine particles: one answer (), numbers (9,) or pairs (9, 9)."""
         return relation[np.ix_(*[rows] * relation.ndim)]
 
     def test_order_of_particles_is_irrelevant(self) -> None:
@@ -76,7 +76,7 @@ class SizeContract(DecisionContract):
 
 
 class ScoreContract(RowsContract):
-    """Properties of components that give one number per particle."""
+    """Properties of components that return one number per particle."""
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         n = len(inputs["population"])
