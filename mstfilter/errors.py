@@ -41,7 +41,7 @@ class InputError(_WithHints, ValueError):
 
 
 class MissingLibraryError(InputError):
-    """A library or a system package that a chosen component needs is missing."""
+    """Raised if a library or a system package that a component needs is missing."""
 
 
 class LostRunError(InputError):

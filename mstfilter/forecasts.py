@@ -96,7 +96,7 @@ class ForecastTable:
         return self._mean(loss)
 
     def with_forecasts(self, p: np.ndarray) -> ForecastTable:
-        """A table of the same outcomes with other forecasts p (k,)."""
+        """A table in which new forecasts p (k,) replace the old forecasts of the same outcomes."""
         share = np.divide(self.yes, self.count, out=np.zeros_like(self.yes), where=self.count > 0)
         return ForecastTable.of(p, share, self.count)
 

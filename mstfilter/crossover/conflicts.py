@@ -119,7 +119,7 @@ class OccupiedVoxels:
         return cls(at, (a.reshape(-1)[at], b.reshape(-1)[at]), a.shape)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
-        """Values (n,) in the shape of the grid, 0 elsewhere."""
+        """A grid with values (n,) at the occupied voxels and 0 at all other voxels."""
         out = np.zeros(self.shape, values.dtype)
         out.reshape(-1)[self.at] = values
         return out
@@ -231,7 +231,7 @@ class RandomOrder(Structure):
 
 @dataclass(frozen=True)
 class SpanningTree(Structure):
-    """The authors' program: a uniform random spanning tree from a uniform random root.
+    """The rule in the authors' program: a uniform random spanning tree from a uniform random root.
 
     Objects are merged only along edges of the tree. Children are painted before their parent.
     """

@@ -225,7 +225,7 @@ class _Child:
     numbers: np.ndarray  #: (n,) object of each voxel, 1, 2, ...; 0 is free
 
     def hypothesis(self, parents: tuple[Hypothesis, Hypothesis]) -> Hypothesis:
-        """The child, with records and occupancy from the parents."""
+        """The child as a hypothesis, with each `ObjectRecord` and the occupancy from the parents."""
         labels = self.voxels.spread(self.numbers.astype(np.uint16))
         child = Hypothesis(labels, parents[0].grid, self._records(parents))
         if all(parent.occupancy is None for parent in parents):

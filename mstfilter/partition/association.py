@@ -8,7 +8,7 @@ A segment and a predicted object are *in conflict* if they share more than a ten
 smaller of the two. The segment may then show the object. Conflicts are the edges of the conflict graph. (In the
 paper, section IV-D, edges join objects that share voxels.) The *main object* of a segment is the predicted object
 that shares most readings with the segment. An object that is the main object of no segment and has fewer than about
-60 readings is in no conflict. The few readings of a hidden object measure objects nearby.
+60 readings is in no conflict. The few depth readings of a hidden object measure nearby objects.
 
 A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
@@ -69,7 +69,7 @@ class Overlaps:
 
     @cached_property
     def in_conflict(self) -> np.ndarray:
-        """Whether each segment is in conflict with each object, bool in the shape of `shared`."""
+        """Whether each segment is in conflict with each object: bool array, same shape as `shared`."""
         segments, objects = self.shared.sum(axis=1), self.shared.sum(axis=0)
         conflict = self.shared > _CONFLICT * np.minimum.outer(segments, objects)
         is_main = np.isin(np.arange(len(objects)), self.main_object)

@@ -284,7 +284,7 @@ def run_contract(
 
 
 def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
-    """A function in the module of a class."""
+    """The function with a given name in the module of a class."""
     found = getattr(sys.modules.get(cls.__module__), name, None)
     return found if callable(found) else None
 
