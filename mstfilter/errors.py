@@ -45,7 +45,7 @@ class MissingLibraryError(InputError):
 
 
 class LostRunError(InputError):
-    """All particles have weight 0 after an observation. The estimated evidence is 0, and the run cannot continue."""
+    """Raised if all particles have weight 0 after an observation. The run cannot continue."""
 
 
 class InputWarning(_WithHints, UserWarning):

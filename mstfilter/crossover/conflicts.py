@@ -218,7 +218,7 @@ class Structure(Checked, ABC):
 
 @dataclass(frozen=True)
 class RandomOrder(Structure):
-    """The paper's text: edges get a random acyclic orientation, and vertices get a topological order of these edges.
+    """The rule of the paper: a random acyclic orientation of the edges, and a topological order of the vertices.
 
     A uniformly random order of the vertices determines the orientation. Objects may be merged along every edge.
     """

@@ -233,7 +233,7 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The record of the head of each object (`_heads`). The motion history ends if the voxels have changed."""
+        """The `ObjectRecord` of each object's head (`_heads`). If voxels have changed, the motion history ends."""
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)

@@ -60,7 +60,7 @@ class Overlaps:
     def of(cls, partition: np.ndarray, counts: np.ndarray, least: float) -> Overlaps:
         """The overlaps of a partition, from the segment (K,) of each cell.
 
-        `counts` (K, objects + 1) has the numbers of readings that cells share with predicted objects; 0 is no object.
+        `counts` (K, objects + 1): number of readings that each cell shares with each object; column 0 is no object.
         """
         shared = np.zeros((int(partition.max(initial=0)) + 1, counts.shape[1]), np.int64)
         np.add.at(shared, partition, counts)

@@ -100,7 +100,7 @@ class Choices:
         return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], staying)
 
     def described(self, projected: Population) -> Population:
-        """The candidates as a population. The particles are indices with the parents of their predictions.
+        """The candidates as a population. The particles are indices of candidates.
 
         `projected` are the projected predictions. The population also stores the discarded mass.
         """

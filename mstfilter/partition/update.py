@@ -26,7 +26,7 @@ last frame. The voxels of an object are estimated again from all observations of
    partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
    probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
-   the object's voxels that the frame does not observe as free. A_j is one factor for all objects of the prediction.
+   the object's voxels that the frame does not observe as free. A_j is the same for all objects of prediction j.
 5. **Completion.** An object keeps its views, which are its observations in earlier frames
    (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
    views of the predicted objects that the visible object continues. An occluded object is completed from its views

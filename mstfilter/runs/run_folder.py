@@ -202,7 +202,7 @@ class RunFolder:
         return self
 
     def _check_pause(self, t: int, n_before: int) -> int:
-        """Check the files of a pause, given the number of hypotheses before. Returns the number of hypotheses."""
+        """Check the files of a pause after a pause with `n_before` hypotheses. Returns the number of hypotheses."""
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
         _ = self.seconds(t), self.questions(t)
@@ -291,7 +291,7 @@ class RunFolder:
             )
 
     def repair(self) -> None:
-        """Prepare for resuming: remove temporary files, and with a warning the first damaged and all later pauses."""
+        """Remove temporary files, the first damaged pause and all later pauses. Warns if pauses are removed."""
         sweep(self.path)
         sweep(self.path / "pauses")
         good = 0
