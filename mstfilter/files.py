@@ -78,7 +78,7 @@ def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep
 
 
 def _place(partial: Path, target: Path, existing: str) -> None:
-    """Rename a complete folder to its final name."""
+    """Rename the complete temporary folder to its final name."""
     earlier = _temporary(target, "replaced")
     if existing == "replace" and target.is_dir():
         target.rename(earlier)

@@ -64,7 +64,7 @@ class ForecastTable:
 
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
-        """A table of all forecasts of several tables."""
+        """A table with the summed numbers of outcomes of several tables."""
         p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
         count = no + yes
         return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)

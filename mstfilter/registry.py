@@ -70,7 +70,7 @@ class Registry:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """All kinds of component."""
+        """The names of all kinds of component."""
         return tuple(self._components)
 
     def known(self, kind: str) -> dict[str, str]:
@@ -397,7 +397,7 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
 
 
 def _classes_of(module: ModuleType) -> list[type]:
-    """The classes that a module defines."""
+    """The classes that a module itself defines, without imported classes."""
     return [v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__]
 
 

@@ -71,7 +71,7 @@ class TrackingOnly(Update):
 
 @dataclass(frozen=True)
 class Union(Update):
-    """Returns predicted and proposed hypotheses together, with the weights of the crossover but without crossover.
+    """Returns all predicted and proposed hypotheses, weighted as in the crossover but not combined by crossover.
 
     A prediction has log weight ``log w + lambda log Q``, and a sample ``log w``. Both populations are first scaled to
     mean weight 1. `free_space` projects the predictions and returns Q. `quality_exponent` is lambda.

@@ -286,7 +286,7 @@ class Belief:
     # Expected information of actions --------------------------------------------------------------------------
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
-        """Information of an image from a camera; `tolerance` in pixels. A smaller ``camera.scaled(0.25)`` saves time.
+        """Information of an image from a camera; `tolerance` in pixels. Use ``camera.scaled(0.25)`` to save time.
 
         The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
         """

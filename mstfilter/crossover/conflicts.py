@@ -18,7 +18,7 @@ rule           probability                    source
                                               ratio); about even odds on real conflicts
 
 ``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension
-                                              is 1 / voxels, so it practically never merges
+                                              is 1 / voxels, so objects are almost never merged
 
 ``always``     1                              a control
 
@@ -67,7 +67,7 @@ class ConflictGraph:
         return len(self.label)
 
     def networkx(self) -> nx.Graph:
-        """The graph as a networkx graph.
+        """The conflict graph as a `networkx.Graph`.
 
         Vertices have the attributes ``side``, ``label`` and ``size``. Edges have the attribute ``intersection``, in
         voxels. Neighbours are in ascending order.
@@ -193,7 +193,7 @@ def _check_structure(
 
 
 class Structure(Checked, ABC):
-    """Draws the painting order of objects in conflict, and the edges along which objects may be merged."""
+    """Draws the painting order of conflicting objects, and the edges along which objects may be merged."""
 
     @returns(_check_structure)
     @abstractmethod
@@ -331,7 +331,7 @@ def resolve(
 def _merged(
     rng: np.random.Generator, graph: ConflictGraph, links: nx.Graph, rule: MergeRule, edges: list[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Draw each edge (child, parent) with its merge probability. Objects are merged along the returned edges."""
+    """Select each edge (child, parent) with its merge probability. Objects are merged along the returned edges."""
     if not edges:
         return []
     child, parent = np.array(edges).T

@@ -174,7 +174,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
     """The objects of a pause. `shape` is the shape (H, W) of the image.
 
-    This function does not open the files of the shapes. Raises InputError if the folder, a mask or a shape is missing, or if a mask or weights.json is invalid.
+    Shapes are not read. Raises InputError if a file or folder is missing, or if a mask or weights.json is invalid.
     """
     if not str(folder):
         raise InputError(

@@ -25,7 +25,7 @@ In a component of one segment and one object, the share is 50 % instead of 80 %.
 - If several objects are *merged* into one segment, the segment continues all these objects.
 - A segment that continues no object is a new object.
 
-A predicted object in no conflict is *occluded*. Readings that belong to no segment are never counted.
+A predicted object in no conflict is *occluded*. Depth readings that belong to no segment are never counted.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ConflictComponent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Overlaps:
-    """The number of readings that each segment shares with each predicted object."""
+    """The number of depth readings that each segment shares with each predicted object."""
 
     shared: np.ndarray  #: (segments + 1, objects + 1) int; row 0 (no segment) is 0, column 0 is no object
     least: float  #: an object that is the main object of no segment needs as many readings to be in conflict

@@ -132,7 +132,7 @@ class Cells:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """Number (K,) of readings of each cell."""
+        """Number (K,) of depth readings of each cell."""
         return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
 
     @cached_property

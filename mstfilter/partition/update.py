@@ -167,7 +167,7 @@ class PartitionUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Weighted candidates, which are built on access.
+        """Weighted candidates; each hypothesis is built at its first access.
 
         Without a proposal, the result is the predictions after free-space projection.
         """
@@ -309,7 +309,7 @@ class PartitionUpdate(Update):
         return [completed[k] for k in range(len(objects))]
 
     def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
-        """The `ObjectRecord` of an object: of the first predicted object that the object continues, or new."""
+        """The `ObjectRecord` of the first predicted object that an object continues, or a new `ObjectRecord`."""
         key, views = completion.key, self._latest(completion.views)
         if not one.tracks:
             return ObjectRecord.born(label, birth, key, views)

@@ -211,7 +211,7 @@ def _seen_free(frame: Frame, grid: VoxelGrid) -> np.ndarray:
 
 
 def _behind_readings(frame: Frame, grid: VoxelGrid) -> np.ndarray:
-    """(X, Y, Z) bool: whether a voxel is at most `DEPTH_BEHIND` behind a depth reading above the table."""
+    """(X, Y, Z) bool: whether a voxel is at, or at most `DEPTH_BEHIND` behind, a depth reading above the table."""
     found = np.zeros(grid.shape, bool)
     for view in frame.all_views:
         geometry = frame_geometry(view, grid)
