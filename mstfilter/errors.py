@@ -41,11 +41,11 @@ class InputError(_WithHints, ValueError):
 
 
 class MissingLibraryError(InputError):
-    """A library or a system package that a chosen component needs is missing."""
+    """Raised if a library or a system package that a component needs is missing."""
 
 
 class LostRunError(InputError):
-    """All particles have weight 0 after an observation. The estimated evidence is 0, and the run cannot continue."""
+    """Raised if all particles have weight 0 after an observation. The run cannot continue."""
 
 
 class InputWarning(_WithHints, UserWarning):

@@ -78,7 +78,7 @@ def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep
 
 
 def _place(partial: Path, target: Path, existing: str) -> None:
-    """Rename a complete folder to its final name."""
+    """Rename the complete temporary folder to its final name."""
     earlier = _temporary(target, "replaced")
     if existing == "replace" and target.is_dir():
         target.rename(earlier)
@@ -97,7 +97,7 @@ def _place(partial: Path, target: Path, existing: str) -> None:
 
 @contextmanager
 def locked(path: str | Path) -> Iterator[None]:
-    """Reserve a file or folder, which need not exist, for this block. Removes temporary files of killed processes.
+    """Reserve a path, which need not exist, until the end of the block. Removes temporary files of killed processes.
 
     Raises InputError if another block or process has reserved `path`. The lock is a file ``.NAME.lock`` beside
     `path`. The system releases the lock when the process ends. On file systems without locks, paths are not reserved.

@@ -64,7 +64,7 @@ class ForecastTable:
 
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
-        """A table of all forecasts of several tables."""
+        """A table with the summed numbers of outcomes of several tables."""
         p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
         count = no + yes
         return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)
@@ -96,7 +96,7 @@ class ForecastTable:
         return self._mean(loss)
 
     def with_forecasts(self, p: np.ndarray) -> ForecastTable:
-        """A table of the same outcomes with other forecasts p (k,)."""
+        """A table in which new forecasts p (k,) replace the old forecasts of the same outcomes."""
         share = np.divide(self.yes, self.count, out=np.zeros_like(self.yes), where=self.count > 0)
         return ForecastTable.of(p, share, self.count)
 

@@ -86,7 +86,7 @@ def late(location: str, summary: str) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> Iterator[Callable[..., None]]:
-    """The function that reports progress: of a bar of `mstfilter.report.progress` if `progress` is True.
+    """The function that reports progress, which updates a bar of `mstfilter.report.progress` if `progress` is True.
 
     Otherwise the function is `progress` itself, or a function without effect if `progress` is False.
     """

@@ -77,7 +77,7 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
 
 
 def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The content of a preset file, added to the content of its base."""
+    """The configuration in a preset file, merged into the configuration of the base."""
     path = find_preset(name, to_extend=bool(parents))
     config = read_toml(path, "a preset")
     base, wraps = config.pop("base", ""), config.pop("wrap", {})

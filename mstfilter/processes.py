@@ -91,7 +91,7 @@ _pools: list[ThreadPoolExecutor] = []  # of the blocks `parallel`, innermost las
 
 @contextmanager
 def parallel(n_threads: int) -> Iterator[None]:
-    """In the block, `together` uses up to `n_threads` threads of this process. The threads do not change results."""
+    """In the block, `together` uses up to `n_threads` threads. The number of threads does not change results."""
     if n_threads < 2:
         yield
         return

@@ -70,7 +70,7 @@ class Registry:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """All kinds of component."""
+        """The names of all kinds of component."""
         return tuple(self._components)
 
     def known(self, kind: str) -> dict[str, str]:
@@ -369,7 +369,7 @@ def load_file(path: str | Path) -> ModuleType:
 
 
 def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> ModuleType:
-    """A new module from the source of a file. The name of the module is different for every path and content."""
+    """A new module from the source of a file. The module's name is unique for its path and content."""
     unique = hashlib.sha256(f"{resolved}\0{digest}".encode()).hexdigest()[:12]
     name = f"mstfilter_user_{resolved.stem}_{unique}"
     spec = importlib.util.spec_from_file_location(name, resolved)
@@ -397,7 +397,7 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
 
 
 def _classes_of(module: ModuleType) -> list[type]:
-    """The classes that a module defines."""
+    """The classes that a module itself defines, without imported classes."""
     return [v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__]
 
 
@@ -413,7 +413,7 @@ def _reduce(instance: object, protocol: Any) -> Any:
 
 
 def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """An instance without its state. The user's file of the class must have the hash `digest`."""
+    """An instance without its state. The user's file that defines the class must have the hash `digest`."""
     module = _MODULES.get((Path(path), digest)) or load_file(path)
     cls = getattr(module, name)
     if cls.__mst_source__ != digest:

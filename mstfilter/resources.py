@@ -38,7 +38,7 @@ def examples_folder() -> Path:
 def training_program(name: str) -> ModuleType:
     """A module of `models/mst_training`, which contains the programs that trained the weights.
 
-    The folder stays in `sys.path`, so that processes started by a training find the module.
+    The folder is kept in `sys.path`, so that processes started by a training find the module.
     """
     folder = str(models_folder())
     if folder not in sys.path:

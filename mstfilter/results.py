@@ -1,4 +1,4 @@
-"""Checks of the results of components' methods.
+"""Checks of the values that methods of components return.
 
 An interface declares the check of a result beside the method. The check applies to every class that defines the
 method. The error of a failed check names the class, the file and the line of the method:

@@ -1,4 +1,4 @@
-"""Paired differences between methods (arms), and the conclusions from such differences.
+"""Paired differences between compared methods (arms), and conclusions from the differences.
 
 >>> difference = compare([0.9, 0.8, 0.8], [0.7, 0.7, 0.6])
 >>> round(difference.mean, 3), difference.n
@@ -47,7 +47,7 @@ class Difference:
     p : float
         Two-sided p value of the sign-flip test; NaN for one unit.
     n : int
-        Number of units with a value in both arms.
+        Number of units with a value of both methods.
     p_holm : float
         `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
@@ -94,7 +94,7 @@ def compare(first: Values, second: Values) -> Difference:
     ----------
     first, second : mapping, or (n,) array_like
         A mapping from units to values, or values in the same order of units. Units without a finite value, such as
-        the seeds of lost runs, are omitted.
+        the seeds of runs in which all weights became zero, are omitted.
 
     Raises
     ------
@@ -214,19 +214,19 @@ def holm(p: Sequence[float]) -> np.ndarray:
 
 
 def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Difference]:
-    """Differences of every arm from the reference, with p values adjusted for all comparisons.
+    """Differences of every compared method from the reference, with p values adjusted for all comparisons.
 
     Parameters
     ----------
     table : mapping
-        Arm -> values, as for `compare`.
+        Name of a compared method -> values, as for `compare`.
     reference : str
-        The arm with which the other arms are compared.
+        The method with which the other methods are compared.
 
     Returns
     -------
     dict
-        Mapping from arms, without the reference, to `Difference`.
+        Mapping from names of methods, without the reference, to `Difference`.
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")

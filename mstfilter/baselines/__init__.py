@@ -2,7 +2,7 @@
 
 >>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
 
-The updates use samples alone, predictions alone, or their union. The proposals are trivial segmentations (floors).
+The updates use samples alone, predictions alone, or their union. The proposals are trivial baselines (floors).
 ``models/published/object_fusion.py`` has a baseline in the style of MID-Fusion.
 ``docs/baselines.md`` lists all presets.
 """

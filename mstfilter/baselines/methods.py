@@ -1,4 +1,4 @@
-"""Updates without crossover, and proposals of trivial methods (floors).
+"""Updates without crossover, and proposals of trivial baselines (floors).
 
 Each update replaces the update of `mst`. All other components of the filter and their random streams are unchanged:
 
@@ -11,8 +11,8 @@ At the first pause there is no prediction, so all updates return the proposed sa
 >>> OccupiedComponents()               # connected components of the occupied space
 >>> ImageComponents()                  # connected components of the image above the table
 
-The floors use the pixels above the table and the completer, but no segmentation. A useful method must be better than
-the floors.
+The trivial baselines use the completer and the pixels above the table, but no segmentation. A useful method must be
+better than the trivial baselines.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MAX_STEP = 0.02  # metres between the depths of connected pixels
 
 @dataclass(frozen=True)
 class SamplesOnly(Update):
-    """Returns the proposed samples."""
+    """Returns the proposed samples and ignores the predictions."""
 
     properly_weighted: ClassVar[bool] = False
     draws: ClassVar[bool] = False
@@ -49,7 +49,7 @@ class SamplesOnly(Update):
 
 @dataclass(frozen=True)
 class TrackingOnly(Update):
-    """Returns the predicted hypotheses.
+    """Returns the predicted hypotheses and ignores the samples.
 
     `free_space` clears voxels that the latest image observes as free. With ``none``, predictions are unchanged.
     """
@@ -71,7 +71,7 @@ class TrackingOnly(Update):
 
 @dataclass(frozen=True)
 class Union(Update):
-    """Returns predicted and proposed hypotheses together, with the weights of the crossover but without crossover.
+    """Returns all predicted and proposed hypotheses, weighted as in the crossover but not combined by crossover.
 
     A prediction has log weight ``log w + lambda log Q``, and a sample ``log w``. Both populations are first scaled to
     mean weight 1. `free_space` projects the predictions and returns Q. `quality_exponent` is lambda.
@@ -117,7 +117,7 @@ class FirstPause(Proposal):
 
 @dataclass(frozen=True)
 class Floor(Proposal):
-    """Base class of the floors (trivial baselines).
+    """Base class of the trivial baselines (floors).
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ class Floor(Proposal):
 
 @dataclass(frozen=True)
 class OneBlob(Floor):
-    """One object that fills the completed space above the table. Parameters: `Floor`."""
+    """One object that fills the completed space above the table. `Floor` describes the parameters."""
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         labels = one_blob(self.occupied(rng, observation))
@@ -152,7 +152,7 @@ class OneBlob(Floor):
 
 @dataclass(frozen=True)
 class OccupiedComponents(Floor):
-    """Connected components of at least 8 voxels of the occupied space. Parameters: `Floor`."""
+    """Connected components of at least 8 voxels of the occupied space. `Floor` describes the parameters."""
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         labels = _largest(connected_components(self.occupied(rng, observation)), _MIN_VOXELS).astype(np.uint16)
@@ -164,7 +164,7 @@ class ImageComponents(Floor):
     """Connected components of the image above the table. Each component is completed.
 
     ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
-    than 2 cm are not connected. Parameters: `Floor`.
+    than 2 cm are not connected. `Floor` describes the parameters.
     """
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:

@@ -15,7 +15,7 @@ replaces the information by I_tau, where outcomes i and j differ in d_ij cells:
 
     ``I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau)``
 
-Outcomes that differ in far fewer than tau cells count as equal. Outcomes that differ in far more cells count as
+Outcomes that differ in far fewer than tau cells count as identical. Outcomes that differ in far more cells count as
 different.
 I_0 is the information without noise. I_tau decreases to 0 as tau grows. Suppose that every cell is measured with an
 independent error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual
@@ -61,7 +61,7 @@ def outcome_information(
     weights : (n,) float
         Sum 1.
     outcomes : (n, k) integer
-        The outcome of each hypothesis in each group of cells. Equal rows are equal outcomes.
+        The outcome of each hypothesis in each group of cells. Identical rows are the same outcome.
     distances : callable
         ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells; not called if `tolerance` is 0.
     sizes : (k,) int

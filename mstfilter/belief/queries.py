@@ -112,7 +112,7 @@ class Belief:
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The n particles."""
+        """The n distinct hypotheses."""
         return tuple(self.population.particles)
 
     @property
@@ -274,7 +274,7 @@ class Belief:
         return [Border(float(one[borders[k][0]]), pixels[borders[k]]) for k in order if len(borders[k]) ** 2 >= least]
 
     def partition_entropy(self, tolerance: float = 0.0) -> float:
-        """Entropy of the segmentation.
+        """Entropy of the segmentation of the scene, in nats.
 
         ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. The entropy is the
         information of the true segmentation. Without tolerance, the entropy is an upper bound of the information of
@@ -286,7 +286,7 @@ class Belief:
     # Expected information of actions --------------------------------------------------------------------------
 
     def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
-        """Information of an image from a camera; `tolerance` in pixels. ``camera.scaled(0.25)`` saves time.
+        """Information of an image from a camera; `tolerance` in pixels. Use ``camera.scaled(0.25)`` to save time.
 
         The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
         """
@@ -324,7 +324,7 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information in nats; of equal actions, the first action.
+        """The action of largest expected information; if several actions have the same information, the first action.
 
         The result is None if no action has `at_least` nats, for example if the hypotheses agree on all outcomes.
         """

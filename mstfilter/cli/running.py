@@ -284,7 +284,7 @@ def _execute_all(
     replace: bool = False,
     threads: int = 1,
 ) -> None:
-    """Run the filter with the empty name in `folder`, and the filters for comparison in the subfolder ``compare``."""
+    """Run the main filter (empty name) in `folder`, and the filters for comparison in the subfolder ``compare``."""
     from mstfilter.runs import filter_recording
 
     for name, config in configs.items():

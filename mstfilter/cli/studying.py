@@ -50,7 +50,7 @@ def study(
 
 
 def _print_summary(summary: Any) -> None:
-    """Print the primary endpoints by scene family and arm, and the differences from the reference arm."""
+    """Print the primary endpoints of each method by scene family, and the differences from the reference."""
     from rich.console import Console
     from rich.table import Table
 

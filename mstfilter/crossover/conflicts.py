@@ -18,7 +18,7 @@ rule           probability                    source
                                               ratio); about even odds on real conflicts
 
 ``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension
-                                              is 1 / voxels, so it practically never merges
+                                              is 1 / voxels, so objects are almost never merged
 
 ``always``     1                              a control
 
@@ -67,7 +67,7 @@ class ConflictGraph:
         return len(self.label)
 
     def networkx(self) -> nx.Graph:
-        """The graph as a networkx graph.
+        """The conflict graph as a `networkx.Graph`.
 
         Vertices have the attributes ``side``, ``label`` and ``size``. Edges have the attribute ``intersection``, in
         voxels. Neighbours are in ascending order.
@@ -119,7 +119,7 @@ class OccupiedVoxels:
         return cls(at, (a.reshape(-1)[at], b.reshape(-1)[at]), a.shape)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
-        """Values (n,) in the shape of the grid, 0 elsewhere."""
+        """A grid with values (n,) at the occupied voxels and 0 at all other voxels."""
         out = np.zeros(self.shape, values.dtype)
         out.reshape(-1)[self.at] = values
         return out
@@ -193,7 +193,7 @@ def _check_structure(
 
 
 class Structure(Checked, ABC):
-    """Draws the painting order of objects in conflict, and the edges along which objects may be merged."""
+    """Draws the painting order of conflicting objects, and the edges along which objects may be merged."""
 
     @returns(_check_structure)
     @abstractmethod
@@ -218,7 +218,7 @@ class Structure(Checked, ABC):
 
 @dataclass(frozen=True)
 class RandomOrder(Structure):
-    """The paper's text: edges get a random acyclic orientation, and vertices get a topological order of these edges.
+    """The rule of the paper: a random acyclic orientation of the edges, and a topological order of the vertices.
 
     A uniformly random order of the vertices determines the orientation. Objects may be merged along every edge.
     """
@@ -231,7 +231,7 @@ class RandomOrder(Structure):
 
 @dataclass(frozen=True)
 class SpanningTree(Structure):
-    """The authors' program: a uniform random spanning tree from a uniform random root.
+    """The rule in the authors' program: a uniform random spanning tree from a uniform random root.
 
     Objects are merged only along edges of the tree. Children are painted before their parent.
     """
@@ -331,7 +331,7 @@ def resolve(
 def _merged(
     rng: np.random.Generator, graph: ConflictGraph, links: nx.Graph, rule: MergeRule, edges: list[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Draw each edge (child, parent) with its merge probability. Objects are merged along the returned edges."""
+    """Select each edge (child, parent) with its merge probability. Objects are merged along the returned edges."""
     if not edges:
         return []
     child, parent = np.array(edges).T

@@ -2,7 +2,7 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. Free-space projection clears voxels of every predicted hypothesis j, which keeps the share Q_j of its voxels.
+1. Free-space projection clears voxels of every predicted hypothesis j, and the share Q_j of the voxels remains.
 2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate
    depends only on its parents (section IV-E):
 
@@ -15,7 +15,7 @@ Without a proposal, the update only projects and weights the predictions. The pr
 of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, few predicted states agree. So every
 particle is projected onto the set of states that agree with the observation.
 
-One crossover has four steps (paper, figure 5):
+A crossover has four steps (paper, figure 5):
 
 >>> child = Crossover().cross(rng, proposed, predicted)
 
@@ -143,7 +143,7 @@ class CrossoverUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The candidates of all pairs, which are built on access.
+        """The candidates of all pairs; each hypothesis is built at its first access.
 
         Without a prediction, the proposed samples are returned. Without a proposal, refined predictions are returned.
         """
@@ -225,7 +225,7 @@ class _Child:
     numbers: np.ndarray  #: (n,) object of each voxel, 1, 2, ...; 0 is free
 
     def hypothesis(self, parents: tuple[Hypothesis, Hypothesis]) -> Hypothesis:
-        """The child, with records and occupancy from the parents."""
+        """The child as a hypothesis, with each `ObjectRecord` and the occupancy from the parents."""
         labels = self.voxels.spread(self.numbers.astype(np.uint16))
         child = Hypothesis(labels, parents[0].grid, self._records(parents))
         if all(parent.occupancy is None for parent in parents):
@@ -233,7 +233,7 @@ class _Child:
         return replace(child, occupancy=self._occupancy(labels, parents))
 
     def _records(self, parents: tuple[Hypothesis, Hypothesis]) -> tuple[ObjectRecord, ...]:
-        """The record of the head of each object (`_heads`). The motion history ends if the voxels have changed."""
+        """The `ObjectRecord` of each object's head (`_heads`). If voxels have changed, the motion history ends."""
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)

@@ -107,7 +107,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return bound_to(self, _shapes=found, other=other)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """The visible surface of the object. `complete_each` adds the voxels of the external shape."""
+        """Probability 1 on the visible surface. `complete_each` adds the voxels of the external shape."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
@@ -160,7 +160,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return memo("external_shape", key, lambda: place_shape(path, data, T, grid))
 
     def _reaching(self, shape: np.ndarray, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> ExternalCompletion:
-        """This completer with enough padding that the box of the mask contains a shape (X, Y, Z)."""
+        """A copy of the completer with enough padding that the box of the mask contains a shape (X, Y, Z)."""
         occupied = occupied_box(shape > 0)
         readings = grid.index_of(frame.points[mask & frame.valid])
         readings = readings[grid.contains(readings)]
@@ -174,8 +174,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
     """The objects of a pause. `shape` is the shape (H, W) of the image.
 
-    The files of the shapes are not opened. Raises InputError if the folder, a mask or a shape is missing,
-    or if a mask or weights.json is invalid.
+    Shapes are not read. Raises InputError if a file or folder is missing, or if a mask or weights.json is invalid.
     """
     if not str(folder):
         raise InputError(

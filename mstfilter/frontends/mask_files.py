@@ -225,7 +225,7 @@ def write_masks(
     ----------
     folder : str or Path
     pause : int
-        `Clip.index` of the clip. The masks segment the last frame of the clip.
+        `Clip.index` of the clip. The masks are a segmentation of the last frame of the clip.
     alternatives : sequence
         Each alternative is a label image (H, W), or disjoint or nested masks (n, H, W) bool, or a pair of such an
         array and its scores.

@@ -115,7 +115,7 @@ def _tree_of(
 
 
 def node_values(tree: Tree, stop: np.ndarray) -> np.ndarray:
-    """Values (N,) for which the Gibbs distribution at temperature 1 has the stop probabilities `stop` (N,)."""
+    """Values (N,) for which a Gibbs distribution of cuts at temperature 1 has the stop probabilities `stop` (N,)."""
     # exp(w) / (exp(w) + Z of the children) = stop, with log Z = 0 for leaves.
     w, log_z = np.zeros(tree.n_nodes), np.zeros(tree.n_nodes)
     for node in range(tree.n_leaves, tree.n_nodes):

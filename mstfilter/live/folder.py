@@ -33,8 +33,8 @@ def filter_folder(
 ) -> RunFolder:
     """Filter the images of a folder while they arrive, and return the run folder.
 
-    The files of each pause equal the files of a run on the complete folder with the same pause rule. An interrupted
-    live run cannot be resumed.
+    The files of each pause are identical to the files of a run on the complete folder with the same pause rule. An
+    interrupted live run cannot be resumed.
 
     Parameters
     ----------

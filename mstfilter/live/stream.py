@@ -7,7 +7,7 @@
 ...     stream.hypotheses, stream.belief
 
 One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last
-complete clip. The results equal the results of a run on the recorded frames with the same pauses.
+complete clip. The results are identical to the results of a run on the recorded frames with the same pauses.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ class Stream:
 
     @property
     def belief(self) -> Belief:
-        """The belief at the last pause."""
+        """The weighted hypotheses at the last pause as a `Belief`."""
         if self.last is None or self.last.state.population is None:
             raise InputError("the stream has had no pause yet", "push frames until nothing moves, and call wait()")
         return Belief(self.last.state.population)
@@ -310,7 +310,7 @@ class Stream:
         self._track()
 
     def _track(self) -> None:
-        """Start the trackers again at the first frame of the clip."""
+        """Restart the optical-flow trackers at the first frame of the clip."""
         self._trackers = [flow.begin(self._clip[0].frame) for flow in self._flows]
         for tracker in self._trackers:
             for item in self._clip[1:]:

@@ -7,7 +7,7 @@ truth instead of an estimate. The gain in quality shows how much quality each st
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-`STAGES` lists the overrides of the preset ``mst`` for each stage.
+`STAGES` lists, for each stage, the overrides that replace the stage of the preset ``mst`` by its oracle.
 """
 
 from mstfilter.lazy import attach

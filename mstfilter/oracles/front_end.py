@@ -6,7 +6,7 @@
 
 A mask that shows exactly one object is completed to all voxels of the object, including hidden voxels. In general, a
 true voxel belongs to the mask that contains its pixel. The pixel of a voxel is the pixel nearest to the projection of
-the voxel, among all pixels that show the object. So a mask of a part of an object is completed to this part, and a
+the voxel, among all pixels that show the object. So a mask of one part of an object is completed to that part, and a
 mask of two objects to both objects.
 """
 
@@ -40,7 +40,7 @@ _REACH = 4.0  # distance to a true border up to which strength is kept, in pixel
 
 @dataclass(frozen=True)
 class TrueMasks(UsesTruth, Proposal):
-    """Equal hypotheses from the true masks of the clip's last frame.
+    """Identical hypotheses from the true masks of the clip's last frame.
 
     The `foreground` of `objects` determines which pixels can belong to an object. Completed voxels of probability
     `threshold` or more are occupied.

@@ -82,7 +82,7 @@ class RecordingTruth:
 
     @cached_property
     def _pauses(self) -> dict[bytes, int]:
-        """The first pause with each frame, by the key of the frame."""
+        """The first pause at which each frame was taken, by the key of the frame."""
         frames = self.recording.frames
         return {frames[index].key: t for t, index in reversed(list(enumerate(self.recording.pauses)))}
 
@@ -137,7 +137,7 @@ class UsesTruth:
 
 
 def uses_truth(component: Any) -> list[str]:
-    """Class names of the component and its nested components, in order, without classes that use no truth."""
+    """Class names of those components that use the truth, among the component and its nested components, in order."""
     return [type(part).__name__ for part in nested_components(component) if isinstance(part, UsesTruth)]
 
 

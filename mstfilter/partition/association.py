@@ -8,7 +8,7 @@ A segment and a predicted object are *in conflict* if they share more than a ten
 smaller of the two. The segment may then show the object. Conflicts are the edges of the conflict graph. (In the
 paper, section IV-D, edges join objects that share voxels.) The *main object* of a segment is the predicted object
 that shares most readings with the segment. An object that is the main object of no segment and has fewer than about
-60 readings is in no conflict. The few readings of a hidden object measure objects nearby.
+60 readings is in no conflict. The few depth readings of a hidden object measure nearby objects.
 
 A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
@@ -25,7 +25,7 @@ In a component of one segment and one object, the share is 50 % instead of 80 %.
 - If several objects are *merged* into one segment, the segment continues all these objects.
 - A segment that continues no object is a new object.
 
-A predicted object in no conflict is *occluded*. Readings that belong to no segment are never counted.
+A predicted object in no conflict is *occluded*. Depth readings that belong to no segment are never counted.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ConflictComponent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Overlaps:
-    """The number of readings that each segment shares with each predicted object."""
+    """The number of depth readings that each segment shares with each predicted object."""
 
     shared: np.ndarray  #: (segments + 1, objects + 1) int; row 0 (no segment) is 0, column 0 is no object
     least: float  #: an object that is the main object of no segment needs as many readings to be in conflict
@@ -60,7 +60,7 @@ class Overlaps:
     def of(cls, partition: np.ndarray, counts: np.ndarray, least: float) -> Overlaps:
         """The overlaps of a partition, from the segment (K,) of each cell.
 
-        `counts` (K, objects + 1) has the numbers of readings that cells share with predicted objects; 0 is no object.
+        `counts` (K, objects + 1): number of readings that each cell shares with each object; column 0 is no object.
         """
         shared = np.zeros((int(partition.max(initial=0)) + 1, counts.shape[1]), np.int64)
         np.add.at(shared, partition, counts)
@@ -69,7 +69,7 @@ class Overlaps:
 
     @cached_property
     def in_conflict(self) -> np.ndarray:
-        """Whether each segment is in conflict with each object, bool in the shape of `shared`."""
+        """Whether each segment is in conflict with each object: bool array, same shape as `shared`."""
         segments, objects = self.shared.sum(axis=1), self.shared.sum(axis=0)
         conflict = self.shared > _CONFLICT * np.minimum.outer(segments, objects)
         is_main = np.isin(np.arange(len(objects)), self.main_object)

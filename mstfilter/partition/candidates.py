@@ -31,7 +31,7 @@ _CERTAIN = 1e-3  # an occluded object stays if its probability is above 1 minus 
 
 @dataclass(frozen=True, eq=False)
 class Choices:
-    """Descriptions of m candidates."""
+    """The choices that define m candidates."""
 
     prediction: np.ndarray  #: (m,) index of the prediction
     partitions: np.ndarray  #: (m, K) segment of each cell, 1, 2, ...
@@ -93,16 +93,16 @@ class Choices:
         )
 
     def most_probable(self, n: int) -> Choices:
-        """The n candidates of largest positive weight, in their present order."""
+        """The n candidates of largest positive weight, in unchanged order."""
         best = largest(self.log_weights, n)
         best = best[self.log_weights[best] > -np.inf]
         staying = tuple(self.staying[k] for k in best.tolist()) if self.staying else ()
         return Choices(self.prediction[best], self.partitions[best], self.log_weights[best], staying)
 
     def described(self, projected: Population) -> Population:
-        """The candidates as a population. The particles are indices with the parents of their predictions.
+        """The candidates as a population. The particles are indices of candidates.
 
-        `projected` are the projected predictions. The notes have the total probability of the omitted candidates.
+        `projected` are the projected predictions. The population also stores the discarded mass.
         """
         previous = projected.parents.get("previous", np.full(len(projected), -1))
         discarded = max(0.0, 1 - float(np.exp(self.log_weights).sum()))

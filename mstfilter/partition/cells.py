@@ -61,7 +61,7 @@ class Readings:
 
     @classmethod
     def of(cls, frame: Frame, grid: VoxelGrid) -> Readings:
-        """The readings of a frame."""
+        """The depth readings of a frame."""
         return cls(*frame_points(frame, grid), frame.depth.shape)
 
     @property
@@ -70,7 +70,7 @@ class Readings:
         return scaled_area(_LEAST_READINGS, self.shape[0] * self.shape[1])
 
     def mask(self, chosen: np.ndarray) -> np.ndarray:
-        """Pixels (H, W) bool of the chosen readings (m,) bool."""
+        """Image (H, W) bool, True at the pixels of the chosen readings (m,) bool."""
         mask = np.zeros(self.shape, bool)
         mask.ravel()[self.pixels[chosen]] = True
         return mask
@@ -132,7 +132,7 @@ class Cells:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """Number (K,) of readings of each cell."""
+        """Number (K,) of depth readings of each cell."""
         return np.bincount(self.of_reading[self.of_reading >= 0], minlength=self.samples.shape[1])
 
     @cached_property
@@ -234,7 +234,7 @@ def _examples(cell: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 
 def _filled(prediction: np.ndarray, sample: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """A prediction (k,), filled with an object for every cell. `sizes` (k,) are the numbers of readings of the cells.
+    """A prediction (k,) with an object for every cell. `sizes` (k,) are the numbers of depth readings of the cells.
 
     A cell without an object joins the predicted object with most readings in the cell's segment of the sample (k,).
     If no predicted object has readings in the segment, the segment is a new object.
@@ -317,7 +317,7 @@ class PairEvidence(PairOdds):
         return np.column_stack(self.terms(cells, weights)) @ np.array(astuple(self))
 
     def terms(self, cells: Cells, weights: np.ndarray) -> PairTerms:
-        """The terms of the log odds, without the coefficients."""
+        """The terms of the log odds, not yet multiplied by the coefficients."""
         in_samples = _labels_of_pairs(cells.samples, cells.pairs)
         image = softened_logit(np.mean(in_samples.same, axis=0))
         in_predictions = _labels_of_pairs(cells.predictions, cells.pairs)
@@ -329,7 +329,7 @@ class PairEvidence(PairOdds):
 
 
 class _PairLabels(NamedTuple):
-    """Labels of pairs of cells in n partitions."""
+    """Labels of the two cells of each pair, in n partitions."""
 
     both: np.ndarray  #: (n, e) bool, both cells belong to an object
     same: np.ndarray  #: (n, e) bool, both cells belong to one object

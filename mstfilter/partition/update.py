@@ -9,7 +9,7 @@ last frame. The voxels of an object are estimated again from all observations of
 
 1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not
    observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j with which
-   the depth readings agree. A_j^lambda is used as the probability that prediction j is valid, which means that the
+   the depth readings agree. A_j^lambda is the probability that prediction j is valid, which means that the
    prediction shows the present scene. A predicted object is *refuted* if the readings agree with less than the
    share `least_agreement` of the object's visible surface. No candidate contains a refuted object.
 2. **Partitions.** A sample groups the readings by segment. A prediction groups the readings by the predicted object
@@ -26,7 +26,7 @@ last frame. The voxels of an object are estimated again from all observations of
    partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
    probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
-   the object's voxels that the frame does not observe as free. A_j is one factor for all objects of the prediction.
+   the object's voxels that the frame does not observe as free. A_j is the same for all objects of prediction j.
 5. **Completion.** An object keeps its views, which are its observations in earlier frames
    (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
    views of the predicted objects that the visible object continues. An occluded object is completed from its views
@@ -143,7 +143,7 @@ class PartitionUpdate(Update):
     mend : bool
         Whether missing readings of objects are estimated, as in `ObjectRule`.
     least_agreement : float
-        Least share of the visible surface of a predicted object with which the depth readings must agree. At 0,
+        Least share of the visible surface of a predicted object with which the depth readings must agree. If 0,
         surfaces are not tested: no object is refuted, and Q replaces A.
     """
 
@@ -167,7 +167,7 @@ class PartitionUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Weighted candidates, which are built on access.
+        """Weighted candidates; each hypothesis is built at its first access.
 
         Without a proposal, the result is the predictions after free-space projection.
         """
@@ -197,7 +197,7 @@ class PartitionUpdate(Update):
         return self._scored(candidates, observation) if self.evidence else candidates
 
     def _mended(self, clip: Clip) -> Clip:
-        """The last frame, with estimates of missing readings. Free-space projection does not use estimates."""
+        """The last frame with estimated missing depth. Free-space projection does not use the estimates."""
         return Clip((foreground(clip.after, clip.grid).frame,), clip.grid, clip.index) if self.mend else clip
 
     # 1. Free-space projection -----------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ class PartitionUpdate(Update):
     def _predictions(
         self, predicted: Population, projected: Population, readings: Readings, frame: Frame
     ) -> list[Prediction]:
-        """Each prediction, compared with the last frame."""
+        """Compares each predicted hypothesis with the last frame."""
         quality = np.exp(log_quality(np.array(projected.notes["quality"])))
         columns = zip(predicted.particles, projected.particles, quality.tolist(), strict=True)
         return each(lambda one: self._prediction(*one, readings, frame), columns)
@@ -280,7 +280,7 @@ class PartitionUpdate(Update):
     # 5. Completion ----------------------------------------------------------------------------------------------
 
     def _hypothesis(self, key: Key, objects: Sequence[SceneObject], readings: Readings, clip: Clip) -> Hypothesis:
-        """A candidate. An object is dropped if all its voxels belong to other objects."""
+        """The hypothesis of a candidate. An object is omitted if all its voxels belong to other objects."""
         completions = self._completions(key, objects, readings, clip)
         labels = arbitrate(completions, clip.grid, self.threshold)
         present = set(np.unique(labels).tolist())
@@ -309,7 +309,7 @@ class PartitionUpdate(Update):
         return [completed[k] for k in range(len(objects))]
 
     def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
-        """The record of an object: the record of the first object that it continues, or a new record."""
+        """The `ObjectRecord` of the first predicted object that an object continues, or a new `ObjectRecord`."""
         key, views = completion.key, self._latest(completion.views)
         if not one.tracks:
             return ObjectRecord.born(label, birth, key, views)

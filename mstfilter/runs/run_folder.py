@@ -8,7 +8,7 @@ run.json                 configuration, seed, versions, recording, status
 pauses/000/rgb.png       image at the pause
 pauses/000/camera.json   camera with its pose at the pause
 pauses/000/state.npz     particles and log weights
-pauses/000/info.json     record of the step
+pauses/000/info.json     statistics of the step
 pauses/000/truth.npz     true labels, if known
 pauses/000/instance.png  true label image, if known
 pauses/000/seconds.json  wall time by component
@@ -145,7 +145,7 @@ class _SecondsFile(RootModel[dict[str, float]]):
 
 @dataclass(frozen=True)
 class HypothesisCodec(Codec):
-    """Converts hypotheses on one grid to arrays and back, without any change."""
+    """Converts hypotheses on one grid to arrays and back without loss."""
 
     def encode(self, particles: Any) -> Mapping[str, np.ndarray]:
         return encode_hypotheses(particles)
@@ -202,7 +202,7 @@ class RunFolder:
         return self
 
     def _check_pause(self, t: int, n_before: int) -> int:
-        """Check the files of a pause, given the number of hypotheses before. Returns the number of hypotheses."""
+        """Check the files of a pause after a pause with `n_before` hypotheses. Returns the number of hypotheses."""
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
         _ = self.seconds(t), self.questions(t)
@@ -291,7 +291,7 @@ class RunFolder:
             )
 
     def repair(self) -> None:
-        """Prepare for resuming: remove temporary files, and with a warning the first damaged and all later pauses."""
+        """Remove temporary files, the first damaged pause and all later pauses. Warns if pauses are removed."""
         sweep(self.path)
         sweep(self.path / "pauses")
         good = 0
@@ -306,7 +306,7 @@ class RunFolder:
             warnings.warn(InputWarning(text, hint), stacklevel=2)
 
     def info(self, t: int) -> dict[str, Any]:
-        """Record of the step that ended at pause `t`."""
+        """The content of info.json: the statistics of the step that ended at pause `t`."""
         return self._read(self.pause(t) / "info.json", _InfoFile)
 
     def seconds(self, t: int) -> dict[str, float]:

@@ -43,7 +43,7 @@ class BeliefScore(NamedTuple):
         ``brier``: mean squared error of the forecasts. ``log_loss``: mean log loss of softened forecasts, in nats.
         ``calibration_error``: calibration error on ten bins of equal numbers of questions.
     counts : (r, 1001, 2) int32
-        Number of questions by rate of noise, forecast in thousandths, and outcome.
+        Number of questions for each rate of noise, each forecast in thousandths, and each outcome.
     """
 
     row: dict[str, float]
@@ -51,7 +51,7 @@ class BeliefScore(NamedTuple):
 
     @property
     def base_rate_loss(self) -> float:
-        """Log loss, in nats, of a constant forecast, the share of questions with the answer yes."""
+        """Log loss, in nats, of a constant forecast that equals the share of questions with the answer yes."""
         table = forecast_table(self.counts[0].astype(np.int64))
         if not table.n:
             return float("nan")

@@ -16,7 +16,7 @@ occupied voxels as one object or as their connected components. ``occupancy``: i
 voxels. ``volume_missed``, ``volume_invented``: volume that is occupied only in the truth, and only in the hypothesis,
 divided by the true volume. ``object_f``: F score of objects at IoU 0.5. ``split``, ``merged``, ``missed``,
 ``invented``: numbers of objects (see `object_metrics`). ``diversity``: 1 - mean quality over pairs of hypotheses,
-which is 0 if all hypotheses are equal.
+which is 0 if all hypotheses are identical.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def pause_metrics(
 
 
 def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
-    """The grids cropped to the voxels that any grid occupies, and the number of removed voxels.
+    """The grids, cropped to the bounding box of all occupied voxels, and the number of removed voxels.
 
     A layer of free voxels is kept at each cropped side, so that free space remains a region of every grid.
     """

@@ -9,7 +9,7 @@ the hypothesis of least expected loss. A row also has the values of two trivial 
 object, and as connected components. If the ground truth has instance images but no volumes, hypotheses are rendered
 and compared in the image. Pixels of the robot (label 255) are ignored. For a recording with volumes, rows also have
 the scores of the forecasts: Brier score, log loss, log loss of the base rate and calibration error (`score_belief`).
-The scores of the forecasts are the same for all forms.
+The scores of the forecasts are the same for all forms of weighted coverage.
 
 `measure_pause` computes all metrics of a pause, for the tables of a study.
 """
@@ -144,7 +144,7 @@ def measure_pause(
         Metrics of `mstfilter.scoring.metrics` and `score_belief`. Metrics that need a missing ground truth are left
         out. ``qualities`` is a list, which tables leave out.
     counts : (r, 1001, 2) int32, or None without ground truth
-        As in `BeliefScore`.
+        The field `counts` of `BeliefScore`.
     """
     labels = [h.labels for h in hypotheses]
     row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": len(labels)}

@@ -66,16 +66,16 @@ class Overlap:
 
     @property
     def sizes_a(self) -> np.ndarray:
-        """(na,) cells of each region of a."""
+        """Number (na,) of cells of each region of a."""
         return self.counts.sum(axis=1)
 
     @property
     def sizes_b(self) -> np.ndarray:
-        """(nb,) cells of each region of b."""
+        """Number (nb,) of cells of each region of b."""
         return self.counts.sum(axis=0)
 
     def jaccard(self) -> np.ndarray:
-        """(na, nb) intersection over union."""
+        """Intersection over union (na, nb) of each region of a with each region of b."""
         union = self.sizes_a[:, None] + self.sizes_b[None, :] - self.counts
         return self.counts / union
 

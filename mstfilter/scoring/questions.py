@@ -10,7 +10,7 @@ answer has a better expected score than the true probabilities.
 >>> float(np.mean((p - y) ** 2))                               # Brier score
 
 **Questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above
-the table. The depth images of pause t do not observe the voxel as free. The voxel is on a depth reading above the
+the table. The depth images of pause t do not observe the voxel as free. The voxel contains a depth reading above the
 table, or up to 10 cm behind a reading along the camera's z axis, at pause t or earlier. The first voxel u of a
 question is uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels
 of u.
@@ -211,7 +211,7 @@ def _seen_free(frame: Frame, grid: VoxelGrid) -> np.ndarray:
 
 
 def _behind_readings(frame: Frame, grid: VoxelGrid) -> np.ndarray:
-    """(X, Y, Z) bool: whether the voxel is on a depth reading above the table, or up to `DEPTH_BEHIND` behind it."""
+    """(X, Y, Z) bool: whether a voxel is at, or at most `DEPTH_BEHIND` behind, a depth reading above the table."""
     found = np.zeros(grid.shape, bool)
     for view in frame.all_views:
         geometry = frame_geometry(view, grid)

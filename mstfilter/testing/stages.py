@@ -217,7 +217,7 @@ class MotionRuleContract(StageContract):
     """The contract of every `MotionRule`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> list[Any]:
-        """Kind, motion, support and score of all candidates and of a choice, for each visible object."""
+        """Kind, motion, support and score of all candidate motions and of the chosen motion of each object."""
         found = []
         for label, track in _tracks(inputs):
             with _quiet():
@@ -284,7 +284,7 @@ def run_contract(
 
 
 def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
-    """A function in the module of a class."""
+    """The function with a given name in the module of a class."""
     found = getattr(sys.modules.get(cls.__module__), name, None)
     return found if callable(found) else None
 
