@@ -28,9 +28,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from mstfilter.scene import Camera, Frame, depth_sigma, memo
+from mstfilter.scene import Camera, Crop, Frame, VoxelGrid, depth_sigma, memo
 from mstfilter.tracking.rigid import invert, move_points
 from mstfilter.tracking.segments import Track
 
@@ -43,6 +44,9 @@ _FACING_AWAY = -0.1  # cosine of normal and ray; the visible side of a surface i
 _EXPLAINED = 0.01  # metres from the moved surface to a measured point that it explains
 _MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
 _N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
+_FREE_WEIGHT, _APART_WEIGHT = 40.0, 6.0  # of the terms of `shape_cost`
+_N_VOXELS, _N_TARGET = 500, 200  # largest numbers of compared voxels and of compared target points
+_FAR = 3.0  # voxels, largest distance in `shape_cost`
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
 _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine
 
@@ -116,6 +120,41 @@ def _unexplained(track: Track, motions: np.ndarray, n: int) -> np.ndarray:
     at_source = move_points(invert(motions), points)
     distance, _ = track.near.query(at_source, distance_upper_bound=_EXPLAINED)
     return (~np.isfinite(distance)).mean(axis=-1)
+
+
+def shape_cost(track: Track, motions: np.ndarray) -> np.ndarray:
+    """Cost (K,) of the complete shape of the object under motions (K, 4, 4), in units of S.
+
+    The first term is the mean distance, in voxels, by which voxels lie in front of the measured surface. The camera
+    sees through these voxels. The second term is the mean distance, in voxels, between the target surface and the
+    surface of the shape. Both terms also compare the sides of the object that the first frame does not show.
+    """
+    after, grid, crop = track.clip.after, track.clip.grid, track.crop
+    cell = np.argwhere(crop.occupied) + crop.offset
+    u, v, z, inside = after.camera.pixels_of(move_points(motions, grid.centre_of(_evenly(cell, _N_VOXELS))))
+    before = np.where(inside & after.valid[v, u], (after.depth[v, u] - z) / grid.voxel_size, 0.0)
+    cost = _FREE_WEIGHT * np.clip(before, 0.0, _FAR).mean(axis=-1)
+    if track.target_surface is not None:
+        at_source = move_points(invert(motions), _evenly(track.target_surface.points, _N_TARGET))
+        off = np.abs(_signed_distance(crop, grid, at_source)) - 0.5
+        cost = cost + _APART_WEIGHT * np.clip(off, 0.0, _FAR).mean(axis=-1)
+    return np.asarray(cost)
+
+
+def _signed_distance(crop: Crop, grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
+    """Distance (...) of points (..., 3) from the surface of a crop, in voxels: negative inside, at most `_FAR` + 1."""
+    margin = int(_FAR) + 1
+    occupied = np.pad(crop.occupied, margin)
+    signed = np.where(occupied, 0.5 - distance_transform_edt(occupied), distance_transform_edt(~occupied) - 0.5)
+    index = grid.index_of(points) - crop.offset + margin
+    near = ((index >= 0) & (index < occupied.shape)).all(axis=-1)
+    index = np.clip(index, 0, np.array(occupied.shape) - 1)
+    return np.where(near, signed[tuple(np.moveaxis(index, -1, 0))], float(margin))
+
+
+def _evenly(points: np.ndarray, n: int) -> np.ndarray:
+    """At most n of the rows of an array, evenly spaced."""
+    return points[np.unique(np.linspace(0, len(points) - 1, n).astype(np.int64))]
 
 
 def normals(frame: Frame) -> np.ndarray:
