@@ -4,10 +4,10 @@
 >>> chain.T, chain.score                          # doctest: +SKIP
 
 An object that turns shows another side in the last frame, so few of its points can be compared with the first frame.
-Between neighbouring frames, most points can be compared. In every `_STRIDE`-th used frame, the voxels of the object
-are rendered at its present place. The pixels whose depth agrees with the rendering show the object, and can show
-surface that is hidden in the first frame. Optical flow and `refine_motion` move these pixels to the next of these
-frames. The motion of the clip is the product of these motions.
+After a small motion, most points can be compared. The chain consists of the frames between which the object has moved
+by some pixels. In each of them, the voxels of the object are rendered at its present place. The pixels whose depth
+agrees with the rendering show the object, and can show surface that is hidden in the first frame. Optical flow and
+`refine_motion` move these pixels to the next frame of the chain. The motion of the clip is the product of all motions.
 
 The errors of these motions accumulate, above all along surfaces without texture. So the resulting motion is compared
 with others by `MotionResidual` and `shape_cost`.
@@ -16,7 +16,6 @@ with others by `MotionResidual` and `shape_cost`.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,11 +26,11 @@ from mstfilter.tracking.flow import advance
 from mstfilter.tracking.residual import MotionResidual, refine_motion
 from mstfilter.tracking.segments import TABLE_HEIGHT, Track
 
-_STRIDE = 2  # used frames of the flow per motion
+_MOVED = 0.002  # of the image width; the motion of the pixels between two frames of the chain
 _LEAST_PIXELS = 150  # that show the object, at each frame of 640 x 480 pixels
-_LARGEST_SCORE = 2.0  # mean of S between frames
+_LARGEST_SCORE = 1.5  # mean of S between frames
 _AGREES = 1.5  # voxels between the rendered and the measured depth
-_N_POINTS, _N_SCORED = 250, 300  # pixels that are moved by the flow, and that are scored, evenly spaced
+_N_POINTS, _N_SCORED = 500, 300  # pixels that are moved by the flow, and that are scored, evenly spaced
 _LEAST_PAIRS, _INLIER, _SCALE = 12, 0.008, 0.004  # points; metres
 _RESIDUAL = MotionResidual(track_weight=0.0, target_weight=0.0)
 
@@ -49,21 +48,21 @@ def follow(rng: np.random.Generator, track: Track) -> Chain | None:
 
     The result is None if too few pixels show the object in a frame, or if the mean of S between frames is too large.
     """
-    flow, clip = track.flow, track.clip
-    unknown = replace(flow, source=np.full(flow.source.shape, -1, np.int32))
-    T, step, fewest, scores, frames = np.eye(4), np.eye(4), len(track.segment.pixels), [], [clip.before]
-    for i, j in pairwise([*range(0, len(flow.flows), _STRIDE), len(flow.flows)]):
-        frames = [frames[-1], *(clip.frames[k] for k in flow.used[i + 1 : j + 1])]
-        pixels = _shown(track.crop, clip.grid, frames[0], T)
+    clip, crop = track.clip, track.crop
+    unknown = replace(track.flow, source=np.full(track.flow.source.shape, -1, np.int32))
+    T, step, scores, k, frame = np.eye(4), np.eye(4), [], 0, clip.before
+    fewest = len(track.segment.pixels)
+    while k < len(track.flow.flows):
+        pixels = _shown(crop, clip.grid, frame, T)
         fewest = min(fewest, len(pixels))
-        if fewest < scaled_area(_LEAST_PIXELS, frames[0].depth.size):
+        if fewest < scaled_area(_LEAST_PIXELS, frame.depth.size):
             return None
+        k, last, p, q = _pairs(track, k, frame, pixels)
         shown = replace(track.segment, pixels=pixels, support=pixels)
-        pair = Track(shown, replace(clip, frames=(frames[0], frames[-1]), times=()), unknown)
-        by_flow = _by_flow(rng, frames, pixels, flow.flows[i:j])
-        step = refine_motion(pair, step if by_flow is None else by_flow)
+        pair = Track(shown, replace(clip, frames=(frame, last), times=()), unknown)
+        step = refine_motion(pair, _fit(rng, p, q, step))
         scores.append(_RESIDUAL.scores(pair, step[None], _N_SCORED)[0])
-        T = step @ T
+        T, frame = step @ T, last
     if not scores or not np.mean(scores) <= _LARGEST_SCORE:
         return None
     return Chain(T, fewest, float(np.mean(scores)))
@@ -80,24 +79,32 @@ def _shown(crop: Crop, grid: VoxelGrid, frame: Frame, T: np.ndarray) -> np.ndarr
     return np.asarray((rows + window[0].start) * frame.depth.shape[1] + columns + window[1].start)
 
 
-def _by_flow(
-    rng: np.random.Generator, frames: list[Frame], pixels: np.ndarray, flows: np.ndarray
-) -> np.ndarray | None:
-    """The motion (4, 4) of some flat pixels from the first to the last frame by the flow; None if it is not known.
+def _pairs(track: Track, k: int, first: Frame, pixels: np.ndarray) -> tuple[int, Frame, np.ndarray, np.ndarray]:
+    """Points (n, 3) of some pixels of used frame k, and the same points in a later used frame, by the flow.
 
-    `flows` (n - 1, 2, h, w, 2) are the flows between consecutive frames, forward and back, as in `ClipTracks`.
+    The later frame is the first one in which the pixels have moved enough, or else the last frame. Returns its number
+    among the used frames, the frame, and the points in both frames.
     """
-    first, last = frames[0], frames[-1]
     height, width = first.depth.shape
     chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, _N_POINTS).astype(np.int64))]
-    at, ok = np.stack([chosen % width, chosen // width], axis=1).astype(np.float32), np.ones(len(chosen), bool)
-    for (a, b), (there, back) in zip(pairwise(frames), flows.astype(np.float32), strict=True):
-        at, valid = advance(at, there, back, a, b)
+    start = at = np.stack([chosen % width, chosen // width], axis=1).astype(np.float32)
+    frame, ok = first, np.ones(len(chosen), bool)
+    for fields in track.flow.flows[k:]:
+        there, back = fields.astype(np.float32)
+        k, a, frame = k + 1, frame, track.clip.frames[track.flow.used[k + 1]]
+        at, valid = advance(at, there, back, a, frame)
         ok &= valid
+        if np.median(np.linalg.norm(at - start, axis=1)) > _MOVED * width:
+            break
     u, v = np.clip(np.rint(at), 0, [width - 1, height - 1]).astype(np.int64).T
-    p, q = first.points.reshape(-1, 3)[chosen], last.points[v, u]
-    ok &= last.valid[v, u] & (q[:, 2] > TABLE_HEIGHT)
-    fit = rigid.ransac(rng, p[ok], q[ok], _INLIER) if ok.sum() >= _LEAST_PAIRS else None
+    q = frame.points[v, u]
+    ok &= frame.valid[v, u] & (q[:, 2] > TABLE_HEIGHT)
+    return k, frame, first.points.reshape(-1, 3)[chosen[ok]], q[ok]
+
+
+def _fit(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """The motion (4, 4) that moves most of the points p (n, 3) to q (n, 3); `otherwise` if there are too few."""
+    fit = rigid.ransac(rng, p, q, _INLIER) if len(p) >= _LEAST_PAIRS else None
     if fit is None or len(fit.inliers) < _LEAST_PAIRS:
-        return None
-    return rigid.refine_robust(fit.T, p[ok], q[ok], _SCALE)
+        return otherwise
+    return rigid.refine_robust(fit.T, p, q, _SCALE)

@@ -265,7 +265,7 @@ class MstRule(MotionRule):
     use_sift: bool = True
     n_refine: int = 3
     search_above: float = 4.0
-    follow_above: float = 4.0
+    follow_above: float = 3.8
     max_score: float = OUTSIDE_COST
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: MotionResidual = field(default_factory=MotionResidual)
