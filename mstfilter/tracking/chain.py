@@ -4,13 +4,14 @@
 >>> chain.T, chain.score                          # doctest: +SKIP
 
 An object that turns shows another side in the last frame, so few of its points can be compared with the first frame.
-After a small motion, most points can be compared. The chain consists of the frames between which the object has moved
-by some pixels. In each of them, the voxels of the object are rendered at its present place. The pixels whose depth
-agrees with the rendering show the object, and can show surface that is hidden in the first frame. Optical flow and
-`refine_motion` move these pixels to the next frame of the chain. The motion of the clip is the product of all motions.
+After a small motion, most points can be compared. The chain consists of frames between which the object moves by at
+least one or two pixels. In each frame of the chain, the voxels of the object are rendered at the place of the object in
+this frame. The pixels whose depth agrees with the rendering show the object. They include surface that the first frame
+does not show. Optical flow and `refine_motion` give the motion of these pixels to the next frame of the chain. The
+motion of the clip is the product of these motions.
 
-The errors of these motions accumulate, above all along surfaces without texture. So the resulting motion is compared
-with others by `MotionResidual` and `shape_cost`.
+Errors accumulate along the chain, mostly on surfaces without texture. `MstRule` uses the motion only if the motion
+agrees better with the last frame than all other motions. The measures are `MotionResidual` and `shape_cost`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _RESIDUAL = MotionResidual(track_weight=0.0, target_weight=0.0)
 
 
 class Chain(NamedTuple):
-    """The motion of an object through a clip."""
+    """The motion of an object through a clip, from frame to frame."""
 
     T: np.ndarray  #: (4, 4) motion, world metres
     n_pixels: int  #: smallest number of pixels that show the object in a frame

@@ -14,6 +14,9 @@ second term is for the fraction of the surface that the flow traces back to this
 not explain. Without this term, a place behind another object fits as well as a place that is seen. A lower score is
 better.
 
+`shape_cost` compares the complete shape, including sides that the first frame does not show. It decides between motions
+that differ in these sides.
+
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
 `refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
 effect. Colour determines motions that depth does not determine, for example the rotation of a can about its axis.
@@ -142,7 +145,7 @@ def shape_cost(track: Track, motions: np.ndarray) -> np.ndarray:
 
 
 def _signed_distance(crop: Crop, grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """Distance (...) of points (..., 3) from the surface of a crop, in voxels: negative inside, at most `_FAR` + 1."""
+    """Distance (...) in voxels of points (..., 3) from the surface of a crop, negative inside, at most `_FAR` + 1."""
     margin = int(_FAR) + 1
     occupied = np.pad(crop.occupied, margin)
     signed = np.where(occupied, 0.5 - distance_transform_edt(occupied), distance_transform_edt(~occupied) - 0.5)

@@ -250,8 +250,9 @@ class MstRule(MotionRule):
         If every score is larger than this value, the object is searched for around its last position, and topplings
         are tried. Disabled if negative.
     follow_above : float
-        If every score is larger than this value, the object is followed from frame to frame (`tracking.chain`). The
-        score of the resulting motion is the mean of the scores between frames. Disabled if negative.
+        If the best score plus `shape_cost` is larger than this value, the object is followed from frame to frame
+        (`tracking.chain`). The resulting motion is a candidate if this sum is smaller for it. Its score is the mean of
+        S between frames, but at most the best score. Disabled if negative.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
