@@ -5,10 +5,10 @@
 
 An object that turns shows another side in the last frame, so few of its points can be compared with the first frame.
 After a small motion, most points can be compared. The chain consists of frames between which the object moves by at
-least one or two pixels. In each frame of the chain, the voxels of the object are rendered at the place of the object in
-this frame. The pixels whose depth agrees with the rendering show the object. They include surface that the first frame
-does not show. Optical flow and `refine_motion` give the motion of these pixels to the next frame of the chain. The
-motion of the clip is the product of these motions.
+least one or two pixels. In each frame of the chain, the voxels of the object are rendered at the place of the object
+in this frame. The pixels whose depth agrees with the rendering show the object. They include surface that the first
+frame does not show. Optical flow and `refine_motion` give the motion of these pixels to the next frame of the chain.
+The motion of the clip is the product of these motions.
 
 Errors accumulate along the chain, mostly on surfaces without texture. `MstRule` uses the motion only if the motion
 agrees better with the last frame than all other motions. The measures are `MotionResidual` and `shape_cost`.

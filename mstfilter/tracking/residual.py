@@ -14,8 +14,8 @@ second term is for the fraction of the surface that the flow traces back to this
 not explain. Without this term, a place behind another object fits as well as a place that is seen. A lower score is
 better.
 
-`shape_cost` compares the complete shape, including sides that the first frame does not show. It decides between motions
-that differ in these sides.
+`shape_cost` compares the complete shape, including sides that the first frame does not show. It decides between
+motions that differ in these sides.
 
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
 `refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no

@@ -251,8 +251,8 @@ class MstRule(MotionRule):
         are tried. Disabled if negative.
     follow_above : float
         If the best score plus `shape_cost` is larger than this value, the object is followed from frame to frame
-        (`tracking.chain`). The resulting motion is a candidate if this sum is smaller for it. Its score is the mean of
-        S between frames, but at most the best score. Disabled if negative.
+        (`tracking.chain`). The resulting motion is a candidate if this sum is smaller for it. Its score is the mean
+        of S between frames, and smaller than the best score. Disabled if negative.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
@@ -346,17 +346,17 @@ class MstRule(MotionRule):
         """The motion of the chain, if it agrees better with the last frame than the best candidate so far."""
 
         def costs(*motions: np.ndarray) -> np.ndarray:
-            at = np.stack(motions)
-            return self.residual.scores(track, at) + shape_cost(track, at)
+            return self.residual.scores(track, np.stack(motions)) + shape_cost(track, np.stack(motions))
 
-        found = costs(best.T.as_matrix())[0]
-        chain = follow(rng, track) if found > self.follow_above else None
+        least = costs(best.T.as_matrix())[0]
+        chain = follow(rng, track) if least > self.follow_above else None
         if chain is not None:
-            motions = [chain.T, refine_motion(track, chain.T)]
-            other = costs(*motions)
-            T, margin = motions[other.argmin()], _REST_MARGIN if best.kind == "identity" else 0.0
-            if other.min() < found - margin and _admissible(T, track.points.mean(axis=0)):
-                yield Candidate("chain", rigid_transform(T), chain.n_pixels, min(chain.score, best.score))
+            motions = chain.T, refine_motion(track, chain.T)
+            found = costs(*motions)
+            T, margin = motions[found.argmin()], _REST_MARGIN if best.kind == "identity" else 0.0
+            if found.min() < least - margin and _admissible(T, track.points.mean(axis=0)):
+                score = min(chain.score, best.score - _REST_BONUS)
+                yield Candidate("chain", rigid_transform(T), chain.n_pixels, score)
 
     def _scored(self, track: Track, kind: str, T: np.ndarray, support: int = 0) -> Candidate:
         return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T))
