@@ -25,7 +25,7 @@ from mstfilter.scene import Crop, Frame, VoxelGrid, object_depth, scaled_area
 from mstfilter.tracking import rigid
 from mstfilter.tracking.flow import advance
 from mstfilter.tracking.residual import MotionResidual, refine_motion
-from mstfilter.tracking.segments import TABLE_HEIGHT, Track
+from mstfilter.tracking.segments import TABLE_HEIGHT, Track, evenly
 
 _MOVED = 0.002  # of the image width; the motion of the pixels between two frames of the chain
 _LEAST_PIXELS = 150  # that show the object, at each frame of 640 x 480 pixels
@@ -49,10 +49,9 @@ def follow(rng: np.random.Generator, track: Track) -> Chain | None:
 
     The result is None if too few pixels show the object in a frame, or if the mean of S between frames is too large.
     """
-    clip, crop = track.clip, track.crop
+    clip, crop, fewest = track.clip, track.crop, len(track.segment.pixels)
     unknown = replace(track.flow, source=np.full(track.flow.source.shape, -1, np.int32))
     T, step, scores, k, frame = np.eye(4), np.eye(4), [], 0, clip.before
-    fewest = len(track.segment.pixels)
     while k < len(track.flow.flows):
         pixels = _shown(crop, clip.grid, frame, T)
         fewest = min(fewest, len(pixels))
@@ -87,7 +86,7 @@ def _pairs(track: Track, k: int, first: Frame, pixels: np.ndarray) -> tuple[int,
     among the used frames, the frame, and the points in both frames.
     """
     height, width = first.depth.shape
-    chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, _N_POINTS).astype(np.int64))]
+    chosen = evenly(pixels, _N_POINTS)
     start = at = np.stack([chosen % width, chosen // width], axis=1).astype(np.float32)
     frame, ok = first, np.ones(len(chosen), bool)
     for fields in track.flow.flows[k:]:

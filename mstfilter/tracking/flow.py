@@ -230,10 +230,7 @@ def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sample(field: np.ndarray, at: np.ndarray, scale: float) -> np.ndarray:
-    """Bilinear samples (N, 2) of a field (h, w, 2) at pixels (N, 2) of an image; the border is repeated.
-
-    `scale` is the width of the field divided by the width of the image.
-    """
+    """Bilinear samples (N, 2) of a field (h, w, 2) at pixels (N, 2) of an image that is w / scale wide."""
     # OpenCV's images have at most 32767 rows: reshape the list of points to an image.
     folded = np.zeros((-(-len(at) // 1024), 1024, 2), np.float32)
     folded.reshape(-1, 2)[: len(at)] = at if scale == 1.0 else (at + 0.5) * scale - 0.5

@@ -14,8 +14,7 @@ second term is for the fraction of the surface that the flow traces back to this
 not explain. Without this term, a place behind another object fits as well as a place that is seen. A lower score is
 better.
 
-`shape_cost` compares the complete shape, including sides that the first frame does not show. It decides between
-motions that differ in these sides.
+`shape_cost` compares the complete shape with the last frame, also sides that the first frame does not show.
 
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
 `refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
@@ -36,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from mstfilter.scene import Camera, Crop, Frame, VoxelGrid, depth_sigma, memo
 from mstfilter.tracking.rigid import invert, move_points
-from mstfilter.tracking.segments import Track
+from mstfilter.tracking.segments import Track, evenly
 
 _DEPTH_SCALE = 1.5  # unit of depth differences, in standard deviations of the difference of two readings
 _COLOUR_SCALE = 25.0  # unit of colour differences (Euclidean RGB), grey levels
@@ -48,8 +47,7 @@ _EXPLAINED = 0.01  # metres from the moved surface to a measured point that it e
 _MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
 _N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
 _FREE_WEIGHT, _APART_WEIGHT = 40.0, 6.0  # of the terms of `shape_cost`
-_N_VOXELS, _N_TARGET = 500, 200  # largest numbers of compared voxels and of compared target points
-_FAR = 3.0  # voxels, largest distance in `shape_cost`
+_FAR, _N_VOXELS, _N_TARGET = 3.0, 500, 200  # largest distance in voxels; numbers of compared voxels and points
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
 _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine
 
@@ -128,17 +126,16 @@ def _unexplained(track: Track, motions: np.ndarray, n: int) -> np.ndarray:
 def shape_cost(track: Track, motions: np.ndarray) -> np.ndarray:
     """Cost (K,) of the complete shape of the object under motions (K, 4, 4), in units of S.
 
-    The first term is the mean distance, in voxels, by which voxels lie in front of the measured surface. The camera
-    sees through these voxels. The second term is the mean distance, in voxels, between the target surface and the
-    surface of the shape. Both terms also compare the sides of the object that the first frame does not show.
+    The first term is the mean distance by which voxels lie in front of the measured surface, in free space. The
+    second term is the mean distance between the target surface and the surface of the shape. The unit is a voxel.
     """
     after, grid, crop = track.clip.after, track.clip.grid, track.crop
     cell = np.argwhere(crop.occupied) + crop.offset
-    u, v, z, inside = after.camera.pixels_of(move_points(motions, grid.centre_of(_evenly(cell, _N_VOXELS))))
+    u, v, z, inside = after.camera.pixels_of(move_points(motions, grid.centre_of(evenly(cell, _N_VOXELS))))
     before = np.where(inside & after.valid[v, u], (after.depth[v, u] - z) / grid.voxel_size, 0.0)
     cost = _FREE_WEIGHT * np.clip(before, 0.0, _FAR).mean(axis=-1)
     if track.target_surface is not None:
-        at_source = move_points(invert(motions), _evenly(track.target_surface.points, _N_TARGET))
+        at_source = move_points(invert(motions), evenly(track.target_surface.points, _N_TARGET))
         off = np.abs(_signed_distance(crop, grid, at_source)) - 0.5
         cost = cost + _APART_WEIGHT * np.clip(off, 0.0, _FAR).mean(axis=-1)
     return np.asarray(cost)
@@ -153,11 +150,6 @@ def _signed_distance(crop: Crop, grid: VoxelGrid, points: np.ndarray) -> np.ndar
     near = ((index >= 0) & (index < occupied.shape)).all(axis=-1)
     index = np.clip(index, 0, np.array(occupied.shape) - 1)
     return np.where(near, signed[tuple(np.moveaxis(index, -1, 0))], float(margin))
-
-
-def _evenly(points: np.ndarray, n: int) -> np.ndarray:
-    """At most n of the rows of an array, evenly spaced."""
-    return points[np.unique(np.linspace(0, len(points) - 1, n).astype(np.int64))]
 
 
 def normals(frame: Frame) -> np.ndarray:

@@ -43,7 +43,7 @@ _MIN_OVERLAP = 0.3  # fraction of the moved surface that has a correspondence af
 _MIN_PAIRS = 6  # flow tracks or SIFT matches of a motion
 _MAX_SIFT = 3  # SIFT motions of a segment
 _REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
-_REST_MARGIN = 2.0  # in S; the chain of an object must be better than rest by this much
+_CHAIN_MARGIN, _REST_MARGIN = 0.5, 2.0  # in S; the chain must be better than another motion and than rest by this
 _MAX_SHIFT, _MAX_ANGLE = 0.6, 2.6  # metres at the segment's centre, radians
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 
@@ -266,7 +266,7 @@ class MstRule(MotionRule):
     use_sift: bool = True
     n_refine: int = 3
     search_above: float = 4.0
-    follow_above: float = 3.8
+    follow_above: float = 4.0
     max_score: float = OUTSIDE_COST
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: MotionResidual = field(default_factory=MotionResidual)
@@ -353,7 +353,7 @@ class MstRule(MotionRule):
         if chain is not None:
             motions = chain.T, refine_motion(track, chain.T)
             found = costs(*motions)
-            T, margin = motions[found.argmin()], _REST_MARGIN if best.kind == "identity" else 0.0
+            T, margin = motions[found.argmin()], _REST_MARGIN if best.kind == "identity" else _CHAIN_MARGIN
             if found.min() < least - margin and _admissible(T, track.points.mean(axis=0)):
                 score = min(chain.score, best.score - _REST_BONUS)
                 yield Candidate("chain", rigid_transform(T), chain.n_pixels, score)

@@ -69,6 +69,11 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     return out
 
 
+def evenly(rows: np.ndarray, n: int) -> np.ndarray:
+    """At most n rows of an array, evenly spaced."""
+    return rows if len(rows) <= n else rows[np.linspace(0, len(rows) - 1, n).astype(np.int64)]
+
+
 def _interior(labels: np.ndarray) -> np.ndarray:
     """Pixels with the same label as their four neighbours."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -164,8 +169,7 @@ class Track:
 
     def sampled(self, n: int) -> np.ndarray:
         """The flat pixels of the first frame of `sample`."""
-        chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
-        return self.segment.support[chosen[chosen >= 0]]
+        return evenly(self.segment.support, n)
 
     @property
     def colour_after(self) -> np.ndarray:
