@@ -130,7 +130,7 @@ class Track:
 
     @cached_property
     def near(self) -> cKDTree:
-        """Search tree of the visible surface in the first frame, for short distances."""
+        """Search tree of the points of `surface`; without points if there is no surface."""
         return cKDTree(np.empty((0, 3)) if self.surface is None else self.surface.points)
 
     @cached_property
@@ -168,7 +168,7 @@ class Track:
         return self.clip.before.points.reshape(-1, 3)[pixels], colours.astype(np.float64)
 
     def sampled(self, n: int) -> np.ndarray:
-        """The flat pixels of the first frame of `sample`."""
+        """Flat pixels, in the first frame, of the points that `sample` returns."""
         return evenly(self.segment.support, n)
 
     @property
