@@ -69,7 +69,6 @@ from mstfilter.scene.recording import (
 )
 from mstfilter.scene.rendering import (
     Rendering as Rendering,
-    object_depth as object_depth,
     project as project,
     render as render,
     render_hypothesis as render_hypothesis,

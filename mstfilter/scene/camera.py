@@ -174,9 +174,7 @@ class Camera:
 
     def at(self, T_world_camera: RigidTransform) -> Camera:
         """The same camera at another pose."""
-        moved = replace(self, T_world_camera=T_world_camera)
-        moved.__dict__["_ray_grid"] = self._ray_grid  # does not depend on the pose
-        return moved
+        return replace(self, T_world_camera=T_world_camera)
 
 
 _WIDTH, _HEIGHT = 640, 480  # pixels: the image size in which numbers of pixels are given

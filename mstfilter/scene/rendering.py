@@ -45,7 +45,7 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
         depth = np.full(image.shape, np.inf, np.float32)
         for label, box in enumerate(find_objects(hypothesis.labels), 1):
             if box is not None:
-                window, of_object = object_depth(hypothesis.labels[box] == label, box, hypothesis.grid, camera)
+                window, of_object = _object_depth(hypothesis.labels[box] == label, box, hypothesis.grid, camera)
                 nearer = of_object < depth[window]
                 image[window][nearer] = label
                 depth[window][nearer] = of_object[nearer]
@@ -55,7 +55,7 @@ def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
     return memo("render", (hypothesis.key, camera.key), compute)
 
 
-def object_depth(mask: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray]:
+def _object_depth(mask: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray]:
     """A window of the image and the depth (h, w) of an object in it, inf without a hit. Hypotheses share objects.
 
     `mask` (a, b, c) are its voxels in a box of the grid.

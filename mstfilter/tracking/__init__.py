@@ -12,7 +12,6 @@
 `features`             SIFT matches, exposure matching
 `registration`         ICP by small_gicp
 `residual`             comparison of a motion with the last frame, refinement
-`chain`                an object followed from frame to frame by its complete shape
 `rigid`                rigid motions from point pairs, J-Linkage
 =====================  ====================================================================
 """

@@ -53,9 +53,6 @@ class ClipTracks:
     #: (H, W) int32, flat pixel of the first frame for each pixel of the last frame; -1 for robot pixels.
     source: np.ndarray
     unchanged: np.ndarray  #: (H, W) bool, whether depth and colour agree between first and last frame
-    used: np.ndarray  #: (S + 1,) int, indices of the used frames, with the first and the last one
-    #: (S, 2, H / 2, W / 2, 2) float16, pixels of the image: flow between consecutive used frames, forward and back.
-    flows: np.ndarray
 
     def warp(self, labels: np.ndarray) -> np.ndarray:
         """A label image (H, W) of the first frame, moved to the last frame; 0 for robot pixels."""
@@ -118,7 +115,6 @@ class FlowTracker:
         self._grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
         self._pull = self._grid.copy()  # position in the first frame of every pixel of the last used frame
         self._known = ~_robot(first).ravel()
-        self._flows: list[np.ndarray] = []
 
     def add(self, frame: Frame) -> None:
         """Add the next frame. The frame before is used if the motion since the last used frame is large."""
@@ -143,22 +139,17 @@ class FlowTracker:
         u, v = _pixel(self._pull, width, height)
         source = np.where(self._known, v * width + u, -1).astype(np.int32).reshape(height, width)
         unchanged = _unchanged_pixels(self._first, self._last)
-        used = np.array([*self.used, len(self.keys) - 1][: len(self._flows) + 1])
-        flows = np.array(self._flows, np.float16)
-        return ClipTracks(self._start.astype(np.int32), self._end, self._alive, source, unchanged, used, flows)
+        return ClipTracks(self._start.astype(np.int32), self._end, self._alive, source, unchanged)
 
     def _use(self, current: Frame) -> None:
         """Follow points and pixels from the last used frame to another one."""
         previous, grid = self._used, self._grid
         height, width = current.depth.shape
         forward, backward = _flow(previous, current, self._preset)
-        half = (max(width // 2, 1), max(height // 2, 1))
-        coarse = [cv2.resize(field, half, interpolation=cv2.INTER_AREA) for field in (forward, backward)]
-        self._flows.append(np.array(coarse, np.float16))
-        self._end, ok = advance(self._end, forward, backward, previous, current)
+        self._end, ok = _advance(self._end, forward, backward, previous, current)
         self._alive = self._alive & ok
         # One step back to the previous frame, then the accumulated map.
-        back, ok = advance(grid, backward, forward, current, previous)
+        back, ok = _advance(grid, backward, forward, current, previous)
         u, v = _pixel(back, width, height)
         at = v * width + u
         pull = self._pull[at] + (back - grid[at])  # keeps the subpixel part
@@ -229,24 +220,22 @@ def _flow(a: Frame, b: Frame, preset: str) -> tuple[np.ndarray, np.ndarray]:
         return together(lambda: between(0, 1), lambda: between(1, 0))
 
 
-def _sample(field: np.ndarray, at: np.ndarray, scale: float) -> np.ndarray:
-    """Bilinear samples (N, 2) of a field (h, w, 2) at pixels (N, 2) of an image that is w / scale wide."""
+def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Bilinear samples (N, 2) of a field (H, W, 2) at points (N, 2); the border is repeated."""
     # OpenCV's images have at most 32767 rows: reshape the list of points to an image.
     folded = np.zeros((-(-len(at) // 1024), 1024, 2), np.float32)
-    folded.reshape(-1, 2)[: len(at)] = at if scale == 1.0 else (at + 0.5) * scale - 0.5
+    folded.reshape(-1, 2)[: len(at)] = at
     sampled = cv2.remap(field, folded, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return sampled.reshape(-1, 2)[: len(at)]
 
 
-def advance(at: np.ndarray, there: np.ndarray, back: np.ndarray, a: Frame, b: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Move points from frame a to frame b. Returns their positions (N, 2) and whether they are valid (N,).
-
-    `there` and `back` are the flows a -> b and b -> a in pixels of the frames; they may have a lower resolution.
-    """
+def _advance(
+    at: np.ndarray, there: np.ndarray, back: np.ndarray, a: Frame, b: Frame
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move points from frame a to frame b. Returns their positions (N, 2) and whether they are valid (N,)."""
     height, width = a.depth.shape
-    scale = there.shape[1] / width
-    moved = at + _sample(there, at, scale)
-    returned = moved + _sample(back, moved, scale)
+    moved = at + _sample(there, at)
+    returned = moved + _sample(back, moved)
     # Operations over columns are several times faster than reductions over axes of two or three elements.
     x, y = moved.T
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)

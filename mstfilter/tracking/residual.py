@@ -14,8 +14,6 @@ second term is for the fraction of the surface that the flow traces back to this
 not explain. Without this term, a place behind another object fits as well as a place that is seen. A lower score is
 better.
 
-`shape_cost` compares the complete shape with the last frame, also sides that the first frame does not show.
-
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
 `refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
 effect. Colour determines motions that depth does not determine, for example the rotation of a can about its axis.
@@ -30,12 +28,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from mstfilter.scene import Camera, Crop, Frame, VoxelGrid, depth_sigma, memo
+from mstfilter.scene import Camera, Frame, depth_sigma, memo
 from mstfilter.tracking.rigid import invert, move_points
-from mstfilter.tracking.segments import Track, evenly
+from mstfilter.tracking.segments import Track
 
 _DEPTH_SCALE = 1.5  # unit of depth differences, in standard deviations of the difference of two readings
 _COLOUR_SCALE = 25.0  # unit of colour differences (Euclidean RGB), grey levels
@@ -46,8 +43,6 @@ _FACING_AWAY = -0.1  # cosine of normal and ray; the visible side of a surface i
 _EXPLAINED = 0.01  # metres from the moved surface to a measured point that it explains
 _MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
 _N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
-_FREE_WEIGHT, _APART_WEIGHT = 40.0, 6.0  # of the terms of `shape_cost`
-_FAR, _N_VOXELS, _N_TARGET = 3.0, 500, 200  # largest distance in voxels; numbers of compared voxels and points
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
 _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine
 
@@ -121,35 +116,6 @@ def _unexplained(track: Track, motions: np.ndarray, n: int) -> np.ndarray:
     at_source = move_points(invert(motions), points)
     distance, _ = track.near.query(at_source, distance_upper_bound=_EXPLAINED)
     return (~np.isfinite(distance)).mean(axis=-1)
-
-
-def shape_cost(track: Track, motions: np.ndarray) -> np.ndarray:
-    """Cost (K,) of the complete shape of the object under motions (K, 4, 4), in units of S.
-
-    The first term is the mean distance by which voxels lie in front of the measured surface, in free space. The
-    second term is the mean distance between the target surface and the surface of the shape. The unit is a voxel.
-    """
-    after, grid, crop = track.clip.after, track.clip.grid, track.crop
-    cell = np.argwhere(crop.occupied) + crop.offset
-    u, v, z, inside = after.camera.pixels_of(move_points(motions, grid.centre_of(evenly(cell, _N_VOXELS))))
-    before = np.where(inside & after.valid[v, u], (after.depth[v, u] - z) / grid.voxel_size, 0.0)
-    cost = _FREE_WEIGHT * np.clip(before, 0.0, _FAR).mean(axis=-1)
-    if track.target_surface is not None:
-        at_source = move_points(invert(motions), evenly(track.target_surface.points, _N_TARGET))
-        off = np.abs(_signed_distance(crop, grid, at_source)) - 0.5
-        cost = cost + _APART_WEIGHT * np.clip(off, 0.0, _FAR).mean(axis=-1)
-    return np.asarray(cost)
-
-
-def _signed_distance(crop: Crop, grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """Distance (...) in voxels of points (..., 3) from the surface of a crop, negative inside, at most `_FAR` + 1."""
-    margin = int(_FAR) + 1
-    occupied = np.pad(crop.occupied, margin)
-    signed = np.where(occupied, 0.5 - distance_transform_edt(occupied), distance_transform_edt(~occupied) - 0.5)
-    index = grid.index_of(points) - crop.offset + margin
-    near = ((index >= 0) & (index < occupied.shape)).all(axis=-1)
-    index = np.clip(index, 0, np.array(occupied.shape) - 1)
-    return np.where(near, signed[tuple(np.moveaxis(index, -1, 0))], float(margin))
 
 
 def normals(frame: Frame) -> np.ndarray:
@@ -254,9 +220,8 @@ def _gauss_newton(x: np.ndarray, *terms: tuple[np.ndarray, np.ndarray]) -> np.nd
     centre = x.mean(axis=0)
     radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)
     H, b = np.zeros((6, 6)), np.zeros(6)
-    ax, ay, az = ((x - centre) / radius).T
     for residual, slope in terms:
-        sx, sy, sz = slope.T
+        (ax, ay, az), (sx, sy, sz) = ((x - centre) / radius).T, slope.T
         J = np.stack([ay * sz - az * sy, az * sx - ax * sz, ax * sy - ay * sx, sx, sy, sz], axis=1)
         weight = (1.0 + residual**2 / 4.0) ** -2
         H += (J * weight[:, None]).T @ J

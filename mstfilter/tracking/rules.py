@@ -31,10 +31,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_rigid, check_type, describe_value, returns, warn_once
 from mstfilter.tracking import rigid
-from mstfilter.tracking.chain import follow
 from mstfilter.tracking.features import SiftMatching
 from mstfilter.tracking.registration import Registration, SmallGicp, centroid_shift
-from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, refine_motion, shape_cost
+from mstfilter.tracking.residual import OUTSIDE_COST, MotionResidual, refine_motion
 from mstfilter.tracking.rigid import MotionCluster, jlinkage, rigid_transform
 from mstfilter.tracking.segments import Track
 
@@ -43,7 +42,6 @@ _MIN_OVERLAP = 0.3  # fraction of the moved surface that has a correspondence af
 _MIN_PAIRS = 6  # flow tracks or SIFT matches of a motion
 _MAX_SIFT = 3  # SIFT motions of a segment
 _REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
-_CHAIN_MARGIN, _REST_MARGIN = 0.5, 2.0  # in S; the chain must be better than another motion and than rest by this
 _MAX_SHIFT, _MAX_ANGLE = 0.6, 2.6  # metres at the segment's centre, radians
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 
@@ -52,7 +50,7 @@ _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
 class Candidate:
     """A possible motion of an object."""
 
-    kind: str  #: "identity", "flow", "icp", "sift", "chain" or "search"
+    kind: str  #: "identity", "flow", "icp", "sift" or "search"
     T: RigidTransform  #: world metres
     support: int = 0  #: number of matches or points that determine it
     #: Criterion of the rule, lower is better: S of `MotionResidual`, or a root mean square residual in metres.
@@ -249,10 +247,6 @@ class MstRule(MotionRule):
     search_above : float
         If every score is larger than this value, the object is searched for around its last position, and topplings
         are tried. Disabled if negative.
-    follow_above : float
-        If the best score plus `shape_cost` is larger than this value, the object is followed from frame to frame
-        (`tracking.chain`). The resulting motion is a candidate if this sum is smaller for it. Its score is the mean
-        of S between frames, and smaller than the best score. Disabled if negative.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
@@ -266,7 +260,6 @@ class MstRule(MotionRule):
     use_sift: bool = True
     n_refine: int = 3
     search_above: float = 4.0
-    follow_above: float = 4.0
     max_score: float = OUTSIDE_COST
     sift: SiftMatching = field(default_factory=SiftMatching)
     residual: MotionResidual = field(default_factory=MotionResidual)
@@ -290,8 +283,6 @@ class MstRule(MotionRule):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
             moving.extend(self._search(track, centre))
-        if self.follow_above >= 0:
-            moving.extend(self._follow(rng, track, min([rest, *moving], key=lambda c: c.score)))
         return (rest, *(c for c in moving if c.score < self.max_score))
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
@@ -341,22 +332,6 @@ class MstRule(MotionRule):
                 if np.isfinite(scores[k]) and _admissible(T, centre):
                     candidates.append(self._scored(track, "search", T))
         return candidates
-
-    def _follow(self, rng: np.random.Generator, track: Track, best: Candidate) -> Iterator[Candidate]:
-        """The motion of the chain, if it agrees better with the last frame than the best candidate so far."""
-
-        def costs(*motions: np.ndarray) -> np.ndarray:
-            return self.residual.scores(track, np.stack(motions)) + shape_cost(track, np.stack(motions))
-
-        least = costs(best.T.as_matrix())[0]
-        chain = follow(rng, track) if least > self.follow_above else None
-        if chain is not None:
-            motions = chain.T, refine_motion(track, chain.T)
-            found = costs(*motions)
-            T, margin = motions[found.argmin()], _REST_MARGIN if best.kind == "identity" else _CHAIN_MARGIN
-            if found.min() < least - margin and _admissible(T, track.points.mean(axis=0)):
-                score = min(chain.score, best.score - _REST_BONUS)
-                yield Candidate("chain", rigid_transform(T), chain.n_pixels, score)
 
     def _scored(self, track: Track, kind: str, T: np.ndarray, support: int = 0) -> Candidate:
         return Candidate(kind, rigid_transform(T), support, self.residual.score(track, T))

@@ -23,12 +23,12 @@ from scipy.ndimage import value_indices
 from scipy.spatial import cKDTree
 
 from mstfilter.results import Checked, check_array, check_list, returns
-from mstfilter.scene import Clip, Crop, Frame, Hypothesis, content_key, read_only, render_hypothesis
+from mstfilter.scene import Clip, Frame, Hypothesis, content_key, read_only, render_hypothesis
 from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_colour
 from mstfilter.tracking.flow import ClipTracks
 from mstfilter.tracking.registration import Surface, prepare
 
-TABLE_HEIGHT = 0.004  # metres; lower points belong to the table
+_TABLE_HEIGHT = 0.004  # metres; lower points belong to the table
 _MAX_CHANGED = 0.03  # largest fraction of changed pixels, among the comparable ones, of an object at rest
 _MIN_COMPARED = 0.3  # smallest fraction of comparable pixels of an object at rest
 _OCCLUDED_MARGIN = 0.015  # metres; a pixel whose depth decreased by more is occluded and not comparable
@@ -43,7 +43,6 @@ class Segment:
     #: (S,) int64, sorted flat pixels of the mask whose measured depth agrees with the object. The mask of a voxel
     #: object extends slightly beyond the object itself.
     support: np.ndarray
-    voxels: np.ndarray  #: (V,) int64, sorted flat indices of the object's voxels in the grid
 
 
 def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
@@ -54,7 +53,7 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     labels, depth = render_hypothesis(hypothesis, frame.camera)
     with np.errstate(invalid="ignore"):
         agrees = np.abs(frame.depth - depth) < 2.0 * hypothesis.grid.voxel_size
-        agrees &= frame.points[..., 2] > TABLE_HEIGHT
+        agrees &= frame.points[..., 2] > _TABLE_HEIGHT
     agrees &= frame.valid
     # Pixels on the rim of a mask mix depth and colour with the background.
     interior = _interior(labels)
@@ -64,14 +63,8 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
         support = pixels[agrees.ravel()[pixels]]
         inner = support[interior.ravel()[support]]
         support = inner if len(inner) >= 60 else support
-        key = content_key(pixels, content_key(voxels[label]))
-        out[label] = Segment(key, pixels, support, voxels[label])
+        out[label] = Segment(content_key(pixels, content_key(voxels[label])), pixels, support)
     return out
-
-
-def evenly(rows: np.ndarray, n: int) -> np.ndarray:
-    """At most n rows of an array, evenly spaced."""
-    return rows if len(rows) <= n else rows[np.linspace(0, len(rows) - 1, n).astype(np.int64)]
 
 
 def _interior(labels: np.ndarray) -> np.ndarray:
@@ -115,15 +108,6 @@ class Track:
         return read_only(self.clip.before.points.reshape(-1, 3)[self.segment.support])
 
     @cached_property
-    def crop(self) -> Crop:
-        """The voxels of the object in the first frame."""
-        index = np.stack(np.unravel_index(self.segment.voxels, self.clip.grid.shape), axis=-1)
-        lower = index.min(axis=0)
-        occupied = np.zeros(index.max(axis=0) - lower + 1, bool)
-        occupied[tuple((index - lower).T)] = True
-        return Crop(occupied, lower)
-
-    @cached_property
     def surface(self) -> Surface | None:
         """The visible surface in the first frame; None if it has too few points."""
         return prepare(self.points)
@@ -138,7 +122,7 @@ class Track:
         """The surface of the target mask in the last frame, above the table; None if it has too few points."""
         after = self.clip.after
         with np.errstate(invalid="ignore"):
-            pixels = self.target_mask & after.valid & (after.points[..., 2] > TABLE_HEIGHT)
+            pixels = self.target_mask & after.valid & (after.points[..., 2] > _TABLE_HEIGHT)
         return prepare(after.points[pixels])
 
     @cached_property
@@ -149,7 +133,7 @@ class Track:
         u, v = self.flow.start[chosen].T
         end_u, end_v = np.rint(self.flow.end[chosen]).astype(np.int64).T
         q = after.points[end_v, end_u]
-        keep = after.valid[end_v, end_u] & (q[:, 2] > TABLE_HEIGHT)
+        keep = after.valid[end_v, end_u] & (q[:, 2] > _TABLE_HEIGHT)
         return read_only(before.points[v, u][keep]), read_only(q[keep])
 
     def sift_pairs(self, sift: SiftMatching, in_target: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +153,8 @@ class Track:
 
     def sampled(self, n: int) -> np.ndarray:
         """Flat pixels, in the first frame, of the points that `sample` returns."""
-        return evenly(self.segment.support, n)
+        chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
+        return self.segment.support[chosen[chosen >= 0]]
 
     @property
     def colour_after(self) -> np.ndarray:

@@ -290,8 +290,8 @@ class TrackingTransition(Transition):
         -----
         `notes` contains:
 
-        - ``motions``: number of objects per kind (static, identity, flow, icp, sift, chain, search, invisible,
-          unsupported, lost);
+        - ``motions``: number of objects per kind (static, identity, flow, icp, sift, search, invisible, unsupported,
+          lost);
         - ``segments``: number of distinct segments;
         - ``voxels_left`` (the grid), ``voxels_contested`` and ``objects_dropped``.
 
