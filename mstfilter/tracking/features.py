@@ -27,7 +27,7 @@ _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the g
 
 
 def same_depth(first: Frame, other: Frame) -> np.ndarray:
-    """Pixels (H, W) off the robot where both frames have readings that agree up to the sensor noise."""
+    """Whether both frames have readings that agree up to the sensor noise, (H, W) bool; False on the robot."""
     limit = _DEPTH_SIGMAS * np.sqrt(2.0) * depth_sigma(first.depth)
     with np.errstate(invalid="ignore"):
         return (np.abs(other.depth - first.depth) <= limit) & first.valid & other.valid

@@ -92,7 +92,7 @@ class DenseFlow(Bounded):
         return memo("clip tracks", (tuple(keys), astuple(self)), compute, ClipTracks)
 
     def begin(self, first: Frame) -> FlowTracker:
-        """A tracker for a clip whose frames arrive one by one. `track` continues it while it is referenced."""
+        """A tracker for frames that arrive one by one. `track` continues it while the caller refers to it."""
         tracker = _begun[first.key, self.preset] = FlowTracker(first, self.preset)
         return tracker
 
@@ -257,7 +257,7 @@ def _pixel(at: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndar
 
 
 def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
-    """Pixels (H, W) with the same content in the first and last frame.
+    """Whether each pixel has the same content in the first and last frame, (H, W) bool.
 
     Depth differs by less than four standard deviations of the difference. Slightly blurred colour differs by at most
     12 grey levels in every channel after exposure matching. Pixels that show the robot or have no depth count as

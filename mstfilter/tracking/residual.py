@@ -221,7 +221,8 @@ def _gauss_newton(x: np.ndarray, *terms: tuple[np.ndarray, np.ndarray]) -> np.nd
     radius = max(float(np.sqrt(((x - centre) ** 2).sum(axis=1).mean())), 1e-3)
     H, b = np.zeros((6, 6)), np.zeros(6)
     for residual, slope in terms:
-        J = np.hstack([np.cross((x - centre) / radius, slope), slope])
+        (ax, ay, az), (sx, sy, sz) = ((x - centre) / radius).T, slope.T
+        J = np.stack([ay * sz - az * sy, az * sx - ax * sz, ax * sy - ay * sx, sx, sy, sz], axis=1)
         weight = (1.0 + residual**2 / 4.0) ** -2
         H += (J * weight[:, None]).T @ J
         b += J.T @ (weight * residual)

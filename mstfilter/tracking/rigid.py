@@ -112,8 +112,8 @@ def minimal_models(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: 
 
 def residuals(models: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Distances between ``R_k p_i + t_k`` and ``q_i``, (N, M), metres."""
-    moved = np.einsum("kij,nj->nki", models[:, :3, :3], p) + models[None, :, :3, 3]
-    return np.linalg.norm(moved - q[:, None, :], axis=-1)
+    x, y, z = np.moveaxis(models[:, :3, :3] @ p.T + models[:, :3, 3:] - q.T, 1, 0)  # much faster than einsum and norm
+    return np.asarray(np.sqrt(x * x + y * y + z * z).T)
 
 
 @dataclass(frozen=True)

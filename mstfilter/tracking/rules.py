@@ -229,12 +229,12 @@ class AuthorsRule(MotionRule):
 
 @dataclass(frozen=True)
 class MstRule(MotionRule):
-    """Candidates from flow, registration and SIFT, ranked by `MotionResidual`. No motion is preferred.
+    """Candidates from flow, registration and SIFT, ranked by `MotionResidual`. Rest is preferred by a small margin.
 
     Parameters
     ----------
     select : "map" or "sample"
-        Take the candidate with the best score ("best"), or draw one with probability proportional to exp(-n_eff S /
+        Take the candidate with the best score ("map"), or draw one with probability proportional to exp(-n_eff S /
         2) for each particle ("sample").
     n_eff : float
         Effective number of independent observations per segment, for ``select="sample"``. Residuals of neighbouring

@@ -114,7 +114,7 @@ class Track:
 
     @cached_property
     def near(self) -> cKDTree:
-        """Search tree of the visible surface in the first frame, for short distances."""
+        """Search tree of the points of `surface`; without points if there is no surface."""
         return cKDTree(np.empty((0, 3)) if self.surface is None else self.surface.points)
 
     @cached_property
@@ -152,7 +152,7 @@ class Track:
         return self.clip.before.points.reshape(-1, 3)[pixels], colours.astype(np.float64)
 
     def sampled(self, n: int) -> np.ndarray:
-        """The flat pixels of the first frame of `sample`."""
+        """Flat pixels, in the first frame, of the points that `sample` returns."""
         chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
         return self.segment.support[chosen[chosen >= 0]]
 

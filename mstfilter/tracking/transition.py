@@ -213,7 +213,7 @@ def _moved_box(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, 
 
 
 def _pull(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels (N, 3) of the source moved by T, also outside the grid, and their depth inside; N does not change."""
+    """Voxels (N, 3) of the source moved by T, and their depth inside (N,). N is the number of its voxels."""
     index, at_source = _moved_box(crop, T, grid)
     cell = np.rint(at_source - 0.5).astype(np.int64)
     turned = np.abs(T[:3, :3] - np.rint(T[:3, :3])).max()
@@ -234,7 +234,7 @@ def _pull(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.nd
 
 
 def _push(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels (N, 3) that contain moved centres of the source, and the largest depth of these centres."""
+    """Voxels (N, 3) that contain moved centres of the source, and the largest depth (N,) of the centres in each."""
     cell = np.argwhere(crop.occupied)
     depth = _depth_inside(crop)[tuple(cell.T)]
     index = grid.index_of(move_points(T, grid.centre_of(cell + crop.offset)))
@@ -343,7 +343,7 @@ class TrackingTransition(Transition):
     def _track_all(
         self, rng: np.random.Generator, clip: Clip, segments: list[dict[int, Segment]]
     ) -> dict[bytes, tuple[str, tuple[Candidate, ...]]]:
-        """Kind and candidate motions of each distinct segment, by its key. An empty list means no motion."""
+        """Kind and candidates of each distinct segment, by its key; no candidates if it is not tracked."""
         tracks = self.flow.track(clip)
         found: dict[bytes, tuple[str, tuple[Candidate, ...]]] = {}
         moving: list[Track] = []
