@@ -208,6 +208,8 @@ def _groups(samples: CompletionSamples) -> dict[str, np.ndarray]:
     for low, high in ((0.9, 1.01), (0.5, 0.9), (0.0, 0.5)):
         name = f"visible {int(100 * low)} - {int(min(100 * high, 100))} %"
         groups[name] = (samples.visible >= low) & (samples.visible < high)
+    for n in np.unique(samples.earlier).tolist():
+        groups[f"whole, {n} earlier views"] = (samples.mask == 0) & (samples.earlier == n)
     groups |= {f"shape: {name}": samples.kind == name for name in sorted(set(samples.kind.tolist()))}
     groups["shapes not trained on"] = np.isin(samples.kind, HELD_OUT)
     return groups

@@ -15,7 +15,7 @@ from mst_training.completion import CompletionTraining, divergence
 from mst_training.completion_data import CompletionSamples
 from mst_training.loop import run_training
 from mst_training.scenes import draw_camera, draw_scene
-from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
+from mst_training.shapes import FURTHER, HELD_OUT, TRAINED, draw_training_shape
 from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
 from mstfilter.completion.unet import LatentLaw
@@ -72,7 +72,7 @@ def test_parts_of_an_object_share_its_voxels(samples):
     assert volume[samples.mask == 1].mean() < volume[samples.mask == 0].mean()
 
 
-@pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT])
+@pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT, *FURTHER])
 def test_shapes(kind):
     """Centred on the origin, of a size that fits a table; every drawn size differs."""
     shapes = [draw_training_shape(np.random.default_rng(k), kind) for k in range(20)]
