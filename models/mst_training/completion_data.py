@@ -96,7 +96,14 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     bits, signed, shapes, kinds, masks, visible, n_known = columns
     scene = np.full(len(bits), index, np.int32)
     return CompletionSamples(
-        bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32), n_known.astype(np.uint8)
+        bits,
+        signed,
+        shapes,
+        kinds,
+        masks.astype(np.uint8),
+        scene,
+        visible.astype(np.float32),
+        n_known.astype(np.uint8),
     )
 
 
