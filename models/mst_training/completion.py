@@ -22,7 +22,7 @@ from torch.nn import functional
 from mst_training.completion_data import MASK_KINDS, CompletionSamples
 from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
-from mst_training.shapes import HELD_OUT
+from mst_training.shapes import FURTHER, HELD_OUT, TRAINED
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.forecasts import ForecastTable
@@ -47,6 +47,7 @@ class CompletionTraining(Training):
     }
     architecture: ClassVar[str] = ARCHITECTURE
     samples: ClassVar[type[Samples]] = CompletionSamples
+    kinds: ClassVar[tuple[str, ...]] = TRAINED + FURTHER
     losses: ClassVar[tuple[str, ...]] = ("loss",)
 
     def networks(self) -> dict[str, nn.Module]:

@@ -93,7 +93,7 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     if not rows:
         return None
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    bits, signed, shapes, kinds, masks, visible, n_known = columns
+    bits, signed, shapes, kinds, masks, visible, n_earlier = columns
     scene = np.full(len(bits), index, np.int32)
     return CompletionSamples(
         bits,
@@ -103,7 +103,7 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
         masks.astype(np.uint8),
         scene,
         visible.astype(np.float32),
-        n_known.astype(np.uint8),
+        n_earlier.astype(np.uint8),
     )
 
 

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mst_training.scenes import Samples
-from mst_training.shapes import FURTHER, HELD_OUT, TRAINED
+from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.errors import InputError, check_choice
 from mstfilter.files import atomic_path, read_csv, write_csv, write_text
 from mstfilter.reading import read_text
@@ -58,6 +58,7 @@ class Training(ABC):
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]]
     architecture: ClassVar[str]
     samples: ClassVar[type[Samples]]  #: what it is trained on
+    kinds: ClassVar[tuple[str, ...]] = TRAINED  #: of shapes in the training scenes
     losses: ClassVar[tuple[str, ...]]  #: names of the figures of `loss`
 
     @classmethod
@@ -152,7 +153,7 @@ def run_training(
     parts = {
         "validation": make(place / "validation", seed + 1, settings.n_validation, workers, TRAINED),
         "test": make(place / "test", seed + 2, settings.n_test, workers, TRAINED + HELD_OUT),
-        "train": make(place / "train", seed, settings.n_scenes, workers, TRAINED + FURTHER),
+        "train": make(place / "train", seed, settings.n_scenes, workers, settings.kinds),
     }
     run = _Run(settings, folder, torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
     validation = read(parts["validation"])
