@@ -57,6 +57,7 @@ class CompletionSamples(Samples):
     mask: np.ndarray  #: (n,) uint8, index in `MASK_KINDS`
     scene: np.ndarray  #: (n,) int32, number of the scene
     visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
+    earlier: np.ndarray  #: (n,) uint8, number of earlier views
 
     @classmethod
     def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
@@ -87,14 +88,23 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     for mask in _masks(rng, frame, instance):
         found = _sample(rng, frame, instance, mask, truth, earlier)
         if found is not None:
-            which, bits, signed, shape, k = found
-            rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k]))
+            which, bits, signed, shape, k, n_known = found
+            rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k], n_known))
     if not rows:
         return None
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    bits, signed, shapes, kinds, masks, visible = columns
+    bits, signed, shapes, kinds, masks, visible, n_earlier = columns
     scene = np.full(len(bits), index, np.int32)
-    return CompletionSamples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
+    return CompletionSamples(
+        bits,
+        signed,
+        shapes,
+        kinds,
+        masks.astype(np.uint8),
+        scene,
+        visible.astype(np.float32),
+        n_earlier.astype(np.uint8),
+    )
 
 
 class _Earlier(NamedTuple):
@@ -185,8 +195,8 @@ def _sample(
     mask: np.ndarray,
     truth: np.ndarray,
     earlier: Sequence[_Earlier],
-) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int] | None:
-    """Kind of mask, bits, distances, true shape and main object of one mask; None if it shows no object."""
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int, int] | None:
+    """Kind of mask, bits, distances, true shape, main object and number of views; None if it shows no object."""
     counts = np.bincount(instance[mask & frame.valid], minlength=256)
     whole = np.bincount(instance[frame.valid], minlength=256)
     counts[0] = 0
@@ -207,7 +217,7 @@ def _sample(
         shape |= _claimed(frame, instance == k, mask, truth[box] == k, offset)
     index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
     bits, signed = (_padded(one) for one in encode_box(seen))
-    return index, bits, signed, _padded(shape), main
+    return index, bits, signed, _padded(shape), main, len(known)
 
 
 class _Crop(Extrude):
