@@ -5,10 +5,12 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_erosion
 
 from mst_training import completion_data
 from mst_training.completion import CompletionTraining
@@ -70,6 +72,22 @@ def test_parts_of_an_object_share_its_voxels(samples):
     whole, part = (volume[samples.mask == k].sum() / surface[samples.mask == k].sum() for k in (0, 1))
     assert 0.4 < part / whole < 1.6
     assert volume[samples.mask == 1].mean() < volume[samples.mask == 0].mean()
+
+
+def test_displaced_borders_take_nothing_from_an_object():
+    """A mask without the pixels of the border gets the whole object; a mask of one half gets that half."""
+    rows, columns = np.indices((30, 30)) * 0.005
+    points = np.stack([rows - 0.005 * 5, columns - 0.005 * 5, np.full_like(rows, 0.1)], axis=-1)  # the face above
+    frame = SimpleNamespace(valid=np.ones((30, 30), bool), points=points)
+    face = np.zeros((30, 30), bool)
+    face[5:25, 5:25] = True
+    truth = np.ones((10, 10, 10), bool)
+    offset = completion_data._GRID.index_of(np.array([0.0001, 0.0001, 0.0001]))
+    smaller, half = binary_erosion(face, iterations=2), face & (rows < 0.005 * 14.9)
+    assert completion_data._claimed(frame, face, smaller, truth, offset).all()
+    claimed = completion_data._claimed(frame, face, half, truth, offset)
+    assert claimed[:5].all()
+    assert not claimed[5:].any()
 
 
 @pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT, *FURTHER])
