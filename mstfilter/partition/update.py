@@ -122,8 +122,8 @@ class PartitionUpdate(Update):
         T. Partitions of a component have probabilities in proportion to P^(1/T), where P is their probability by the
         pairs. A higher T makes the probabilities more even.
     occupied_log_odds : float
-        Added to the log odds of every uncertain voxel, since the network is calibrated for its training scenes. The
-        value was fitted in `experiments/partition_fit`.
+        Added to the log odds of every uncertain voxel, for completers whose probabilities are too low or too high.
+        `experiments/partition_fit` fits it.
     evidence : tuple of Evidence
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
@@ -150,7 +150,7 @@ class PartitionUpdate(Update):
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
     temperature: PositiveFloat = 1.0
-    occupied_log_odds: Annotated[float, Bounds()] = 0.6
+    occupied_log_odds: Annotated[float, Bounds()] = 0.0
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: NonNegativeFloat = 3.0
     n_candidates: NonNegativeInt = 0
