@@ -10,8 +10,8 @@ have one to three earlier views of the whole object (`mstfilter.completion.obser
 moved: from other cameras, with a small error of the motion since then, and some of them without some other objects.
 
 The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
-point lies in the mask. Narrow strips beside the mask do not count (`_claimed`). So a whole object gets all its voxels,
-the masks of two halves share them, and a mask of two objects gets both.
+point lies in the mask. Narrow strips beside the mask do not count (`_claimed`). So a whole object gets all its
+voxels, the masks of two halves share them, and a mask of two objects gets both.
 """
 
 from __future__ import annotations
