@@ -123,8 +123,8 @@ class PartitionUpdate(Update):
         T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
         cells. A higher T makes the probabilities more even.
     occupied_log_odds : float
-        Added to the log odds of every uncertain voxel, for completers whose probabilities are too low or too high.
-        `experiments/partition_fit` fits it.
+        Added to the log odds of every uncertain voxel. The completion network is calibrated only for its training
+        scenes, so the default was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
@@ -151,7 +151,7 @@ class PartitionUpdate(Update):
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
     temperature: PositiveFloat = 1.0
-    occupied_log_odds: Annotated[float, Bounds()] = 0.0
+    occupied_log_odds: Annotated[float, Bounds()] = 0.3
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: NonNegativeFloat = 3.0
     n_candidates: NonNegativeInt = 0
