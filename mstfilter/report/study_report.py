@@ -189,7 +189,7 @@ def _costs(summary: Summary) -> dict[str, Any]:
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Name of each arm, and the fields in which the configuration of the arm differs from the reference."""
+    """Each arm, and the fields in which the arm's configuration differs from the reference."""
     flat = {arm["name"]: flatten(arm["config"]) for arm in description["arms"]}
     base = flat[description["reference"]]
     found = []

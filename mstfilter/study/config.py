@@ -93,7 +93,7 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset with changes. Values that are separated by commas give one filter each."""
+    """A filter to compare: a preset with changes. Comma-separated values give one filter each."""
 
     preset: Texts = ("mst",)  #: names, or paths of TOML files
     set: Texts = ()  #: ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms
@@ -178,7 +178,7 @@ def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
-    """The arms of a study. Values that are separated by commas, also in `overrides`, give one arm each."""
+    """The arms of a study. Comma-separated values, also in `overrides`, give one arm each."""
     for entry in study.arms:
         yield from _expand(entry, study.folder, overrides)
 

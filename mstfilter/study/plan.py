@@ -96,7 +96,7 @@ class Plan:
 def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after the changes of the arm. Values separated by commas give one arm each.
+    `overrides` are applied to every arm after the changes of the arm. Comma-separated values give one arm each.
     Raises InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()

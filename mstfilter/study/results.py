@@ -168,7 +168,7 @@ class StudyFolder:
 
     @property
     def truth_users(self) -> dict[str, list[str]]:
-        """Classes of the components that use the ground truth, for each arm with such components."""
+        """Mapping from arms to the classes of their components that use the ground truth."""
         return {arm["name"]: arm["uses_truth"] for arm in self.description["arms"] if arm["uses_truth"]}
 
     def run(self, folder: str) -> Path:

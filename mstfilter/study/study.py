@@ -67,7 +67,7 @@ def run_study(
     executor : Executor, optional
         By default, one process for each core of this machine.
     overrides : sequence of str
-        Overrides for every arm. Values with commas give one arm each.
+        Overrides for every arm. Comma-separated values give one arm each.
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. By default, the user's cache folder.
     progress : bool or callable
