@@ -1,7 +1,7 @@
 """Quality and processor time of `mst` on images of 1440 x 1080 pixels, in full size and reduced to 410,000 pixels.
 
 python experiments/full_size/large_images.py            # 20 minutes of one core; prints a line per run
-python experiments/full_size/large_images.py --smoke    # one small scene: shows only that it works
+python experiments/full_size/large_images.py --small    # one small scene: shows only that it works
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ def filtered(recording: Recording, seed: int, max_pixels: int) -> tuple[float, f
     return float(np.mean(quality)), seconds
 
 
-def main(smoke: bool) -> None:
-    size = {"width": 200, "height": 150, "n_actions": 1} if smoke else {"width": 1440, "height": 1080, "n_actions": 3}
-    for family in ("demo",) if smoke else ("s1", "s2"):
+def main(small: bool) -> None:
+    size = {"width": 200, "height": 150, "n_actions": 1} if small else {"width": 1440, "height": 1080, "n_actions": 3}
+    for family in ("demo",) if small else ("s1", "s2"):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / family
             simulate_recording(replace(scene_family(family), **size), 44, path)
             recording = mstfilter.open_recording(path)
-            for seed in range(1 if smoke else 3):
-                full, reduced = (filtered(recording, seed, n) for n in (0, 20_000 if smoke else WORKING_PIXELS))
+            for seed in range(1 if small else 3):
+                full, reduced = (filtered(recording, seed, n) for n in (0, 20_000 if small else WORKING_PIXELS))
                 print(
                     f"{family} seed {seed}: quality {full[0]:.3f} full, {reduced[0]:.3f} reduced; "
                     f"{full[1]:.0f} s full, {reduced[1]:.0f} s reduced",
@@ -51,5 +51,5 @@ def main(smoke: bool) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true")
-    main(parser.parse_args().smoke)
+    parser.add_argument("--small", action="store_true")
+    main(parser.parse_args().small)

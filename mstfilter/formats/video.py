@@ -33,7 +33,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.fields import NonNegativeInt
+from mstfilter.fields import Bounded, NonNegativeInt
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
     WORKING_PIXELS,
@@ -268,7 +268,7 @@ def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: floa
 
 
 @dataclass(frozen=True)
-class VideoFormat(RecordingFormat):
+class VideoFormat(RecordingFormat, Bounded):
     """A layout of RGB-D videos on disk.
 
     Parameters

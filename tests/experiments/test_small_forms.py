@@ -123,6 +123,10 @@ def test_families(tmp_path):
     assert read_csv(tmp_path / "counts.csv")[0]["median_pixels"] == "1.5"
 
 
+def test_large_images():
+    assert "s full, " in run_script("full_size/large_images.py", "--small")
+
+
 def test_full_size(tmp_path):
     assert "peak_GiB: mst" in run_script("full_size/run.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "full_size.csv")
