@@ -5,7 +5,7 @@
 >>> write_study_report("studies/first")                              # doctest: +SKIP
 
 `overlay` and `voxel_picture` draw a hypothesis. `assign_identities` gives an object the same colour in all pictures
-of a run. A report is made from the folder of a run or a study alone, and loads no user code.
+of a run. A report reads only the folder of a run or a study, and loads no user code.
 """
 
 from mstfilter.lazy import attach

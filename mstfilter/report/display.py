@@ -6,7 +6,7 @@
 >>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
 
 Classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.belief` have methods `plot`, `show` and `_repr_html_`,
-which import the module when they are called (`mstfilter.lazy.late`). Pages load nothing from a network.
+which import this module when they are called (`mstfilter.lazy.late`). HTML pages load nothing from a network.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
 
 
 def to_html(value: Any) -> str:
-    """HTML of an object of the package for a notebook: its text, and pictures or a table of steps."""
+    """HTML that shows an object of the package in a notebook: text, and pictures or a table of steps."""
     text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
     style = "display:inline-block;margin:4px 8px 4px 0"
     cells = [

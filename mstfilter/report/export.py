@@ -59,9 +59,9 @@ def object_mesh(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndar
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
     """Write the mesh of a hypothesis with at least one object, in world metres, to a ply or obj file.
 
-    The triangles are the faces of the voxels. The mesh of an object encloses exactly the volume of its voxels.
-    `colours` is ``{label: (r, g, b)}``. The default is the palette in order of labels. Raises MissingLibraryError if
-    open3d cannot be imported.
+    The triangles are the outer faces of the objects. The mesh of an object encloses exactly the volume of its voxels.
+    `colours` is ``{label: (r, g, b)}``. By default, the colours of the palette are used in order of labels. Raises
+    MissingLibraryError if open3d cannot be imported.
     """
     path, o3d = Path(path), import_open3d()
     mesh = o3d.geometry.TriangleMesh()

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Colours of the style file that a page replaces by its own, which follow a light or a dark theme.
 _INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#1d2126", "#646b74", "#e1e2e0", "#2f6db4", "#b26a1c"
-#: Colours of arms.
+#: Colours of the compared methods (arms).
 SERIES = (
     *("#336fb9", "#ee9138", "#2ca281", "#93285c", "#a3d3eb", "#e8d34f"),
     *("#d381d8", "#8b8f86", "#4f4100", "#502684", "#70d6b5", "#a95317"),
@@ -102,7 +102,7 @@ def _merge_styles(match: re.Match[str]) -> str:
 
 
 def _keep_font_size(match: re.Match[str]) -> str:
-    """Keep the size of a ``font`` shorthand and drop the family."""
+    """Keep the size of a CSS ``font`` shorthand and remove the font family."""
     size = re.search(r"([\d.]+)px", match[0])
     return "" if size is None else f"font-size: {size[1]}px;"
 
@@ -121,7 +121,7 @@ def quality_figure(
     compared: Mapping[str, Sequence[float]],
     baselines: Mapping[str, Sequence[float]],
 ) -> str:
-    """Quality of every hypothesis (points, area by weight), mean and compared runs (lines), baselines (dashed).
+    """Quality of hypotheses (points, area by weight), mean and compared runs (lines) and baselines (dashed lines).
 
     `times` are the indices of the pauses with ground truth. `qualities` and `weights` have one value per hypothesis
     for each pause. `compared` and `baselines` have one value per pause for each name. NaN means no value.
@@ -154,7 +154,7 @@ def _arm_colours(arms: Sequence[str]) -> dict[str, str]:
 
 
 def figure_groups(arms: Sequence[str], reference: str) -> list[list[str]]:
-    """Arms of each figure: one figure for up to twelve arms, else figures of the reference and seven other arms."""
+    """Split `arms` into figures: up to twelve arms in one figure, or else the reference and seven others in each."""
     if len(arms) <= _MOST:
         return [list(arms)]
     others, first = [arm for arm in arms if arm != reference], [reference] if reference in arms else []
@@ -171,10 +171,10 @@ def time_figure(
     """Quality of all hypotheses, or another measure of the runs, over time, with one panel per family.
 
     `values` is family -> arm -> pause -> values. A pause has one value for each scene and seed, or for each
-    hypothesis. `arms` gives the order of the boxes (see `figure_groups` for many arms). Arms without values are
-    omitted. An arm has the same colour in all figures with the same `every_arm`, if `every_arm` has at most twelve
-    arms. A box contains the middle half of the values, the bar is the median, and whiskers reach the 5th and 95th
-    percentile. Points are values, and lines join the means.
+    hypothesis. `arms` names the compared methods in the order of their boxes (`figure_groups` splits long lists).
+    Methods without values are not drawn. A method has the same colour in all figures with the same `every_arm` of at
+    most twelve names. A box contains the middle half of the values, the bar is the median, and whiskers reach the 5th
+    and 95th percentile. Points are values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)
@@ -218,7 +218,7 @@ def _columns(names: Iterable[str]) -> int:
 def _boxes(
     axes: Axes, at: Mapping[int, float], by_pause: Mapping[int, Sequence[float]], width: float, colour: str
 ) -> None:
-    """Draw a box and the points of each pause."""
+    """Draw a box and points for the values of each pause."""
     for t, x in at.items():
         q = np.sort(np.asarray(by_pause[t]))
         # Points are spread horizontally, in an order that does not depend on their height.
@@ -270,7 +270,7 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
 def differences_figure(
     differences: Sequence[tuple[str, str, Difference]], arms: Sequence[str], reference: str, measure: str, side: str
 ) -> str:
-    """Differences of a measure between arms and the reference, with t intervals, by family.
+    """Differences of a measure between compared methods and the reference, with t intervals, by family.
 
     An entry of `differences` is (family, arm, arm minus reference). `arms` lists all compared methods, in the order
     of the colours. `side` is the side of zero on which the reference is better, "left" or "right".
@@ -296,7 +296,7 @@ def forest_height(rows: Sequence[ForestRow]) -> float:
 
 
 def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
-    """Draw differences with intervals below each other, under the names of the groups that have a name."""
+    """Draw each difference with its interval on a line, below the name of its group if the group has a name."""
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x")
     axes.axvline(0, color=_MUTED, lw=1.0)

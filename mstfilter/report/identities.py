@@ -5,9 +5,9 @@
 >>> identities.colours(t, k)                        # {label: (r, g, b)}
 
 Each hypothesis numbers its objects independently. Within a pause, objects are matched by the overlap of their voxels.
-From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. An object without a
-known parent is matched by its overlap with the last pause. Objects of the ground truth, if known, are matched first,
-and each label of the truth keeps its identity. Identities are used only for display and affect no score.
+From pause to pause, an object is matched by its stable id if its hypothesis has a known parent. Without a known
+parent, an object is matched by overlap with objects of the last pause. Objects of the ground truth, if known, are
+matched first, and each true label keeps its identity. Identities are used only for display and affect no score.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class _Assignment:
         parents: Sequence[int] | None,
         truth: np.ndarray | None,
     ) -> None:
-        """Add the truth of a pause, and then its hypotheses in order of weight."""
+        """Add the ground truth of pause `t`, and then the hypotheses of this pause in order of weight."""
         self._before, self._now = self._now, []
         if truth is not None:
             labels = np.flatnonzero(np.bincount(truth.ravel(), minlength=1)[1:]) + 1
@@ -142,7 +142,7 @@ class _Assignment:
 
 
 def _overlaps(labels: np.ndarray, image: np.ndarray, objects: list[int], n: int) -> np.ndarray:
-    """Jaccard indices (len(objects), n) of objects and identities."""
+    """Jaccard indices (len(objects), n) of the voxels of `objects` and of n identities."""
     table = overlap(labels, image)
     jaccard = table.jaccard()
     out = np.zeros((len(objects), n))
@@ -160,13 +160,13 @@ def order_by_weight(weights: Sequence[float]) -> list[int]:
 
 
 def names_of(indices: Sequence[int]) -> str:
-    """Names of equal hypotheses, such as ``#0`` or ``#0, #3``. At most four hypotheses are named."""
+    """Names of identical hypotheses, such as ``#0`` or ``#0, #3``. At most four hypotheses are named."""
     more = len(indices) - 4
     return ", ".join(f"#{k}" for k in indices[:4]) + (f" and {more} more" if more > 0 else "")
 
 
 def weigh_distinct(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[tuple[tuple[int, ...], float]]:
-    """Indices and total weight of each group of equal hypotheses, from heavy to light."""
+    """Indices and total weight of each group of identical hypotheses, from heavy to light."""
     groups: dict[bytes, list[int]] = {}
     for k, h in enumerate(hypotheses):
         groups.setdefault(h.key, []).append(k)

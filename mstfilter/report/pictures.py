@@ -7,11 +7,11 @@
 ((51, 111, 185), (238, 145, 56))
 
 The first six colours of the palette were chosen by hand. Each further colour is the farthest from all earlier
-colours. The distance is the smallest Oklab distance in three kinds of vision: normal, protanopia and
+colours. The distance of two colours is their smallest Oklab distance in three kinds of vision: normal, protanopia and
 deuteranopia (Machado, Oliveira, Fernandes 2009, severity 1).
 
-Voxels are rendered by ray casting. The brightness of a face depends on its normal. Lines are drawn where objects or
-faces meet.
+Voxels are rendered by ray casting. The brightness of a face depends on its normal. Lines are drawn along the borders
+of objects and of faces.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _label_colours(labels: np.ndarray, colours: Mapping[int, Colour]) -> np.ndar
 def overlay_layer(
     labels: np.ndarray, colours: Mapping[int, Colour], *, scale: int = 1, fill: float = 0.42, line: int = 2
 ) -> np.ndarray:
-    """Overlay of a label image for any photo: translucent fill and opaque contours.
+    """A layer that shows a label image over a photo: translucent fill and opaque contours.
 
     `fill` is the opacity inside, and `line` is the width of the contour in pixels of the result. The result is (scale
     H, scale W, 4) uint8, RGBA, not premultiplied. Label 0 is transparent.
@@ -159,8 +159,8 @@ def viewpoint(
 ) -> Camera:
     """A camera that looks down obliquely at the occupied voxels of all volumes and shows all of them.
 
-    A volume is a hypothesis or (labels, grid). If no voxel is occupied, the view shows the middle of the workspace.
-    If `camera` is given, the view has the azimuth of `camera`, turned by 35 degrees.
+    A volume is a hypothesis or a pair (labels, grid). If no voxel is occupied, the view shows the middle of the
+    workspace. If `camera` is given, the view has the azimuth of `camera`, turned by 35 degrees.
     """
     points, grid = _occupied_points(volumes)
     if len(points) == 0:
@@ -233,7 +233,7 @@ def _normals(points: np.ndarray, rays: np.ndarray, grid: VoxelGrid) -> np.ndarra
 
 
 def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels where the face changes within an object, and pixels where the object changes."""
+    """Pixels on the borders of faces within an object, and pixels on the borders of objects."""
     crease, border = np.zeros(hit.shape, bool), np.zeros(hit.shape, bool)
     for axis in (0, 1):
         a = [slice(None)] * 2
@@ -248,7 +248,7 @@ def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.nd
 
 
 def _table(view: Camera) -> np.ndarray:
-    """The plane z = 0 as (H, W, 4) float: translucent grey, a line every 10 cm, transparent at the border."""
+    """Picture (H, W, 4) float of the plane z = 0: translucent grey, a line every 10 cm, transparent at the border."""
     rays = view.rays() @ view.pose.rotation.as_matrix().T
     below = rays[..., 2] < -1e-6
     along = np.where(below, -view.position[2] / np.where(below, rays[..., 2], -1), 0)
@@ -265,7 +265,7 @@ def _table(view: Camera) -> np.ndarray:
 
 
 def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Alpha composition of RGBA pictures (H, W, 4) float, as uint8."""
+    """Alpha composition of `front` over `back`, both RGBA pictures (H, W, 4) float, as uint8."""
     a, b = front[..., 3:] / 255, back[..., 3:] / 255
     alpha = a + b * (1 - a)
     rgb = (front[..., :3] * a + back[..., :3] * b * (1 - a)) / np.maximum(alpha, 1e-9)

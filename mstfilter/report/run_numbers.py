@@ -52,7 +52,7 @@ class PauseNumbers:
     n_distinct: int  #: number of distinct hypotheses
     metrics: Mapping[str, float] | None  #: of `mstfilter.scoring.pause_metrics`; None without ground truth
     in_image: float | None  #: mean quality of the outlines in the image; None without ground truth
-    image_score: PauseScore | None  #: scores in the image, with floors; None with true volumes or without true image
+    image_score: PauseScore | None  #: scores in the image; None with true volumes or without true image
     compared: Mapping[str, float]  #: mean quality of the compared runs, where it is known
     compared_losses: Mapping[str, float]  #: log loss of the compared runs in nats, where it is known
     belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
@@ -106,11 +106,11 @@ class PauseNumbers:
         return None if self.quality is None else max(self.quality)
 
     def parents(self, kind: str) -> list[int] | None:
-        """Parents of a `kind`, ``"previous"`` or ``"proposed"``; None if the run has not recorded parents."""
+        """Parent of each hypothesis, of `kind` ``"previous"`` or ``"proposed"``; None if parents are not recorded."""
         return self.info["parents"].get(kind)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
-        """Notes of a component, without notes that an earlier component has with the same value."""
+        """Extra values that a component stored, without identical values that an earlier component stored."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
         earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
         return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
@@ -130,24 +130,24 @@ class RunNumbers:
 
     @cached_property
     def slots(self) -> list[str]:
-        """Slots with times or notes, in the order of a step."""
+        """Names of the components of the step that have times or extra values, in the order of the step."""
         used = {s for step in self.steps for s in (*step.seconds, *step.info["notes"])}
         return [s for s in SLOT_TITLES if s in used] + sorted(used - set(SLOT_TITLES))
 
     def component(self, slot: str) -> str:
-        """Name of the component of a slot; empty if unknown."""
+        """Name of the class that the run used for a component of the step; empty if unknown."""
         part = self.description["config"].get(slot)
         name = part.get("component", "") if isinstance(part, Mapping) else part
         return str(name).rsplit(":", 1)[-1] if name else ""
 
     @property
     def with_truth(self) -> list[int]:
-        """Pauses with known quality."""
+        """Indices of the pauses with known quality."""
         return [t for t, step in enumerate(self.steps) if step.quality is not None]
 
     @property
     def with_images(self) -> list[int]:
-        """Pauses with known quality in the image only."""
+        """Indices of the pauses for which only the quality in the image is known."""
         return [t for t, step in enumerate(self.steps) if step.image_score is not None]
 
     @property
@@ -157,7 +157,7 @@ class RunNumbers:
 
     @property
     def value_of_the_past(self) -> list[str]:
-        """A sentence that compares the filter with the latest image alone; empty if a score of either is unknown."""
+        """Whether the filter is better than the latest image alone, in a sentence; empty if a score is unknown."""
         name = "single frame"
         known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
         if not known:
@@ -177,7 +177,7 @@ class RunNumbers:
 
 
 def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
-    """The numerical results of a run folder. Without `beliefs` the log losses, which are slow, are omitted."""
+    """The numerical results of a run folder. `beliefs` adds the log losses, which take long to compute."""
     description = run.description
     times = description["recording"]["times"]
     steps = []
@@ -225,7 +225,7 @@ def read_numbers(run: RunFolder, beliefs: bool = True) -> RunNumbers:
 
 
 def _image_score(run: RunFolder, t: int) -> PauseScore | None:
-    """Scores of pause `t` in the image, in the form ``objects``; None without a true label image."""
+    """Scores of pause `t` in the image, with the ``objects`` quality; None without a true label image."""
     image = run.instance(t)
     if image is None:
         return None

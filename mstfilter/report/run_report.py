@@ -5,7 +5,7 @@
 
 The report is made from the folder of a finished or an interrupted run, and loads no user code. Pictures are embedded,
 figures are inline SVG, and there are no links. The only script rotates the three-dimensional view, in a frame that
-cannot access the rest of the page. The same run gives the same bytes, except for the times of steps.
+cannot access the rest of the page. A repeated run gives an identical file, except for the times of steps.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
 
 
 def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
-    """Pictures and numbers of equal hypotheses, or of the ground truth, for the template."""
+    """Pictures and numbers of a group of identical hypotheses, or of the ground truth, for the template."""
     # Small images are enlarged, so that contours are about as fine as on large ones.
     scale = max(1, round(960 / camera.width))
     return {
@@ -127,7 +127,7 @@ def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
-    """Number and widest place, in pixels, of each object that is large enough in the image; large objects first."""
+    """Number, and pixel at the widest part, of each object that is large enough in the image; large objects first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
     min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
@@ -170,7 +170,7 @@ def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
 
 
 def _part(numbers: RunNumbers, slot: str) -> dict[str, Any]:
-    """Notes and times of a component over all pauses."""
+    """Extra values and times of a component of the step, over all pauses."""
     return {
         "slot": slot,
         "title": SLOT_TITLES.get(slot, slot),

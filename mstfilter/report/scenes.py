@@ -32,7 +32,7 @@ class ShownHypothesis:
     hypothesis: Hypothesis
     identity: Mapping[int, int]  #: label -> identity, which sets the colour
     weight: float | None = None  #: None for the truth
-    colours: Mapping[int, Colour] = field(default_factory=dict)  #: in place of those of the identities
+    colours: Mapping[int, Colour] = field(default_factory=dict)  #: used instead of the colours of the identities
     quality: float | None = None
 
     def colour(self, label: int) -> Colour:
@@ -58,14 +58,14 @@ class ShownHypothesis:
 
 @dataclass(frozen=True)
 class ShownPause:
-    """The content of a pause."""
+    """The image and the hypotheses of a pause."""
 
     name: str
     views: Sequence[ShownHypothesis]
     time: float = 0.0
     image: np.ndarray | None = None
     camera: Camera | None = None
-    links: Sequence[tuple[int, int]] = ()  #: (view of the last pause, view) where one descends from the other
+    links: Sequence[tuple[int, int]] = ()  #: (view of the last pause, view) if the second descends from the first
     hidden: float = 0.0  #: weight of the hypotheses that are not shown
 
 

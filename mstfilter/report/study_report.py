@@ -161,7 +161,7 @@ def _drawn(
 
 
 def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str, Any]:
-    """Family -> arm -> pause -> values: quality of every hypothesis, or one value for each run."""
+    """Mapping family -> arm -> pause -> values. Values are qualities of all hypotheses, or one value for each run."""
     values: dict[str, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in records:
         of_row = row.get("qualities") if endpoint == "quality" else [row.get(endpoint)]
@@ -171,7 +171,7 @@ def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str,
 
 
 def _costs(summary: Summary) -> dict[str, Any]:
-    """Seconds by stage, core seconds and memory by family and arm; means over pauses."""
+    """Seconds of each stage, core seconds and memory, by family and arm, as means over pauses."""
     stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
     rows: list[dict[str, Any]] = []
     per = ("seconds_", "peak_mb")
@@ -189,7 +189,7 @@ def _costs(summary: Summary) -> dict[str, Any]:
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Each arm and the fields in which its configuration differs from the reference."""
+    """Each arm, and the fields in which the arm's configuration differs from the reference."""
     flat = {arm["name"]: flatten(arm["config"]) for arm in description["arms"]}
     base = flat[description["reference"]]
     found = []

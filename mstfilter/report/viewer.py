@@ -28,7 +28,7 @@ from mstfilter.scene import Hypothesis, Recording, occupied_box
 
 @dataclass(frozen=True)
 class ScenePage:
-    """A page with scenes that can be rotated. A notebook shows the page in place."""
+    """A page with scenes that can be rotated. A notebook shows the page below the cell."""
 
     text: str  #: HTML, self-contained
     title: str
@@ -40,7 +40,7 @@ class ScenePage:
         return self.frame(460)
 
     def frame(self, height: int) -> str:
-        """The page as a frame in another page, `height` pixels high. Scripts cannot access the other page."""
+        """The page as a frame in another page, `height` pixels high, without access to the other page."""
         style = f'width="100%" height="{height}" style="border:0" sandbox="allow-scripts"'
         return f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.text)}" {style}></iframe>'
 
@@ -135,7 +135,7 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
 
 
 def encode_runs(labels: np.ndarray) -> np.ndarray:
-    """Runs of equal labels in C order as rows (label, length), with 16 bits each. Long runs are split."""
+    """Run-length encoding of labels in C order: rows (label, length) with 16 bits each. Long runs are split."""
     flat = labels.ravel()
     if not len(flat):
         return np.zeros((0, 2), "<u2")

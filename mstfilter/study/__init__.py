@@ -5,9 +5,9 @@
 >>> result = run_study(study, Path("studies/main"), Local(workers=2))
 >>> result.folder.summary().compared()[0].words
 
-`run_study` plans the runs (every arm on every scene with every seed). An executor (`Local`, or an executor of the
-user) makes the missing runs. Then `run_study` writes the tables of the study folder. Each run is a
-`mstfilter.runs.RunFolder`.
+`run_study` plans the runs: every arm (configuration of the filter) on every scene with every seed. An executor
+(`Local`, or an executor of the user) makes the missing runs. Then `run_study` writes the tables of the study folder.
+Each run is a `mstfilter.runs.RunFolder`.
 """
 
 from mstfilter.lazy import attach

@@ -93,7 +93,7 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset with changes. Values with commas give one filter each."""
+    """A filter to compare: a preset with changes. Comma-separated values give one filter each."""
 
     preset: Texts = ("mst",)  #: names, or paths of TOML files
     set: Texts = ()  #: ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms
@@ -142,7 +142,7 @@ def load_study(path: str | Path, *, smoke: bool = False) -> StudyConfig:
 
 
 def study_of(data: dict[str, Any], where: str = "study") -> StudyConfig:
-    """A study from plain values."""
+    """A study from plain values, such as the content of a TOML file."""
     try:
         return StudyConfig(**data)
     except ValidationError as error:
@@ -158,7 +158,7 @@ def study_of(data: dict[str, Any], where: str = "study") -> StudyConfig:
 
 @dataclass(frozen=True)
 class ArmRequest:
-    """An arm before its filter is built."""
+    """An arm (configuration of the filter) before the filter is built."""
 
     name: str
     preset: str  #: name or path
@@ -171,14 +171,14 @@ class ArmRequest:
 
 
 def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
-    """Raise InputError if an arm names an unknown preset or component; imports no component."""
+    """Raise InputError if an arm names an unknown preset or component. Components are not imported."""
     for request in expand_arms(study, overrides):
         with naming(f"arm {request.name!r}"):
             request.config()
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
-    """The arms of a study, with grids expanded. Values with commas in `overrides` give one arm each."""
+    """The arms of a study. Comma-separated values, also in `overrides`, give one arm each."""
     for entry in study.arms:
         yield from _expand(entry, study.folder, overrides)
 

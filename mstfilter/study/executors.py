@@ -42,7 +42,7 @@ class Executor(Bounded, ABC):
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
         Jobs start in the order of `jobs`, except that jobs with the same ``share`` go to the same worker if possible.
-        `tell` is called in the calling thread. An exception in `tell` stops all jobs.
+        `tell` is called in the thread that called `run`. An exception in `tell` stops all jobs.
         """
 
 
@@ -98,7 +98,7 @@ class _LocalRun:
         return [self._outcomes[k] for k in range(len(self._jobs))]
 
     def _next_job(self, worker: _Worker) -> int | None:
-        """The next job of a worker: from its last share, else from a share of no other worker, else the first job."""
+        """The next job: of the worker's last ``share``, else of a ``share`` without a worker, else the first."""
         other_shares = {share for other, share in self._share_of.items() if other is not worker}
 
         def rank(k: int) -> tuple[bool, bool]:
@@ -137,7 +137,7 @@ class _LocalRun:
 
 
 class _Worker:
-    """One process. The first job starts the process, and a job after its death starts the process again."""
+    """A worker process. The first job starts the process. If the process dies, the next job starts a new process."""
 
     def __init__(self, number: int, logs: Path | None) -> None:
         self._log = None if logs is None else logs / f"worker-{number}.log"

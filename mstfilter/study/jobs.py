@@ -4,8 +4,8 @@
 JobOutcome(status='done')
 
 A job is a mapping of plain values, so that a process on another machine can run it. The folder of a run is written
-under a temporary name and renamed when the run is complete. So two workers with the same run do not disturb each
-other, and the remains of a killed worker are never used as a result.
+under a temporary name and renamed when the run is complete. So two workers can make the same run, and an incomplete
+folder of a killed worker is never used as a result.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _failure(error: BaseException) -> JobOutcome:
 
 
 def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
-    """The recording of a scene. A simulated recording is made if it is missing."""
+    """The recording of a scene. A missing recording of a simulated scene is made first."""
     if "path" in source:
         return open_recording(Path(source["path"]), source["format"], source["options"], source["pauses"])
     from mstfilter.simulation import cached_recording
@@ -118,7 +118,7 @@ def _run(job: Job) -> None:
 
 
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
-    """The metrics of each pause of a run. The counts of the run's forecasts are written into its folder."""
+    """Return the metrics of each pause of a run, and write the counts of the forecasts into the folder of the run."""
     measured = [
         measure_pause(
             recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)

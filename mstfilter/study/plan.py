@@ -4,9 +4,9 @@
 >>> [run.name for run in plan.runs]
 
 The identity of a run is a hash of its configuration, its recording, its seed, the files of mstfilter and of the user,
-and the versions of the libraries. For a simulated recording, the recipe is hashed. For other recordings, the content
-and the ground truth are hashed. A run is not repeated if its identity has not changed. Equal runs have equal
-identities.
+and the versions of the libraries. For a simulated recording, the family, the seed and the version of the simulator
+are hashed. For other recordings, the content and the ground truth are hashed. A run is not repeated if its identity
+has not changed.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ class Plan:
 def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after its own changes; values with commas give one arm each. Raises
-    InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
+    `overrides` are applied to every arm after the changes of the arm. Comma-separated values give one arm each.
+    Raises InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()
@@ -159,7 +159,7 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
 
 
 def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
-    """Put the group before a name if several scenes have the name."""
+    """Put the group of a scene before the name of the scene if several scenes have the same name."""
     count = Counter(scene.name for scene in scenes)
     return tuple(replace(s, name=f"{s.group}-{s.name}") if count[s.name] > 1 else s for s in scenes)
 

@@ -79,7 +79,7 @@ class _Cost(BaseModel, extra="allow"):
 
 
 class _Result(BaseModel):
-    """The parts of result.json that readers use. A failed run has a result without rows."""
+    """The fields of result.json that readers use. A failed run has a result without rows."""
 
     status: str
     identity: str
@@ -117,7 +117,7 @@ class _StudyRun(BaseModel):
 
 
 class _Study(BaseModel):
-    """The parts of study.json that readers use."""
+    """The fields of study.json that readers use."""
 
     format: int
     name: str
@@ -168,11 +168,11 @@ class StudyFolder:
 
     @property
     def truth_users(self) -> dict[str, list[str]]:
-        """Mapping from arms that use the ground truth to the classes of the components that use it."""
+        """Mapping from arms to the classes of their components that use the ground truth."""
         return {arm["name"]: arm["uses_truth"] for arm in self.description["arms"] if arm["uses_truth"]}
 
     def run(self, folder: str) -> Path:
-        """A run's folder."""
+        """Path of the folder of a run, from its name."""
         return self.path / "runs" / folder
 
     def write_failure(self, folder: str, identity: str, outcome: JobOutcome) -> None:
@@ -206,8 +206,8 @@ class StudyFolder:
     def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
         """Add the recalibrated log loss to rows, in place.
 
-        The forecasts of a scene are recalibrated on the other scenes of its family and arm. All filter seeds of a
-        scene are left out together.
+        The forecasts of a scene are recalibrated on the other scenes of its family and arm. No filter seed of a scene
+        is used to recalibrate this scene.
         """
         groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
@@ -280,7 +280,7 @@ def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]
 
 
 def cost_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Columns of time and memory. All other columns are the same if the same study runs again."""
+    """Columns of time and memory. All other columns are identical if the same study runs again."""
     return [c for c in _columns(rows) if c == "core_seconds" or c.startswith(("seconds", "peak_mb"))]
 
 

@@ -67,11 +67,11 @@ def run_study(
     executor : Executor, optional
         By default, one process for each core of this machine.
     overrides : sequence of str
-        Overrides for every arm. Values with commas give one arm each.
+        Overrides for every arm. Comma-separated values give one arm each.
     cache : Path, optional
         Folder of simulated recordings and of intermediate results. By default, the user's cache folder.
     progress : bool or callable
-        True shows progress bars; a function is called whenever a job ends or loses its worker.
+        True shows progress bars. A function is called with a `StudyProgress` when a job ends or loses its worker.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _prepare(folder: StudyFolder, cache: Path, description: dict[str, Any]) -> N
 
 @dataclass(frozen=True)
 class _Call:
-    """One call of `run_study`: gives jobs to the executor and records failures."""
+    """One call of `run_study`, which gives jobs to the executor and records failures."""
 
     plan: Plan
     folder: StudyFolder
@@ -176,7 +176,7 @@ class _Call:
         return self._job("run", run.name, run.scene, more)
 
     def _counter(self, what: str, jobs: Sequence[Job], done: int, total: int, failed: int) -> Tell:
-        """A function that turns the outcomes of jobs into progress."""
+        """A function that reports the outcome of each job as a `StudyProgress`."""
 
         def count(k: int, outcome: JobOutcome | None) -> None:
             nonlocal done, failed
@@ -191,7 +191,7 @@ class _Call:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[StudyFolder]:
-    """Lock the study folder, which need not exist, for this process. Remains of killed processes are removed."""
+    """Lock the study folder, which need not exist, for this process. Files of killed processes are removed."""
     with locked(path):
         try:
             sweep(path)

@@ -6,8 +6,8 @@
 The two primary endpoints are means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality of the
 hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats, after recalibration
 on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the same pauses.
-Values are averaged over filter seeds first, then over scenes. A difference is arm minus reference. The p values of
-both endpoints are adjusted together.
+Values are averaged over filter seeds first, then over scenes. A difference is the value of an arm minus the value of
+the reference. The p values of both endpoints are adjusted together.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def title_of(metric: str) -> str:
 
 
 def bounds_of(metric: str) -> tuple[float, float]:
-    """The least and the largest value of a metric. Slopes are not bounded."""
+    """The least and the largest possible value of a metric. Slopes are not bounded."""
     if metric.endswith("_slope"):
         return -np.inf, np.inf
     return 0.0, 1.0 if metric.startswith(_SHARES) else np.inf
@@ -132,7 +132,7 @@ class Summary:
         return None
 
     def compared(self, name: str = "quality") -> list[Compared]:
-        """Differences of a metric."""
+        """Differences of all arms from the reference in a metric."""
         return [one for one in self.differences if one.metric == name]
 
     def is_better(self, family: str, arm: str) -> bool:
@@ -186,8 +186,8 @@ def summarise(
     reference : str
         The arm with which the other arms are compared.
     cost : sequence of str
-        Columns of time and memory. The columns are averaged over all pauses, and arms are not compared. A missing
-        stage counts as 0 seconds. The first of several filter seeds is omitted, because its run fills the cache.
+        Columns of time and memory. These columns are averaged over all pauses and have no comparisons of arms. A
+        missing stage counts as 0 seconds. The first of several filter seeds is omitted: its run fills the cache.
     reported_only : collection of str
         Arms that are not part of the comparisons.
     """
@@ -253,7 +253,7 @@ def _by_scene(
     names: Sequence[str],
     of_run: Callable[[np.ndarray, np.ndarray], float] = lambda pauses, values: float(np.mean(values)),
 ) -> _Values:
-    """(family, arm, metric) -> scene -> mean over seeds of ``of_run(pauses, values)``; NaN is left out."""
+    """Mapping (family, arm, metric) -> scene -> mean over seeds of ``of_run(pauses, values)``, without NaN."""
     runs: dict[tuple[str, str, str, str, Any], list[tuple[int, float]]] = defaultdict(list)
     for row in rows:
         for name in names:
