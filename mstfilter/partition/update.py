@@ -151,7 +151,7 @@ class PartitionUpdate(Update):
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
     temperature: PositiveFloat = 1.0
-    occupied_log_odds: Annotated[float, Bounds()] = 0.3
+    occupied_log_odds: Annotated[float, Bounds()] = 0.6
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: NonNegativeFloat = 3.0
     n_candidates: NonNegativeInt = 0
