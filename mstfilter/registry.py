@@ -152,8 +152,8 @@ class Registry:
     ) -> Any:
         """A component from its name, or from a mapping with ``component`` and fields.
 
-        A mapping without ``component`` changes fields of `default`. Messages name `where`, the path in the
-        configuration. With `allow_files`, ``./file.py:Class`` is loaded.
+        A mapping without ``component`` changes fields of `default`. Error messages contain `where`, the path of the
+        component in the configuration. With `allow_files`, ``./file.py:Class`` is loaded.
         """
         where = where or kind
         if isinstance(spec, str):

@@ -247,7 +247,7 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
     tables : mapping
         Mapping from names of methods or families to their forecasts.
     arms : sequence of str
-        Names in the order of their colours. The default is the names of `tables`.
+        Names of the curves; the first name has the first colour. The default is the names of `tables`.
     """
     colours = _arm_colours(arms or list(tables))
     with _style("reliability"):

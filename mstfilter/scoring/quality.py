@@ -169,8 +169,8 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
     t : int
         Number of the pause.
     min_pixels : float
-        Least number of pixels of a shown object in an image of 640 x 480 pixels. The least number scales with the
-        area of the image.
+        An object with at least this number of pixels in an image of 640 x 480 pixels counts as shown. The number
+        scales with the area of the image.
 
     Raises
     ------

@@ -15,9 +15,9 @@ table, or up to 10 cm behind a reading along the camera's z axis, at pause t or 
 question is uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels
 of u.
 
-**Noise.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns the
-forecasts of the hypotheses with noise. With probability e, each voxel independently takes the label of one of its six
-neighbours. Only voxels at a border change. The expectation over the noise is computed exactly:
+**Noise.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns forecasts for labels
+with noise. With probability e, each voxel independently takes the label of one of its six neighbours. Only
+voxels at a border change. The expectation over the noise is computed exactly:
 
     ``p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]``
 

@@ -81,7 +81,8 @@ class _Checked(Distribution):
     """A distribution that checks its parameters, which are its fields.
 
     Scalar parameters are checked when the distribution is made. Arrays are checked at the same time unless `lazy` is
-    True. Lazy arrays are checked when the distribution is sampled; the log density of a row out of range is NaN.
+    True. Lazy arrays are checked when the distribution is sampled. The log density of a row with invalid parameters
+    is NaN.
     """
 
     draws_numbers = True

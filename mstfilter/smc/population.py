@@ -328,8 +328,8 @@ class Population:
     def traced_through(self, resampled: Population | None) -> Population:
         """The same particles, with parents in the population from which `resampled` was selected.
 
-        ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, the indices are converted to
-        indices into the population before the resampling. The field `notes` of the result is empty.
+        ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, each index is replaced by
+        the index of the ancestor before this resampling. The field `notes` of the result is empty.
         """
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         index = self.parents.get("previous")

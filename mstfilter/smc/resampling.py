@@ -288,7 +288,7 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and the indices are partly sorted.
+    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and the order of the indices is not random.
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
