@@ -78,7 +78,7 @@ def test_the_package_does_not_grow():
     assert len(FILES) <= 175
     smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
     smc = [path for path in smc if not path.is_relative_to(PACKAGE / "smc" / "testing")]  # contracts
-    assert n_lines(smc) <= 7_222
+    assert n_lines(smc) <= 7_223
     assert len({path if path.parent.name == "smc" else path.parent for path in smc}) <= 24  # programs/ is one
     assert max(n_lines([path]) for path in FILES) <= 490
 
