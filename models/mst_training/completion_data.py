@@ -10,8 +10,8 @@ have one to three earlier views of the whole object (`mstfilter.completion.obser
 moved: from other cameras, with a small error of the motion since then, and some of them without some other objects.
 
 The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
-point lies in the mask. Narrow strips beside the mask do not count (`_claimed`). So a whole object gets all its
-voxels, the masks of two halves share them, and a mask of two objects gets both.
+point lies in the mask. So a whole object gets all its voxels, the masks of two halves share them, and a mask of two
+objects gets both.
 """
 
 from __future__ import annotations
@@ -57,7 +57,6 @@ class CompletionSamples(Samples):
     mask: np.ndarray  #: (n,) uint8, index in `MASK_KINDS`
     scene: np.ndarray  #: (n,) int32, number of the scene
     visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
-    earlier: np.ndarray  #: (n,) uint8, number of earlier views
 
     @classmethod
     def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
@@ -88,23 +87,14 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     for mask in _masks(rng, frame, instance):
         found = _sample(rng, frame, instance, mask, truth, earlier)
         if found is not None:
-            which, bits, signed, shape, k, n_known = found
-            rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k], n_known))
+            which, bits, signed, shape, k = found
+            rows.append((bits, signed, shape, world.shapes[k - 1].family, which, alone[k]))
     if not rows:
         return None
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    bits, signed, shapes, kinds, masks, visible, n_earlier = columns
+    bits, signed, shapes, kinds, masks, visible = columns
     scene = np.full(len(bits), index, np.int32)
-    return CompletionSamples(
-        bits,
-        signed,
-        shapes,
-        kinds,
-        masks.astype(np.uint8),
-        scene,
-        visible.astype(np.float32),
-        n_earlier.astype(np.uint8),
-    )
+    return CompletionSamples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
 
 
 class _Earlier(NamedTuple):
@@ -195,8 +185,8 @@ def _sample(
     mask: np.ndarray,
     truth: np.ndarray,
     earlier: Sequence[_Earlier],
-) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int, int] | None:
-    """Kind of mask, bits, distances, true shape, main object and number of views; None if it shows no object."""
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, int] | None:
+    """Kind of mask, bits, distances, true shape and main object of one mask; None if it shows no object."""
     counts = np.bincount(instance[mask & frame.valid], minlength=256)
     whole = np.bincount(instance[frame.valid], minlength=256)
     counts[0] = 0
@@ -217,7 +207,7 @@ def _sample(
         shape |= _claimed(frame, instance == k, mask, truth[box] == k, offset)
     index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
     bits, signed = (_padded(one) for one in encode_box(seen))
-    return index, bits, signed, _padded(shape), main, len(known)
+    return index, bits, signed, _padded(shape), main
 
 
 class _Crop(Extrude):
@@ -255,17 +245,8 @@ def _view(rng: np.random.Generator, rule: Completer, earlier: _Earlier, found: S
 def _claimed(
     frame: Frame, visible: np.ndarray, mask: np.ndarray, truth: np.ndarray, offset: np.ndarray
 ) -> np.ndarray:
-    """The voxels of an object, (a, b, c) bool in the box at `offset`, whose nearest visible point is in the mask.
-
-    Visible strips outside the mask that are at most two pixels wide are errors of the mask's border, not parts of the
-    object, so they claim nothing. The border is nearest to most of the hidden back: otherwise a mask whose border is
-    displaced by one pixel loses a third of the object.
-    """
-    import cv2
-
-    rest = (visible & frame.valid & ~mask).astype(np.uint8)
-    rest = cv2.morphologyEx(rest, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    pixels = np.flatnonzero(visible & frame.valid & (mask | (rest > 0)))
+    """The voxels of an object, (a, b, c) bool in the box at `offset`, whose nearest visible point is in the mask."""
+    pixels = np.flatnonzero(visible & frame.valid)
     inside = mask.ravel()[pixels]
     if inside.mean() > 0.95:
         return truth

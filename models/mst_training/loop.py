@@ -52,13 +52,11 @@ class Training(ABC):
     rate: float = 2e-3  #: largest learning rate; it falls to 0 along a cosine
     average: float = 0.999  #: decay of the moving average of the weights
     half_precision: bool = True  #: compute in bfloat16
-    start: str = ""  #: name or folder of a model whose weights are the start, widened by `widened`; none if empty
 
     #: Changes of the settings by name. "cpu" takes about four core hours, "smoke" shows that everything works.
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]]
     architecture: ClassVar[str]
     samples: ClassVar[type[Samples]]  #: what it is trained on
-    kinds: ClassVar[tuple[str, ...]] = TRAINED  #: of shapes in the training scenes
     losses: ClassVar[tuple[str, ...]]  #: names of the figures of `loss`
 
     @classmethod
@@ -153,7 +151,7 @@ def run_training(
     parts = {
         "validation": make(place / "validation", seed + 1, settings.n_validation, workers, TRAINED),
         "test": make(place / "test", seed + 2, settings.n_test, workers, TRAINED + HELD_OUT),
-        "train": make(place / "train", seed, settings.n_scenes, workers, settings.kinds),
+        "train": make(place / "train", seed, settings.n_scenes, workers, TRAINED),
     }
     run = _Run(settings, folder, torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
     validation = read(parts["validation"])
@@ -189,10 +187,6 @@ class _Run:
         self.settings, self.folder, self.device = settings, folder, device
         torch.manual_seed(settings.seed)
         self.networks = {name: network.to(device) for name, network in settings.networks().items()}
-        if settings.start:
-            narrow = open_model(settings.start, settings.architecture).tensors
-            net = self.networks["net"]
-            net.load_state_dict(widened({k: torch.from_numpy(v) for k, v in narrow.items()}, net.state_dict()))
         self.averaged = copy.deepcopy(self.networks["net"])
         self.parameters = [p for network in self.networks.values() for p in network.parameters()]
         self.optimiser = torch.optim.AdamW(self.parameters, lr=settings.rate, weight_decay=0.01)
@@ -264,26 +258,6 @@ class _Run:
             for mean, now in zip(self.averaged.parameters(), self.networks["net"].parameters(), strict=True):
                 mean.lerp_(now, 1 - decay)
         return np.array(figures)
-
-
-def widened(narrow: Mapping[str, Tensor], wide: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Weights with the shapes of `wide` that compute the same as `narrow`, with as many features or half as many.
-
-    Every feature is doubled, and the weights of the two copies share those of the feature unequally, so that the
-    copies learn different things (T. Chen, I. Goodfellow, J. Shlens, "Net2Net: accelerating learning via knowledge
-    transfer", 2016). The copies lie side by side, so they are in one group of the normalisation.
-    """
-    result = {}
-    for name, value in narrow.items():
-        shape = wide[name].shape
-        for axis in range(min(value.ndim, 2)):
-            if shape[axis] == 2 * value.shape[axis]:
-                value = value.repeat_interleave(2, dim=axis)
-                if axis == 1:
-                    share = 0.25 + 0.5 * torch.rand_like(value[:, ::2])
-                    value = value * torch.stack([share, 1 - share], dim=2).flatten(1, 2)
-        result[name] = value
-    return result
 
 
 def fit_calibration(logits: Tensor, outcomes: Tensor) -> tuple[float, float]:

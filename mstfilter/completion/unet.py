@@ -7,9 +7,9 @@ The input is a crop of the workspace's voxel grid (`mstfilter.completion.crops`)
 voxel. The residual blocks work at a half, a quarter and an eighth of the resolution. At the input and the output, 2 x
 2 x 2 voxels are packed as channels. A latent vector z scales and shifts the features at the two coarse levels (FiLM;
 Perez et al., "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). The vector z is the mode of a
-prior that depends on the input. The weights of the package were trained as a conditional variational autoencoder
-(Sohn, Lee and Yan, "Learning structured output representation using deep conditional generative models", NeurIPS
-2015).
+prior that depends on the input. In training, z is drawn from a posterior that also depends on the true shape. The
+network is a conditional variational autoencoder (Sohn, Lee and Yan, "Learning structured output representation using
+deep conditional generative models", NeurIPS 2015).
 
 `load_network` also loads a user's network: an `Architecture` with weights in a folder, or an ONNX file.
 """

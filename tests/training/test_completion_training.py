@@ -5,22 +5,20 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_erosion
 
 from mst_training import completion_data
-from mst_training.completion import CompletionTraining
+from mst_training.completion import CompletionTraining, divergence
 from mst_training.completion_data import CompletionSamples
-from mst_training.loop import run_training, widened
+from mst_training.loop import run_training
 from mst_training.scenes import draw_camera, draw_scene
-from mst_training.shapes import FURTHER, HELD_OUT, TRAINED, draw_training_shape
+from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from mstfilter.completion import NetworkCompleter
-from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, extruded
-from mstfilter.completion.unet import CompletionNet, load_network
+from mstfilter.completion.crops import extruded
+from mstfilter.completion.unet import LatentLaw
 from mstfilter.errors import InputError
 from mstfilter.files import read_csv
 from mstfilter.scene import Seen
@@ -74,23 +72,7 @@ def test_parts_of_an_object_share_its_voxels(samples):
     assert volume[samples.mask == 1].mean() < volume[samples.mask == 0].mean()
 
 
-def test_displaced_borders_take_nothing_from_an_object():
-    """A mask without the pixels of the border gets the whole object; a mask of one half gets that half."""
-    rows, columns = np.indices((30, 30)) * 0.005
-    points = np.stack([rows - 0.005 * 5, columns - 0.005 * 5, np.full_like(rows, 0.1)], axis=-1)  # the face above
-    frame = SimpleNamespace(valid=np.ones((30, 30), bool), points=points)
-    face = np.zeros((30, 30), bool)
-    face[5:25, 5:25] = True
-    truth = np.ones((10, 10, 10), bool)
-    offset = completion_data._GRID.index_of(np.array([0.0001, 0.0001, 0.0001]))
-    smaller, half = binary_erosion(face, iterations=2), face & (rows < 0.005 * 14.9)
-    assert completion_data._claimed(frame, face, smaller, truth, offset).all()
-    claimed = completion_data._claimed(frame, face, half, truth, offset)
-    assert claimed[:5].all()
-    assert not claimed[5:].any()
-
-
-@pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT, *FURTHER])
+@pytest.mark.parametrize("kind", [*TRAINED, *HELD_OUT])
 def test_shapes(kind):
     """Centred on the origin, of a size that fits a table; every drawn size differs."""
     shapes = [draw_training_shape(np.random.default_rng(k), kind) for k in range(20)]
@@ -154,11 +136,8 @@ def test_training_learns_resumes_and_is_used(files, tmp_path):
     for inside in (rule, ~rule & unknown):
         p = found.truth[inside].mean()
         loss -= inside.sum() * (p * np.log(p) + (1 - p) * np.log(1 - p)) / unknown.sum()
-    # The probabilities of extrusion are the best for these samples, and the network is calibrated on them.
-    network, boxes = load_network(str(tmp_path / "a")), [found.box(k) for k in range(len(found))]
-    p = np.concatenate([network.probabilities(boxes[k : k + BATCH], EDGE) for k in range(0, len(boxes), BATCH)])
-    right = np.where(found.truth, p, 1 - p)[unknown]
-    assert -np.log(right).mean() < loss
+    lines = [line.split(",") for line in (tmp_path / "a/curves.csv").read_text().split()]
+    assert float(lines[-1][lines[0].index("log_loss")]) < loss
     # The test samples are those of one scene. The IoU there changes with rounding: .31 to .36, for .39 to .41.
     # tests/completion/test_shipped.py compares the weights of the package by IoU.
     assert figures["iou"] > 0.5 * figures["iou_extrude"]
@@ -186,25 +165,14 @@ def test_settings():
         CompletionTraining.recipe("fast")
 
 
-def test_a_widened_network_computes_the_same():
-    """And its copies of a feature have different weights."""
-    torch.manual_seed(0)
-    narrow, wide = (CompletionNet(len(CHANNELS), width, 4) for width in (8, 16))
-    torch.nn.init.normal_(narrow.head.weight)
-    wide.load_state_dict(widened(narrow.state_dict(), wide.state_dict()))
-    x = (torch.rand(2, len(CHANNELS), 16, 16, 16) > 0.6).float()
-    with torch.inference_mode():
-        assert torch.allclose(wide(x), narrow(x), atol=1e-4)
-    assert not torch.allclose(wide.fine.conv1.weight[0], wide.fine.conv1.weight[1])
+def test_divergence_of_normal_laws():
+    """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
+    torch.manual_seed(1)
+    a, b = (LatentLaw(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
+    x = a.mean + torch.randn(100_000, 3) * a.log_std.exp()
 
+    def log_density(law):
+        return (-0.5 * ((x - law.mean) * (-law.log_std).exp()) ** 2 - law.log_std).sum(dim=1)
 
-def test_training_starts_from_a_model(files, tmp_path):
-    """At a learning rate of zero, the result is the model."""
-    for name in ("train", "validation", "test"):
-        (tmp_path / f"a/samples/{name}").mkdir(parents=True)
-        shutil.copy(files[0], tmp_path / f"a/samples/{name}/scenes-000000.npz")
-    model = open_model("completion")
-    width, latent = (model.description["network"][name] for name in ("width", "latent"))
-    run_training(replace(SMALL, start="completion", width=width, latent=latent, rate=0.0, steps=1), tmp_path / "a")
-    for name, tensor in model.tensors.items():
-        assert np.allclose(open_model(str(tmp_path / "a")).tensors[name], tensor, atol=1e-6)
+    assert float(divergence(a, b)) == pytest.approx(float((log_density(a) - log_density(b)).mean()), abs=0.03)
+    assert float(divergence(a, a)) == 0
