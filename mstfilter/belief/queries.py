@@ -231,11 +231,11 @@ class Belief:
         return entropy
 
     def disagreement(self, camera: Camera) -> np.ndarray:
-        """Expected difference (H, W) of the objects that two hypotheses, drawn by weight, show at a pixel.
+        """Map (H, W) of the expected Jaccard distance between the objects that two hypotheses show at a pixel.
 
-        ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the object that hypothesis i shows at
-        the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an object at the pixel, and 0 if
-        only one hypothesis shows an object.
+        Both hypotheses are drawn by weight: ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the
+        object that hypothesis i shows at the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an
+        object at the pixel, and 0 if only one hypothesis shows an object.
         """
         refined = self._refined_image(camera)
         shared = refined.overlaps()
@@ -250,7 +250,7 @@ class Belief:
         return np.clip(1 - same, 0, 1)[refined.cells]
 
     def open_borders(self, camera: Camera, at_least: float = 0.05) -> list[Border]:
-        """Borders in the image across which the hypotheses disagree, with the most uncertain borders first.
+        """Borders in the image that separate two objects in some hypotheses only, the most uncertain first.
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
         between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label

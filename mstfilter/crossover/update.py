@@ -242,7 +242,7 @@ class _Child:
         return tuple(r if same else r.changed() for r, same in zip(records, unchanged, strict=True))
 
     def _heads(self) -> np.ndarray:
-        """The head (objects,) of each group: the largest predicted vertex, or else the largest proposed vertex."""
+        """The largest predicted vertex (objects,) of each group, or the largest proposed one if none is predicted."""
         side, size = self.graph.side.tolist(), self.graph.size.tolist()
         ranking = sorted(range(len(self.graph)), key=lambda v: (side[v], size[v], -v))
         head_of = {int(self.group[v]): v for v in ranking}  # the last one of a group counts

@@ -128,7 +128,10 @@ class Questions:
 
     @cached_property
     def _voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distinct voxels (k,), the index (2 m,) of each first and second voxel, and the neighbours (6, k)."""
+        """The k distinct voxels (k,) of the m pairs, and their six neighbours (6, k).
+
+        The second array has the index (2 m,) among them of all first voxels, then of all second voxels.
+        """
         voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
         return voxels, place, _neighbours(voxels, self.shape)
 

@@ -122,10 +122,10 @@ def filled_disparity(frame: Frame) -> np.ndarray:
 
 
 def curvature(disparity: np.ndarray, resize: float) -> tuple[np.ndarray, np.ndarray]:
-    """Strength x / (x + 2) of the concave and the convex curvature x of disparity (H, W).
+    """Two maps (H, W) of the strength of the concave and of the convex curvature of a disparity image (H, W).
 
-    Concave curvature is the largest eigenvalue of the Hessian. Convex curvature is minus the smallest eigenvalue.
-    `resize` is the image width / 640.
+    A curvature x has the strength x / (x + 2). Concave curvature is the largest eigenvalue of the Hessian. Convex
+    curvature is minus the smallest eigenvalue. `resize` is the image width / 640.
     """
     s = _blur(resize)
     smooth = cv2.GaussianBlur(disparity, (0, 0), s)

@@ -156,8 +156,9 @@ class AuthorsMoves(MoveRule):
     """The moves of the authors' program, including an error: the target distribution is not stationary.
 
     The choice is uniform over (node, direction). A move up is allowed for every node except the root. A move up
-    removes all nodes of the cut below the parent. The program takes 1 / (number of choices) as the forward
-    probability of a move up. But each sibling in the cut proposes the same move up, so merges are accepted too often.
+    replaces the nodes of the cut that are descendants of the parent by the parent. The program takes 1 / (number of
+    choices) as the forward probability of a move up. But each sibling in the cut proposes the same move up, so merges
+    are accepted too often.
     """
 
     def choose(self, random: Callable[[], float], state: CutState) -> tuple[int, bool] | None:

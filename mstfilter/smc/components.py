@@ -187,8 +187,8 @@ class Kld(Size):
     """KLD-sampling: the least n that bounds the error of the distribution over bins by `epsilon`.
 
     With k occupied bins, the bound is n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
-    size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` knows the
-    weight W_b of each bin and chooses the least n with n >= bound(sum_b 1 - (1 - W_b)^n). The sum is the expected
+    size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` uses the weight
+    W_b of each bin. It chooses the least n with n >= bound(k), where k = sum_b (1 - (1 - W_b)^n) is the expected
     number of bins that n draws occupy. The bound applies to any resampling scheme, and slightly exceeds Fox's n.
 
     Parameters

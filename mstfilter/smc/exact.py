@@ -69,7 +69,7 @@ def _matrices(
 
 
 def _varies(array: np.ndarray) -> dict[str, bool]:
-    """The parameters that `step_parameters` returns: ``t`` if the matrix changes with time."""
+    """The parameters that `step_parameters` returns: the time ``t`` if the matrix changes with time, else none."""
     return {"t": True} if array.ndim == 3 else {}
 
 

@@ -171,7 +171,7 @@ class _Job:
             return Collected(dict(collect(steps, **self.collectors)), "".join(lost))
 
     def history(self, found: Mapping[_Task, Collected], single: Mapping[str, str], has_arms: bool) -> History:
-        """The results of all runs. For a single filter, the axis "arm" of the filters is omitted."""
+        """The results of all runs. The axis "arm" has an entry for each filter. A single filter has no such axis."""
         sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys)}
         coords = {"arm": list(self.arms), "seed": np.asarray(self.seeds), "time": np.arange(sizes["time"])}
         runs = [found[task] for task in product(self.arms, self.seeds)]

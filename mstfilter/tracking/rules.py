@@ -107,7 +107,7 @@ def _check_candidate(one: Candidate) -> None:
 
 
 def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | None:
-    """The fault that a candidate moves the object by more than the width of the workspace; None if none does."""
+    """An error message if a candidate moves the object by more than the width of the workspace, else None."""
     if not len(track.segment.support):
         return None
     grid, centre = track.clip.grid, track.points.mean(axis=0)

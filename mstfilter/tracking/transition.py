@@ -157,7 +157,7 @@ class Warp(Bounded):
 def _moved_occupancy(
     before: Occupancy, labels: np.ndarray, kept: Sequence[ObjectRecord], moving: Container[int], grid: VoxelGrid
 ) -> Occupancy:
-    """The occupancy after a motion, for the new labels (X, Y, Z) and objects. `moving` are the objects that moved.
+    """The occupancy after a motion, from the moved labels (X, Y, Z) and objects. `moving` are the objects that moved.
 
     The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label.
     Labelled voxels have a probability of at least one half, and other voxels at most one half.

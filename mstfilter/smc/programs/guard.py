@@ -3,8 +3,8 @@
 A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
 ``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
 error, but its weights are wrong. Steps of each kind (first, later, without observation) are counted, and the steps 1,
-2, 9, 66, 515, ... are checked. The numbers 8^k + k have all remainders modulo 3, so a fault in every third step is
-detected. A check has three parts:
+2, 9, 66, 515, ... are checked. These are the steps 8^k + k. They have all remainders modulo 3, so a fault in every
+third step is detected. A check has three parts:
 
 1. The first two steps are repeated with the same random numbers. Values and log weights must agree up to rounding.
 2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
