@@ -1,7 +1,9 @@
 """Quality and processor time of `mst` on images of 1440 x 1080 pixels, in full size and reduced to 410,000 pixels.
 
-python experiments/full_size/large_images.py            # 20 minutes of one core; prints a line per run
-python experiments/full_size/large_images.py --small    # one small scene: shows only that it works
+    python experiments/full_size/large_images.py            # 20 minutes of one core; prints a line per run
+    python experiments/full_size/large_images.py --small    # one small scene: shows only that it works
+
+The script filters two simulated scenes with three seeds of the filter.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ class Redwood(VideoFormat):
             try:
                 for pair in _complete(*self._files(path, known), after=pairs[-1:]):
                     colour, depth = map(list, zip(*pairs[:1], pair, strict=True))
-                    video = replace(self._video(path, colour, depth), max_pixels=self.max_pixels)
+                    video = self._video(path, colour, depth)
                     camera, _, read = video.frame_reader()
                     stamped = _seconds(_number(pair[0])) is not None
                     seconds = video.times[-1] if stamped else n / self._rate(*_read_intrinsics(path))

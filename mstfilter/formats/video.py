@@ -202,16 +202,12 @@ class Video:
             )
         stored = Camera.from_intrinsics(fx, fy, cx, cy, width, height)
         source = undistortion_map(stored, self.distortion)
-
-        def read(index: int, camera: Camera) -> Frame:
-            return self._frame(index, stored, source).resized(camera)
-
-        return stored.limited(self.max_pixels), source, read
+        return stored, source, lambda index, camera: self._frame(index, stored, source).resized(camera)
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
         """The recording of the video. Pose and workspace are computed during the call. Images are read on access."""
-        camera, source, read = self.frame_reader()
-        height, width = self.read_rgb(0).shape[:2]
+        stored, source, read = self.frame_reader()
+        camera = stored.limited(self.max_pixels)
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
         found = pauses.find(self.times, self.read_rgb)
         first_pause = found[0]
@@ -228,7 +224,7 @@ class Video:
 
         def instance(index: int) -> np.ndarray | None:
             image = self.read_instance(index)
-            if image is not None and image.shape != (height, width):
+            if image is not None and image.shape != (stored.height, stored.width):
                 raise InputError(f"instance image of frame {index} of {self.path} has shape {image.shape}")
             if image is None:
                 return None

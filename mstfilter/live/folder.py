@@ -94,6 +94,7 @@ def filter_folder(
             raise InputError(f"no image arrived in {source}")
         camera = frame.camera if reader.world.pose is None else frame.camera.at(reader.world.pose)
         settings: dict[str, Any] = {"grid": reader.world.grid, "seed": seed, "threads": n_threads}
+        settings["max_pixels"] = reader.max_pixels
         try:
             with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
                 stream.push(frame.rgb, frame.depth, time)

@@ -163,7 +163,7 @@ def test_a_folder_is_filtered_while_it_is_filled(tmp_path):
                 time.sleep(0.01)
                 file.write(data[100:])
 
-    reader, config = Redwood(fps=FPS, pauses=RULE), load_config("mst", ["n=2", "n_proposed=4"])
+    reader, config = Redwood(fps=FPS, pauses=RULE, max_pixels=12_000), load_config("mst", ["n=2", "n_proposed=4"])
     recorder = threading.Thread(target=record)
     recorder.start()
     live = filter_folder(growing, reader, config, tmp_path / "live", 3, idle_s=2)
