@@ -2,6 +2,7 @@
 
     python tests/sentences.py                   # 60 sentences, drawn at random, for a reader
     python tests/sentences.py --seed 7 -n 20
+    python tests/sentences.py --context         # each with its signature and its paragraph
     python tests/sentences.py --longer 30       # all sentences of more than 30 words, with their files
 
 Code, tables, formulas, headings and numpydoc's lines of names and types are left out.
@@ -39,27 +40,41 @@ _ITEM = re.compile(r"^[ ]*(?:[-*] |\d+\. |: |[\w*, .]+ : .*$)", re.MULTILINE)
 _END = re.compile(r"(?<=[.!?:])[\"')*]*\s+(?=[\"'(*\[$]*[A-Z`])")
 
 
-def sentences(text: str) -> Iterator[str]:
-    """Sentences of a page or a docstring. A colon before a capital letter also ends a sentence."""
+def paragraphs(text: str) -> Iterator[list[str]]:
+    """Sentences of each paragraph of a page or a docstring. A colon before a capital letter also ends a sentence."""
     text += "\n"  # a docstring may end with an example
     for pattern in _BLOCKS:
         text = re.sub(pattern, "\n\n", text, flags=re.MULTILINE | re.DOTALL if ".*?" in pattern else re.MULTILINE)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
     text = _ITEM.sub("\n\n", text)
     for paragraph in re.split(r"\n\s*\n", text):
-        for sentence in _END.split(" ".join(paragraph.split())):
-            if len(re.findall(r"[A-Za-z]{2,}", re.sub(_CODE, "", sentence))) >= 3:
-                yield sentence.strip()
+        found = [sentence.strip() for sentence in _END.split(" ".join(paragraph.split()))]
+        yield [s for s in found if len(re.findall(r"[A-Za-z]{2,}", re.sub(_CODE, "", s))) >= 3]
 
 
-def texts() -> Iterator[tuple[str, str]]:
-    """Place and text of each page, and of each docstring of the package."""
+def sentences(text: str) -> Iterator[str]:
+    """Sentences of a page or a docstring."""
+    for paragraph in paragraphs(text):
+        yield from paragraph
+
+
+def signature(node: ast.AST) -> str:
+    """First line of a definition."""
+    if isinstance(node, ast.FunctionDef):
+        return f"def {node.name}({ast.unparse(node.args)})" + (
+            f" -> {ast.unparse(node.returns)}" if node.returns else ""
+        )
+    return f"class {node.name}" if isinstance(node, ast.ClassDef) else "module"
+
+
+def texts() -> Iterator[tuple[str, str, str]]:
+    """Place, first line and text of each page, and of each docstring of the package."""
     for path in sorted(p for pattern in PAGES for p in REPOSITORY.glob(pattern)):
-        yield str(path.relative_to(REPOSITORY)), path.read_text(encoding="utf-8")
+        yield str(path.relative_to(REPOSITORY)), "", path.read_text(encoding="utf-8")
     for path in sorted((REPOSITORY / "mstfilter").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
-                yield f"{path.relative_to(REPOSITORY)}:{getattr(node, 'name', 'module')}", text
+                yield f"{path.relative_to(REPOSITORY)}:{getattr(node, 'name', 'module')}", signature(node), text
 
 
 def n_words(sentence: str) -> int:
@@ -70,7 +85,17 @@ def n_words(sentence: str) -> int:
 
 def every_sentence() -> list[tuple[str, str]]:
     """(place, sentence) of the whole project."""
-    return [(place, sentence) for place, text in texts() for sentence in sentences(text)]
+    return [(place, sentence) for place, _, text in texts() for sentence in sentences(text)]
+
+
+def every_context() -> list[str]:
+    """First line of the definition, and the paragraph with the sentence marked, in the order of `every_sentence`."""
+    return [
+        f"{line}\n  " + " ".join([*paragraph[:i], f">>> {sentence} <<<", *paragraph[i + 1 :]]) + "\n"
+        for _, line, text in texts()
+        for paragraph in paragraphs(text)
+        for i, sentence in enumerate(paragraph)
+    ]
 
 
 if __name__ == "__main__":
@@ -78,8 +103,11 @@ if __name__ == "__main__":
     parser.add_argument("-n", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longer", type=int, help="list the sentences of more than this number of words instead")
+    parser.add_argument("--context", action="store_true", help="print what a reader of the file sees, too")
     options = parser.parse_args()
     found = every_sentence()
+    if options.context:
+        found = [(place, context) for (place, _), context in zip(found, every_context(), strict=True)]
     if options.longer:
         found = [(f"{n_words(s):3} {place}", s) for place, s in found if n_words(s) > options.longer]
     else:
