@@ -1,12 +1,11 @@
 """Training of the completion network.
 
->>> run_training(CompletionTraining(n_scenes=900, steps=40_000), "completion-model")
+>>> run_training(CompletionTraining.recipe("cpu"), "completion-model")
 
-The loss is the evidence lower bound of a conditional variational autoencoder: the log loss of the voxels that are
-not observed as free, and the divergence of the posterior of the latent variable from its prior. The log loss of a
-sample is divided by the number of voxels on or behind the visible surface, so that small objects count as much as
-large ones; the divisor depends on the input only, so the loss stays proper. At the end, scale and
-shift of the logits are fitted to the validation samples, over the voxels that are not free.
+The loss is the log loss of the voxels that are not observed as free, at the mode of the latent variable. The log loss
+of a sample is divided by the number of voxels on or behind the visible surface, so that small objects count as much
+as large ones; the divisor depends on the input only, so the loss stays proper. At the end, scale and shift of the
+logits are fitted to the validation samples, over the voxels that are not free.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
 from mst_training.shapes import HELD_OUT
 from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet, LatentLaw, to_channels
+from mstfilter.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.forecasts import ForecastTable
 from mstfilter.scene import Seen
 
@@ -37,9 +36,6 @@ class CompletionTraining(Training):
     """Settings of the training of the completion network. A scene gives about 35 samples."""
 
     latent: int = 16  #: dimension of the latent variable
-    #: Weight of the divergence in the loss. It is larger than one over the number of voxels, because the voxels of a
-    #: shape are far from independent: at 0.004 the posterior holds 22 nats, details that the prior cannot know.
-    divergence: float = 0.04
 
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "cpu": {},
@@ -51,11 +47,10 @@ class CompletionTraining(Training):
     }
     architecture: ClassVar[str] = ARCHITECTURE
     samples: ClassVar[type[Samples]] = CompletionSamples
-    losses: ClassVar[tuple[str, ...]] = ("loss", "nats")
+    losses: ClassVar[tuple[str, ...]] = ("loss",)
 
     def networks(self) -> dict[str, nn.Module]:
-        net = CompletionNet(len(CHANNELS), self.width, self.latent)
-        return {"net": net, "posterior": ShapePosterior(self.width, self.latent)}
+        return {"net": CompletionNet(len(CHANNELS), self.width, self.latent)}
 
     def batches(self, samples: CompletionSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
         """Batches in which each sample is turned and mirrored."""
@@ -70,21 +65,15 @@ class CompletionTraining(Training):
     def loss(
         self, networks: Mapping[str, Any], step: int, batch: Sequence[Tensor]
     ) -> tuple[Tensor, tuple[float, ...]]:
-        """Log loss a voxel on or behind the surface, with the weighted divergence in nats."""
+        """Log loss a voxel on or behind the surface."""
         bits, signed, truth = batch
-        device = bits.device
-        x = channels(bits, signed, _heights()).to(device)
-        noise = torch.randn((len(x), self.latent), generator=torch.Generator().manual_seed(step)).to(device)
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=self.half_precision):
-            features, prior = networks["net"].encode(x)
-            law: LatentLaw = networks["posterior"](features, truth.float())
-            logits = networks["net"].decode(features, law.mean + noise * law.log_std.exp())
+        x = channels(bits, signed, _heights()).to(bits.device)
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=self.half_precision):
+            logits = networks["net"](x)
         unknown, own = ~Seen.FREE.among(bits), _OWN.among(bits).sum(dim=(1, 2, 3))
         loss = functional.binary_cross_entropy_with_logits(logits.float(), truth.float(), reduction="none")
-        per_sample = ((loss * unknown).sum(dim=(1, 2, 3)) / (own + 50)).mean()
-        nats = divergence(law, prior).mean()
-        total = per_sample + self.divergence * min(1.0, step / 2000) * nats
-        return total, (float(per_sample.detach()), float(nats.detach()))
+        total = ((loss * unknown).sum(dim=(1, 2, 3)) / (own + 50)).mean()
+        return total, (float(total.detach()),)
 
     def validate(self, net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:
         return evaluate(net, samples.take(np.arange(min(len(samples), 400))), device)
@@ -105,33 +94,6 @@ class CompletionTraining(Training):
             "calibration": {"scale": calibration[0], "shift": calibration[1]},
         }
         return described, figures, rows
-
-
-def divergence(law: LatentLaw, other: LatentLaw) -> Tensor:
-    """Kullback-Leibler divergence (b,) of `law` from `other`, in nats."""
-    ratio = 2 * (law.log_std - other.log_std)
-    distance = ((law.mean - other.mean) * (-other.log_std).exp()) ** 2
-    return 0.5 * (ratio.exp() + distance - 1 - ratio).sum(dim=1)
-
-
-class ShapePosterior(nn.Module):
-    """The law of z given the input and the true shape."""
-
-    def __init__(self, width: int, latent: int) -> None:
-        super().__init__()
-        self.stem = nn.Conv3d(8, width, 3, padding=1)
-        self.down1 = nn.Conv3d(2 * width, 2 * width, 3, stride=2, padding=1)
-        self.down2 = nn.Conv3d(2 * width, 4 * width, 3, stride=2, padding=1)
-        self.law = nn.Linear(8 * width, 2 * latent)
-
-    def forward(self, features: list[Tensor], truth: Tensor) -> LatentLaw:
-        """From the features of the input, and the true shape (b, X, Y, Z) as 0 and 1."""
-        x = functional.silu(self.stem(to_channels(truth[:, None])))
-        x = functional.silu(self.down1(torch.cat([x, features[0].detach()], dim=1)))
-        x = functional.silu(self.down2(x))
-        pooled = torch.cat([x.mean(dim=(2, 3, 4)), features[2].detach().mean(dim=(2, 3, 4))], dim=1)
-        mean, log_std = self.law(pooled.float()).chunk(2, dim=1)
-        return LatentLaw(mean, log_std.clamp(-4, 2))
 
 
 def _heights() -> Tensor:

@@ -58,6 +58,8 @@ class CompletionSamples(Samples):
     scene: np.ndarray  #: (n,) int32, number of the scene
     visible: np.ndarray  #: (n,) float32, visible share of the object's silhouette (0 hidden, 1 nothing in front)
 
+    largest = 1.8
+
     @classmethod
     def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> CompletionSamples | None:
         parts = [part for _ in range(_N_VIEWS) if (part := _view_samples(rng, world, index)) is not None]
@@ -78,7 +80,7 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     inside = on_table(poses)
     if not inside.any():
         return None
-    camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
+    camera = _camera(rng, poses[inside])
     frame, instance = _frame(rng, world, camera)
     truth = label_voxels(world.shapes, poses, _GRID)
     earlier = _earlier_frames(rng, world)
@@ -97,6 +99,12 @@ def _view_samples(rng: np.random.Generator, world: PhysicsWorld, index: int) -> 
     return CompletionSamples(bits, signed, shapes, kinds, masks.astype(np.uint8), scene, visible.astype(np.float32))
 
 
+def _camera(rng: np.random.Generator, poses: np.ndarray) -> Camera:
+    """Draw a camera that looks at objects with poses (n, 4, 4). Half of the cameras are lower or farther away."""
+    elevation, distance = ((22, 68), (0.55, 1.05)) if rng.random() < 0.5 else ((10, 45), (0.6, 1.6))
+    return draw_camera(rng, poses[:, :2, 3].mean(axis=0), elevation, distance)
+
+
 class _Earlier(NamedTuple):
     """A frame, its true instances (H, W), and the objects that were taken away."""
 
@@ -110,7 +118,7 @@ def _earlier_frames(rng: np.random.Generator, world: PhysicsWorld) -> list[_Earl
     state, poses, found = world.save(), world.poses(), []
     inside = np.flatnonzero(on_table(poses))
     for _ in range(int(rng.integers(1, 4)) if rng.random() < _EARLIER else 0):
-        camera = draw_camera(rng, poses[inside, :2, 3].mean(axis=0), (22, 68), (0.55, 1.05))
+        camera = _camera(rng, poses[inside])
         gone = inside[rng.random(len(inside)) < 0.5] if rng.random() < _TAKEN_AWAY else inside[:0]
         for k in gone.tolist():
             put_away(world, k)

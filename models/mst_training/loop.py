@@ -52,6 +52,7 @@ class Training(ABC):
     rate: float = 2e-3  #: largest learning rate; it falls to 0 along a cosine
     average: float = 0.999  #: decay of the moving average of the weights
     half_precision: bool = True  #: compute in bfloat16
+    start: str = ""  #: name or folder of a model of the same size whose weights are the start; none if empty
 
     #: Changes of the settings by name. "cpu" takes about four core hours, "smoke" shows that everything works.
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]]
@@ -187,6 +188,9 @@ class _Run:
         self.settings, self.folder, self.device = settings, folder, device
         torch.manual_seed(settings.seed)
         self.networks = {name: network.to(device) for name, network in settings.networks().items()}
+        if settings.start:
+            tensors = open_model(settings.start, settings.architecture).tensors
+            self.networks["net"].load_state_dict({name: torch.from_numpy(value) for name, value in tensors.items()})
         self.averaged = copy.deepcopy(self.networks["net"])
         self.parameters = [p for network in self.networks.values() for p in network.parameters()]
         self.optimiser = torch.optim.AdamW(self.parameters, lr=settings.rate, weight_decay=0.01)

@@ -31,10 +31,14 @@ from mstfilter.simulation.world import PhysicsWorld
 WIDTH, HEIGHT = 320, 240  # pixels of an image
 
 
-def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...]) -> PhysicsWorld | None:
-    """Draw a scene of 2 to 12 objects of some kinds, at rest; None if the objects do not fit."""
+def draw_scene(rng: np.random.Generator, kinds: tuple[str, ...], largest: float = 1.0) -> PhysicsWorld | None:
+    """Draw a scene of 2 to 12 objects of some kinds, at rest; None if the objects do not fit.
+
+    The objects of half of the scenes are larger, by one factor of up to `largest`.
+    """
     n = int(rng.integers(2, 13))
-    shapes = [draw_training_shape(rng, draw_kind(rng, kinds)) for _ in range(n)]
+    scale = largest ** rng.uniform() if largest > 1 and rng.uniform() < 0.5 else 1.0
+    shapes = [draw_training_shape(rng, draw_kind(rng, kinds), scale) for _ in range(n)]
     world = PhysicsWorld(shapes, arm=False)
     n_dropped = int(rng.integers(0, n // 2 + 1)) if rng.uniform() < 0.6 else 0
     family = SceneFamily(
@@ -146,6 +150,7 @@ class Samples:
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
+    largest: ClassVar[float] = 1.0  #: largest factor of the sizes of objects (`draw_scene`)
 
     @classmethod
     def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> Self | None:
@@ -157,7 +162,7 @@ class Samples:
         """The samples of scene number `index`, which follow from the arguments alone."""
         for attempt in range(20):
             rng = np.random.default_rng([seed, index, attempt])
-            world = draw_scene(rng, kinds)
+            world = draw_scene(rng, kinds, cls.largest)
             samples = None if world is None else cls.of_world(rng, world, index)
             if samples is not None:
                 return samples

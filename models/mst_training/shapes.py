@@ -11,6 +11,7 @@ Training draws from these kinds instead, so a network does not learn the catalog
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -177,12 +178,18 @@ HELD_OUT = ("wedge", "tee")  #: Kinds that no network is trained on; they measur
 TRAINED = tuple(kind for kind in _KINDS if kind not in HELD_OUT)
 
 
-def draw_training_shape(rng: np.random.Generator, kind: str) -> Shape:
-    """Draw a shape of a kind. Its mass follows from 500 kg per cubic metre."""
+def draw_training_shape(rng: np.random.Generator, kind: str, scale: float = 1.0) -> Shape:
+    """Draw a shape of a kind, with all lengths times `scale`. Its mass follows from 500 kg per cubic metre."""
     maker, rests, _ = _KINDS[kind]
-    pieces = maker(rng)
+    pieces = [_scaled(piece, scale) for piece in maker(rng)]
     mass = 500.0 * sum(piece.volume for piece in pieces)
     return Shape(kind, kind, pieces, max(mass, 0.02), "box", rests, ("speckle",), rolling=0.001)
+
+
+def _scaled(piece: Piece, scale: float) -> Piece:
+    vertices = None if piece.vertices is None else scale * piece.vertices
+    size = tuple(scale * length for length in piece.size)
+    return replace(piece, size=size, centre=scale * piece.centre, vertices=vertices)
 
 
 def draw_kind(rng: np.random.Generator, kinds: tuple[str, ...]) -> str:

@@ -31,7 +31,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mstfilter.completion.observed import ObservedBox, enclosing_box, encode_box, observed_again
+from mstfilter.completion.observed import ObservedBox, areas_of_colours, enclosing_box, encode_box, observed_again
 from mstfilter.errors import InputError
 from mstfilter.results import Checked, check_list, check_probabilities, check_type, returns, warn_once
 from mstfilter.scene import (
@@ -212,7 +212,9 @@ class Completer(Checked, ABC):
             for k, (offset, now, seen, used), p in zip(missing, boxes, filled, strict=True):
                 one = finish(offset, seen, p, names[k].hex()[:16])
                 if views is not None:
-                    latest = (ObjectView(offset, *encode_box(now), one.key),) if now.surface.any() else ()
+                    colours = areas_of_colours(frame, masks[k])
+                    view = ObjectView(offset, *encode_box(now), one.key, colours=colours)
+                    latest = (view,) if now.surface.any() else ()
                     one = replace(one, views=(*used, *latest))
                 found.append(one)
             return found

@@ -146,6 +146,30 @@ def decode_signed(signed: np.ndarray) -> np.ndarray:
     return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
 
 
+_BINS, _LOWEST, _WIDTH = (4, 6, 6), (0.0, -48.0, -48.0), (25.0, 16.0, 16.0)  # of Lab colours
+
+
+def areas_of_colours(frame: Frame, mask: np.ndarray) -> np.ndarray:
+    """Visible area (144,) float32 in square metres of each colour in a mask (H, W) bool of a frame.
+
+    The colours are 4 x 6 x 6 bins of Lab colours. A pixel is divided between the nearest bins. The area is that of a
+    surface that faces the camera.
+    """
+    import cv2
+
+    areas = np.zeros(_BINS)
+    rgb, depth = frame.rgb[mask], frame.depth[mask & frame.valid]
+    if not len(depth):
+        return areas.ravel().astype(np.float32)
+    lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
+    at = np.clip((lab - _LOWEST) / _WIDTH - 0.5, 0, np.array(_BINS) - 1)
+    low = np.minimum(at.astype(np.int64), np.array(_BINS) - 2)
+    for corner in np.ndindex(2, 2, 2):
+        np.add.at(areas, tuple((low + corner).T), np.where(corner, at - low, 1 - (at - low)).prod(axis=1))
+    pixel = float(np.median(depth)) ** 2 / (frame.camera.K[0, 0] * frame.camera.K[1, 1])
+    return (pixel * areas.ravel()).astype(np.float32)
+
+
 def observed_again(
     frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid, rule: Completer, refute: bool = True
 ) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:

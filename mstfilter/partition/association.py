@@ -26,20 +26,49 @@ In a component of one segment and one object, the share is 50 % instead of 80 %.
 - A segment that continues no object is a new object.
 
 A predicted object in no conflict is *occluded*. Depth readings that belong to no segment are never counted.
+
+A predicted object is *lost* if the frame refutes the object or if no segment continues the object. A lost object may
+be elsewhere in the image. `recognised` compares the lost objects with the new objects by colours and visible area. A
+recognised object keeps its identity, but loses its earlier views, because its motion is unknown.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from mstfilter.scene import ObjectRecord, ObjectView
 
 _CONFLICT = 0.1  # a segment and an object are in conflict if they share more than this share of the smaller one
 _SAME = 0.5  # share of an object's readings in the segment that continues it, if both have no other conflict
 _CONTAINED = 0.8  # the same, if they have other conflicts
+
+
+_ALIKE = 0.5  # with less, the same object is less probable than another object (simulated scenes)
+
+
+def recognised(lost: Sequence[ObjectRecord], new: Sequence[ObjectView]) -> dict[int, ObjectRecord]:
+    """The lost objects that are the new objects with the most similar latest views, by the index of the new object.
+
+    The similarity is the common share of the colours, times the square root of the ratio of the visible areas. The
+    pairs have the largest sum of similarities. Pairs with a similarity below 0.5 are omitted.
+    """
+    lost = [one for one in lost if one.views and one.views[-1].colours.any()]
+    if not lost or not new:
+        return {}
+    before, now = (np.array([view.colours for view in views]) for views in ([one.views[-1] for one in lost], new))
+    areas, areas_now = before.sum(axis=1), np.maximum(now.sum(axis=1), 1e-12)
+    common = np.minimum((before / areas[:, None])[:, None], now / areas_now[:, None]).sum(axis=2)
+    ratio = np.minimum.outer(areas, areas_now) / np.maximum.outer(areas, areas_now)
+    alike = common * np.sqrt(ratio)
+    pairs = zip(*linear_sum_assignment(-alike), strict=True)
+    return {int(k): lost[j] for j, k in pairs if alike[j, k] >= _ALIKE}
 
 
 class ConflictComponent(NamedTuple):

@@ -52,7 +52,7 @@ from scipy.special import logsumexp
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
-from mstfilter.partition.association import Overlaps
+from mstfilter.partition.association import Overlaps, recognised
 from mstfilter.partition.candidates import Choices, largest
 from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
 from mstfilter.processes import each
@@ -191,7 +191,7 @@ class PartitionUpdate(Update):
         key = key_of(rng)
 
         def build(candidate: int) -> Hypothesis:
-            return self._hypothesis(key.child("candidate", candidate), objects_of(candidate), readings, mended)
+            return self._hypothesis(key.child("candidate", candidate), *objects_of(candidate), readings, mended)
 
         candidates = replace(described, particles=Candidates(build, len(described)))
         return self._scored(candidates, observation) if self.evidence else candidates
@@ -262,8 +262,11 @@ class PartitionUpdate(Update):
 
     def _associate(
         self, cells: Cells, predictions: Sequence[Prediction], choices: Choices, candidate: int
-    ) -> list[SceneObject]:
-        """The objects of a candidate: the segments of its partition, and the occluded objects that stay."""
+    ) -> tuple[list[SceneObject], list[ObjectRecord]]:
+        """The objects of a candidate, and the predicted objects that are lost.
+
+        The objects are the segments of the partition, and the occluded objects that stay.
+        """
         prediction, partition = predictions[choices.prediction[candidate]], choices.partitions[candidate]
         segments = cells.to_readings(partition)
         overlaps = Overlaps.of(partition, cells.counts(prediction.objects), cells.readings.smallest_region)
@@ -275,13 +278,21 @@ class PartitionUpdate(Update):
         ]
         none = np.zeros(len(segments), bool)
         stay = [record_of[label] for label in choices.staying[candidate]]
-        return visible + [SceneObject(none, (one,), prediction.remaining(one, self.threshold)) for one in stay]
+        objects = visible + [SceneObject(none, (one,), prediction.remaining(one, self.threshold)) for one in stay]
+        kept = {track.label for one in objects for track in one.tracks}
+        return objects, [record for label, record in record_of.items() if label not in kept]
 
     # 5. Completion ----------------------------------------------------------------------------------------------
 
-    def _hypothesis(self, key: Key, objects: Sequence[SceneObject], readings: Readings, clip: Clip) -> Hypothesis:
+    def _hypothesis(
+        self, key: Key, objects: Sequence[SceneObject], lost: Sequence[ObjectRecord], readings: Readings, clip: Clip
+    ) -> Hypothesis:
         """The hypothesis of a candidate. An object is omitted if all its voxels belong to other objects."""
         completions = self._completions(key, objects, readings, clip)
+        new = [k for k, one in enumerate(objects) if not one.tracks and completions[k].views]
+        again = recognised(lost, [completions[k].views[-1] for k in new])
+        tracks = {new[k]: (record,) for k, record in again.items()}
+        objects = [one._replace(tracks=tracks.get(k, one.tracks)) for k, one in enumerate(objects)]
         labels = arbitrate(completions, clip.grid, self.threshold)
         present = set(np.unique(labels).tolist())
         records = [
@@ -352,7 +363,7 @@ def _distinct(proposed: Population, segments: Sequence[np.ndarray]) -> tuple[Pop
     return merged, [segments[k] for k in example]
 
 
-def _new_objects(segments: Sequence[np.ndarray], candidate: int) -> list[SceneObject]:
-    """The segments (m,) of a candidate as new objects."""
+def _new_objects(segments: Sequence[np.ndarray], candidate: int) -> tuple[list[SceneObject], list[ObjectRecord]]:
+    """The segments (m,) of a candidate as new objects. No object is lost."""
     own = segments[candidate]
-    return [SceneObject(own == k) for k in np.unique(own[own > 0])]
+    return [SceneObject(own == k) for k in np.unique(own[own > 0])], []

@@ -26,7 +26,8 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     If a hypothesis has probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
     ``source_probability`` concatenates the probabilities of all `Crop` objects. Each `ObjectView` has a row in
     ``view_of`` (row of the viewed object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4),
-    ``view_key``. ``view_bits`` and ``view_signed`` concatenate the arrays of all `ObjectView` objects.
+    ``view_key``, ``view_colours`` (n,). ``view_bits`` and ``view_signed`` concatenate the arrays
+    of all `ObjectView` objects.
     """
     grid = hypotheses[0].grid
     if any(h.grid != grid for h in hypotheses):
@@ -72,6 +73,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
             "view_key": np.array([view.key for _, view in views], np.str_),
             "view_bits": _joined([view.bits for _, view in views], np.uint8),
             "view_signed": _joined([view.signed for _, view in views], np.int8),
+            "view_colours": np.array([view.colours for _, view in views], np.float32),
         }
     return arrays
 
@@ -138,10 +140,12 @@ def _decode_views(arrays: Mapping[str, np.ndarray]) -> dict[int, list[ObjectView
     found: dict[int, list[ObjectView]] = {}
     if "view_of" in arrays:
         bits, signed = _Reader(arrays["view_bits"]), _Reader(arrays["view_signed"])
+        colours = arrays.get("view_colours", np.zeros((len(arrays["view_of"]), 0), np.float32))  # not in old files
         for k, row in enumerate(arrays["view_of"].tolist()):
             shape = arrays["view_shape"][k].tolist()
             motion = RigidTransform(arrays["view_motion"][k], normalize=False)
             key = str(arrays["view_key"][k])
-            view = ObjectView(arrays["view_offset"][k], bits.take(shape), signed.take(shape), key, motion)
+            seen = bits.take(shape), signed.take(shape)
+            view = ObjectView(arrays["view_offset"][k], *seen, key, motion, colours[k])
             found.setdefault(row, []).append(view)
     return found

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
+from mstfilter.completion.observed import areas_of_colours
 from mstfilter.partition import Overlaps
+from mstfilter.partition.association import recognised
+from mstfilter.scene import Camera, Frame, ObjectRecord, ObjectView
 
 
 def overlaps_of(segments, objects, least):
@@ -74,3 +79,42 @@ def test_components_and_tracks_by_brute_force(segments, objects):
         assert [shared[a, b] for b in found] == sorted((shared[a, b] for b in found), reverse=True)
     whole = {b for a, b in conflicts if shared[a, b] > 0.8 * inside[b]}
     assert whole <= set(continued), "an object of which a segment has more than 80 % is continued"
+
+
+def view(colours):
+    none = np.zeros((0, 0, 0))
+    return ObjectView(np.zeros(3, int), none, none, "", colours=np.asarray(colours, np.float32))
+
+
+def similarity(a, b):
+    return np.minimum(a / a.sum(), b / b.sum()).sum() * np.sqrt(min(a.sum(), b.sum()) / max(a.sum(), b.sum()))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_lost_objects_are_recognised(seed):
+    """Against all assignments."""
+    rng = np.random.default_rng(seed)
+    before = rng.dirichlet(np.full(5, 0.3), 3) * rng.uniform(0.5, 2, (3, 1))
+    now = np.vstack([before[rng.permutation(3)] * rng.uniform(0.7, 1.4, (3, 1)), rng.dirichlet(np.ones(5), 1)])
+    lost = [ObjectRecord(k, 70 + k, views=(view(rng.random(5)), view(row))) for k, row in enumerate(before)]
+    alike = np.array([[similarity(a, b) for b in now] for a in before])
+    best = max(permutations(range(4), 3), key=lambda order: sum(alike[k, order[k]] for k in range(3)))
+    expected = {new: 70 + k for k, new in enumerate(best) if alike[k, new] >= 0.5}
+    found = recognised([ObjectRecord(9, 9), *lost], [view(row) for row in now])
+    assert {new: record.id for new, record in found.items()} == expected
+
+
+def test_areas_of_colours():
+    """Two squares in a plane: areas, and the same shares at half of the distance. Red is not green."""
+    rgb, squares = np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), np.int64)
+    squares[10:20, 10:30], squares[30:50, 40:50] = 1, 2
+    rgb[squares == 1], rgb[squares == 2] = (200, 30, 30), (30, 160, 30)
+    red, green, near = (
+        areas_of_colours(
+            Frame(rgb, np.full((60, 80), depth), Camera.from_intrinsics(100.0, 100.0, 40, 30, 80, 60)), squares == k
+        )
+        for k, depth in ((1, 0.5), (2, 0.5), (1, 0.25))
+    )
+    assert red.sum() == pytest.approx(200 * 0.005**2, rel=1e-5)
+    assert np.allclose(near, red / 4)
+    assert np.minimum(red, green).sum() < 0.1 * red.sum()

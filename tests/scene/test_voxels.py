@@ -152,6 +152,7 @@ def test_encoding_is_lossless_and_reproducible():
                         rng.integers(-127, 128, size=(2, 3, k + 1), dtype=np.int8),
                         f"view {k}",
                         RigidTransform.from_exp_coords(rng.normal(size=6)),
+                        rng.random(5, dtype=np.float32),
                     )
                     for k in range(n - 1)
                 ),
@@ -178,7 +179,7 @@ def test_encoding_is_lossless_and_reproducible():
                 np.testing.assert_array_equal(p.source.probability, q.source.probability)
             assert [v.name for v in p.views] == [v.name for v in q.views]
             for v, w in zip(p.views, q.views, strict=True):
-                for name in ("offset", "bits", "signed"):
+                for name in ("offset", "bits", "signed", "colours"):
                     np.testing.assert_array_equal(getattr(v, name), getattr(w, name))
     again = encode_hypotheses(loaded)
     assert {name: a.tobytes() for name, a in again.items()} == {name: a.tobytes() for name, a in arrays.items()}
