@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import binary_dilation
-from sequences import Truth
+from sequences import WALL, Truth
 
 from mstfilter.scene import Frame, Hypothesis, VoxelGrid, frame_geometry
 from mstfilter.scoring import weighted_coverage
@@ -20,7 +20,8 @@ PIECE = 0.1  # share of a true object's pixels that an object needs to be a piec
 FOUND = 0.25  # share of a true object's pixels that objects must cover, else it is missed; likewise for invented ones
 TALL = 0.04  # metres above the table
 READABLE = 0.25  # share of an object's pixels that need a reading to count in `quality_readable`
-_SEEN, _BEHIND, _FRONT = 0.03, 0.02, 0.03  # metres: witness surface above the table, behind depth 1, before depth 2
+# Metres: witness surface above the table, behind depth 1, before depth 2; distance of surface of the wall.
+_SEEN, _BEHIND, _FRONT, _AT_WALL = 0.03, 0.02, 0.03, 0.03
 
 
 def image_scores(image: np.ndarray, truth: Truth, frame: Frame, grid: VoxelGrid) -> dict[str, float]:
@@ -93,7 +94,8 @@ def witness_scores(hypothesis: Hypothesis, frame: Frame, witness: Frame) -> dict
 
     Of the voxels with surface that the witness sees more than 3 cm above the table and that lie more than 2 cm behind
     the readings of `frame`, `covered` is the share within a voxel of the hypothesis. Of the voxels of the hypothesis
-    in view of the witness, `in_free_space` is the share more than 3 cm in front of its readings.
+    in view of the witness, `in_free_space` is the share more than 3 cm in front of its readings. `covered_objects` is
+    `covered` without the voxels within 3 cm of the wall, which is no object.
     """
     grid = hypothesis.grid
     points = witness.points[witness.valid & (witness.points[..., 2] > _SEEN)]
@@ -101,13 +103,16 @@ def witness_scores(hypothesis: Hypothesis, frame: Frame, witness: Frame) -> dict
     surface = np.zeros(grid.shape, bool)
     surface[tuple(index[grid.contains(index)].T)] = True
     with np.errstate(invalid="ignore"):
-        hidden = surface & (frame_geometry(frame, grid).signed > _BEHIND)
+        hidden = np.argwhere(surface & (frame_geometry(frame, grid).signed > _BEHIND))
         in_front = frame_geometry(witness, grid).signed
         occupied = hypothesis.labels > 0
         near = binary_dilation(occupied, np.ones((3, 3, 3)))
         seen = occupied & np.isfinite(in_front)
         free = seen & (in_front < -_FRONT)
+    covered = near[tuple(hidden.T)]
+    objects = np.abs(grid.centre_of(hidden) @ WALL[0] - WALL[1]) > _AT_WALL
     return {
-        "covered": float(near[hidden].mean()) if hidden.any() else np.nan,
+        "covered": float(covered.mean()) if len(hidden) else np.nan,
+        "covered_objects": float(covered[objects].mean()) if objects.any() else np.nan,
         "in_free_space": float(free.sum() / max(int(seen.sum()), 1)),
     }

@@ -36,6 +36,8 @@ POINTS = {
     "skateboard": ((475, 214),) * 3
     + ((483, 218), (485, 218), (478, 218), (475, 218), (468, 218), (478, 218), (483, 218), (485, 218)),
 }
+#: Normal and offset in metres of the wall in the workspace of `two_cameras`, fitted to the readings of camera 2.
+WALL = (-0.795, 0.606, -0.029), 1.108
 #: A pixel (column, row) on the toy at the five pauses of `jack`, marked by hand.
 TOY = ((312, 337), (329, 315), (291, 304), (353, 310), (393, 300))
 _ABOVE = 0.015  # metres: readings above the table that may belong to the toy

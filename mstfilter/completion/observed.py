@@ -121,12 +121,16 @@ def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]
 
 
 def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
-    """Voxels (X, Y, Z) bool at least `margin` voxels and `sigmas` standard deviations in front of the surface."""
+    """Voxels (X, Y, Z) bool at least `margin` voxels and `sigmas` standard deviations in front of the surface.
+
+    The space in front of an estimated depth is not known to be free.
+    """
 
     def compute() -> np.ndarray:
         geometry = frame_geometry(frame, grid)
         distance = np.maximum(margin * grid.voxel_size, sigmas * depth_sigma(geometry.z - geometry.signed))
-        return read_only(geometry.known_free(distance))
+        free = geometry.known_free(distance)
+        return read_only(free if frame.estimated is None else free & ~frame.estimated.ravel()[geometry.pixel])
 
     return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
 

@@ -203,6 +203,8 @@ class Frame:
         Pixels that show the robot. The depth at robot pixels is treated as unknown.
     views : tuple of Frame
         Simultaneous frames of other cameras. With views, all cameras need a pose in the same world axes.
+    estimated : (H, W) bool, optional
+        Pixels whose depth is an estimate, not a reading (`mstfilter.scene.foreground`).
     """
 
     rgb: np.ndarray
@@ -210,6 +212,7 @@ class Frame:
     camera: Camera
     robot_mask: np.ndarray | None = None
     views: tuple[Frame, ...] = ()
+    estimated: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
@@ -261,7 +264,8 @@ class Frame:
     def key(self) -> bytes:
         """Content key."""
         robot = b"" if self.robot_mask is None else self.robot_mask
-        key = content_key("frame", self.rgb, self.depth, self.camera.key, robot)
+        estimated = () if self.estimated is None else (self.estimated,)
+        key = content_key("frame", self.rgb, self.depth, self.camera.key, robot, *estimated)
         return content_key("views", key, *(view.key for view in self.views)) if self.views else key
 
     def resized(self, camera: Camera) -> Frame:

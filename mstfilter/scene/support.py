@@ -122,7 +122,10 @@ def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
     if grid is not None:
         pixels &= frame.valid | grid.contains(grid.index_of(posed_camera(frame).unproject(depth)))
     pixels &= np.isfinite(depth)
-    return Foreground(read_only(pixels), replace(frame, depth=np.where(pixels, depth, frame.depth)))
+    estimated = read_only(pixels & ~frame.valid)
+    return Foreground(
+        read_only(pixels), replace(frame, depth=np.where(pixels, depth, frame.depth), estimated=estimated)
+    )
 
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:

@@ -245,6 +245,19 @@ def surface_and_free(seen: ObservedBox) -> tuple[np.ndarray, ...]:
     return seen.surface, seen.free, seen.behind, seen.hidden, seen.other_surface
 
 
+def test_space_before_an_estimated_depth_is_not_free():
+    frame = frame_of(TWO)
+    mask = masks_of(TWO, frame)[0]
+    offset, seen = observed_box(frame, mask, GRID, Extrude())
+    _, found = observed_box(replace(frame, estimated=mask), mask, GRID, Extrude())
+    box = tuple(slice(a, a + n) for a, n in zip(offset, found.free.shape, strict=True))
+    pixel = frame_geometry(frame, GRID).pixel[box]
+    inside = (pixel >= 0) & mask.ravel()[pixel]
+    assert (seen.free & inside).any()
+    assert np.array_equal(found.free, seen.free & ~inside)
+    assert np.array_equal(found.surface, seen.surface)
+
+
 def test_views_are_recalled_where_the_object_is_now():
     """A box that moved by whole voxels, seen again: its evidence moves with it; other objects stay behind."""
     before, after = TWO, np.roll(TWO, 6, axis=1)

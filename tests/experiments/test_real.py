@@ -87,9 +87,24 @@ def test_a_witness_sees_what_is_hidden(scores):
     labels[:30, :, 5] = 1
     found = scores.witness_scores(Hypothesis.from_labels(labels, GRID), frame(shelf), witness)
     assert found["in_free_space"] == 0 and found["covered"] == pytest.approx(0.5, abs=0.05)
+    assert found["covered_objects"] == found["covered"]
     labels[:, :, 0] = 2  # in front of what the witness sees
     found = scores.witness_scores(Hypothesis.from_labels(labels, GRID), frame(shelf), witness)
     assert found["in_free_space"] > 0.4
+
+
+def test_the_wall_is_no_object(scores, monkeypatch):
+    """As above, with a wall at the part of the surface that is not covered."""
+    shelf = np.full((40, 60), 0.9)
+    under = Camera(frame(shelf).camera.K, 60, 40, RigidTransform.from_translation([0.0, 0.0, -0.5]))
+    witness = Frame(np.zeros((40, 60, 3), np.uint8), np.full((40, 60), 0.55), under)
+    labels = np.zeros(GRID.shape, np.uint16)
+    labels[:30, :, 5] = 1  # x < 0
+    monkeypatch.setattr(scores, "WALL", ((1.0, 0.0, 0.0), 0.15))
+    monkeypatch.setattr(scores, "_AT_WALL", 0.145)
+    found = scores.witness_scores(Hypothesis.from_labels(labels, GRID), frame(shelf), witness)
+    assert found["covered"] < 0.6
+    assert found["covered_objects"] > 0.9
 
 
 def test_small_form(tmp_path, shared_data):

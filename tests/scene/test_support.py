@@ -120,6 +120,8 @@ def test_measured_depth_stays_and_estimates_are_above_the_table(seed, missing, n
     np.testing.assert_array_equal(found.frame.depth[measured], holed.depth[measured])
     assert not (found.pixels & measured & ~readings_above_table(holed, GRID)).any()
     assert np.isfinite(found.frame.depth[found.pixels]).all()
+    estimated = found.frame.estimated
+    assert np.array_equal(found.pixels & ~measured, np.zeros_like(measured) if estimated is None else estimated)
     assert (found.frame.points[..., 2][found.pixels & ~measured] > 0).all()
 
 
