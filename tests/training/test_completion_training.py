@@ -11,14 +11,13 @@ import pytest
 import torch
 
 from mst_training import completion_data
-from mst_training.completion import CompletionTraining, divergence
+from mst_training.completion import CompletionTraining
 from mst_training.completion_data import CompletionSamples
 from mst_training.loop import run_training
 from mst_training.scenes import draw_camera, draw_scene
 from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from mstfilter.completion import NetworkCompleter
 from mstfilter.completion.crops import extruded
-from mstfilter.completion.unet import LatentLaw
 from mstfilter.errors import InputError
 from mstfilter.files import read_csv
 from mstfilter.scene import Seen
@@ -36,7 +35,7 @@ SMALL = CompletionTraining(
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> list[Path]:
     """Two files of one scene each, made by two processes."""
-    return CompletionSamples.write(tmp_path_factory.mktemp("samples"), 5, 2, workers=2, per_file=1)
+    return CompletionSamples.write(tmp_path_factory.mktemp("samples"), 6, 2, workers=2, per_file=1)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +45,7 @@ def samples(files) -> CompletionSamples:
 
 def test_a_sample_depends_on_its_scene_alone(samples):
     """On the seed and the number of the scene, not on the process that makes it."""
-    again, first = CompletionSamples.of_scene(5, 1), int((samples.scene == 0).sum())
+    again, first = CompletionSamples.of_scene(6, 1), int((samples.scene == 0).sum())
     for name, values in samples.columns().items():
         assert np.array_equal(values[first:], again.columns()[name]), name
     assert set(samples.scene.tolist()) == {0, 1} and len(samples) > 20
@@ -165,14 +164,25 @@ def test_settings():
         CompletionTraining.recipe("fast")
 
 
-def test_divergence_of_normal_laws():
-    """Against the average log ratio of densities over draws (100,000 draws, error below 0.03)."""
-    torch.manual_seed(1)
-    a, b = (LatentLaw(torch.randn(1, 3), 0.4 * torch.randn(1, 3)) for _ in range(2))
-    x = a.mean + torch.randn(100_000, 3) * a.log_std.exp()
+def test_training_starts_from_a_model(files, tmp_path):
+    """At a learning rate of zero, the result is the model."""
+    for name in ("train", "validation", "test"):
+        (tmp_path / f"a/samples/{name}").mkdir(parents=True)
+        shutil.copy(files[0], tmp_path / f"a/samples/{name}/scenes-000000.npz")
+    model = open_model("completion")
+    width, latent = (model.description["network"][name] for name in ("width", "latent"))
+    run_training(replace(SMALL, start="completion", width=width, latent=latent, rate=0.0, steps=1), tmp_path / "a")
+    for name, tensor in model.tensors.items():
+        assert np.allclose(open_model(str(tmp_path / "a")).tensors[name], tensor, atol=1e-6)
 
-    def log_density(law):
-        return (-0.5 * ((x - law.mean) * (-law.log_std).exp()) ** 2 - law.log_std).sum(dim=1)
 
-    assert float(divergence(a, b)) == pytest.approx(float((log_density(a) - log_density(b)).mean()), abs=0.03)
-    assert float(divergence(a, a)) == 0
+def test_sizes_of_training_shapes():
+    """A scaled shape is the shape with larger coordinates."""
+    for kind in TRAINED:
+        small, large = (draw_training_shape(np.random.default_rng(1), kind, scale) for scale in (1.0, 1.5))
+        points = np.random.default_rng(0).uniform(-0.2, 0.2, (2000, 3))
+        inside, expected = (
+            np.any([piece.inside(at) for piece in shape.pieces], axis=0)
+            for shape, at in ((large, 1.5 * points), (small, points))
+        )
+        assert (inside == expected).mean() > 0.999
