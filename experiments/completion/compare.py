@@ -50,7 +50,7 @@ def main() -> None:
         "extrude": Extrude(),
         "hull": Hull(),
         "hilbert_map": HilbertMap(),
-        "network": NetworkCompleter(weights=str(chosen.trained)),
+        "network": NetworkCompleter(weights=str(chosen.trained), log_odds=0.0),
     }
     everything = np.ones(len(samples), bool)
     groups = {"all": everything}
