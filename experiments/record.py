@@ -1,9 +1,10 @@
 """Which version of the program made the results of each study, and all studies again by one command.
 
-    python experiments/record.py                    # a table: study, state, commit, date, core hours
+    python experiments/record.py                    # lists the studies: state, commit, date, core hours
     python experiments/record.py --run              # runs every study that is older than the program; resumable
     python experiments/record.py --run real main    # runs some studies, if they are older than the program
     python experiments/record.py --check            # exit status 1 if the front page cites an older study
+    python experiments/record.py --table            # the table of experiments/README.md
 
 `studies.toml` lists the commands of each study, and the files on which its results depend. A study is *current* if
 its results were made with the present state of these files and of its folder. The hash of the state ignores comments,
@@ -110,20 +111,18 @@ def studies() -> dict[str, Study]:
     return {name: Study(name, one["commands"], tuple(one.get("depends", PROGRAM))) for name, one in found.items()}
 
 
-def cited(page: str = "README.md") -> set[str]:
-    """The recorded studies to which a page links."""
-    links = re.findall(r"experiments/(\w+)", (REPOSITORY / page).read_text(encoding="utf-8"))
-    return {name for name in links if name in studies()}
+def cited(text: str) -> set[str]:
+    """The studies to which a text links."""
+    return set(re.findall(r"experiments/(\w+)/README", text)) & studies().keys()
 
 
 def table() -> str:
-    """All studies, in a table of Markdown."""
-    lines = ["| study | results | commit | date | core hours |", "|---|---|---|---|---|"]
+    """The table of experiments/README.md: version and cost of each study with results."""
+    lines = ["| study | commit | date | core hours |", "|---|---|---|---|"]
     for name, study in studies().items():
-        record = study.record()
-        state = "current" if study.is_current() else "older"
-        columns = (str(record.get(column, "")) for column in ("commit", "date", "core_hours"))
-        lines.append(f"| [{name}]({name}/README.md) | {state} | {' | '.join(columns)} |")
+        if record := study.record():
+            columns = (str(record.get(column, "")) for column in ("commit", "date", "core_hours"))
+            lines.append(f"| [{name}]({name}/README.md) | {' | '.join(columns)} |")
     return "\n".join(lines)
 
 
@@ -157,16 +156,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs="*", metavar="STUDY", help="run these studies, or all, if they are older")
     parser.add_argument("--check", action="store_true", help="fail if the front page cites an older study")
+    parser.add_argument("--table", action="store_true", help="print the table of experiments/README.md")
     options = parser.parse_args()
+    if options.table:
+        sys.exit(print(table()))
     found = studies()
     if options.run is not None:
         for name in options.run or found:
             if not found[name].is_current():
                 found[name].run()
     if options.check:
-        older = sorted(name for name in cited() if not found[name].is_current())
+        page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+        older = sorted(name for name in cited(page) if not found[name].is_current())
         sys.exit(older and f"error: README.md cites studies that are older than the program: {', '.join(older)}")
-    print(table())
+    for name, study in found.items():
+        record = study.record()
+        state = "current" if study.is_current() else "older" if record else "not measured"
+        print(f"{name:18} {state:13}", *(str(record.get(column, "")) for column in ("commit", "date", "core_hours")))
 
 
 if __name__ == "__main__":

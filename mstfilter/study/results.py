@@ -5,7 +5,7 @@
 
 Layout::
 
-    study.json       description, arms with their configuration, scenes, seeds, the folder of every run
+    study.json       description, code, libraries, machine, arms with their configuration, scenes, seeds, runs
 
     runs/NAME/       one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz: counts of
                      its forecasts

@@ -18,7 +18,7 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.files import locked, sweep, writing
 from mstfilter.lazy import progress_of
-from mstfilter.processes import check_main_guard
+from mstfilter.processes import check_main_guard, machine
 from mstfilter.reading import check_private
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
@@ -215,6 +215,9 @@ def _description(plan: Plan) -> dict[str, Any]:
         "name": study.name,
         "description": study.description,
         "reference": plan.reference,
+        "code": plan.code,
+        "libraries": library_versions(),
+        "machine": machine(),
         "arms": [
             {name: getattr(arm, name) for name in ("name", "reported_only", "uses_truth", "config")}
             for arm in plan.arms

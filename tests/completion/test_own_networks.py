@@ -84,7 +84,8 @@ def completed(completer: NetworkCompleter, seed: int = 0) -> np.ndarray:
 
 def test_a_network_in_torch_gives_its_logits(tmp_path):
     net = save(tmp_path / "mine", Convolution())
-    completer = NetworkCompleter(weights=str(tmp_path / "mine"), architecture=Convolution(), least_surface=0, log_odds=0)
+    folder = str(tmp_path / "mine")
+    completer = NetworkCompleter(weights=folder, architecture=Convolution(), least_surface=0, log_odds=0)
     np.testing.assert_allclose(completed(completer), expected(net, scale=0.8, shift=0.3), atol=1e-6)
     save(tmp_path / "other", Convolution(), seed=1)
     other = replace(completer, weights=str(tmp_path / "other"))

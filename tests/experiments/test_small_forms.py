@@ -225,9 +225,3 @@ def test_newcomer(tmp_path):
     rows = read_csv(tmp_path / "hour.csv")
     assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer", "notebook"}
     assert [row["step"] for row in rows if row["fault"]] == []
-
-
-def test_correct_components(tmp_path):
-    found = run_script("correct_components/run.py", "--only", "rejuvenations", "--out", tmp_path / "checks.csv")
-    assert "6 checks, 0 rejected" in found
-    assert [row["broken"] for row in read_csv(tmp_path / "checks.csv")] == [""] * 6
