@@ -90,8 +90,7 @@ class NetworkCompleter(Completer, UsesFiles):
         lattice = grid if abs(grid.voxel_size - LATTICE) < 1e-6 else _lattice(grid)  # views have boxes of it
         found = super().complete_each(rngs, frame, masks, lattice, views)
         if lattice is not grid:
-            pairs = zip(found, masks, strict=True)
-            found = [self._on_grid(one, frame, np.asarray(mask, dtype=bool), grid, lattice) for one, mask in pairs]
+            found = [self._on_grid(one, frame, m, grid, lattice) for one, m in zip(found, masks, strict=True)]
         return [one.shifted(self.log_odds) for one in found]
 
     def _on_grid(
@@ -103,7 +102,7 @@ class NetworkCompleter(Completer, UsesFiles):
         corners = np.array([one.offset, one.offset + one.probability.shape]) * LATTICE / grid.voxel_size
         low, high = np.floor(corners[0] + 1e-6).astype(np.int64), np.ceil(corners[1] - 1e-6).astype(np.int64)
         high = np.maximum(np.minimum(high, grid.shape), low)
-        seen = observed_in(frame, mask, grid, self, low, high)
+        seen = observed_in(frame, np.asarray(mask, dtype=bool), grid, self, low, high)
         p = np.zeros(seen.surface.shape, np.float32)
         if p.size:
             index = np.indices(p.shape).reshape(3, -1).T + low
