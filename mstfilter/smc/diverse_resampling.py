@@ -131,7 +131,7 @@ class Chopthin(WeightResampler):
 
 
 def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
-    """The threshold a with sum h(w_i) = n (see `Chopthin`) for positive weights (m,), or one of several such thresholds."""
+    """A threshold a with sum h(w_i) = n for positive weights (m,) (see `Chopthin`). There may be several."""
     w = np.sort(weights)
     # For a between neighbours among all w and 2 w / ratio, sum h = share / a + middle: particles below the index
     # `thinned` have w < a, those from `unchopped` on have w > ratio a / 2.

@@ -175,7 +175,7 @@ class WeightResampler(Resampler):
 class Trigger(Bounded, ABC):
     """Decides whether a step resamples."""
 
-    #: Whether `wants` also takes the populations of R runs as one, with `ess` (R,), and returns (R,) bool or one bool.
+    #: Whether `wants` also takes the populations of R runs together, with `ess` (R,), and returns (R,) or one bool.
     batched: ClassVar[bool] = False
 
     @abstractmethod
@@ -266,7 +266,7 @@ class Distribution(ABC):
         return self.parameter_shape[1:]
 
     def value_shape(self, size: int) -> tuple[int, ...]:
-        """Shape ``(size, *event_shape)`` of `size` values; InputError if the parameters have neither 1 nor `size` rows."""
+        """Shape ``(size, *event_shape)`` of `size` values; InputError if the parameters are for another size."""
         shape = self.parameter_shape
         if shape and shape[0] not in (1, size):
             raise InputError(

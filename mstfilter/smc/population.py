@@ -366,7 +366,7 @@ class Population:
 
 
 def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
-    """Table columns from arrays. The first `axes` axes index the rows; an array x has columns ``x_0``, ``x_1``, ..."""
+    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
     columns = {}
     for name, a in arrays.items():
         a = np.asarray(a)
