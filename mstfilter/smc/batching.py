@@ -87,8 +87,8 @@ def run_together(
 
     If `check` is True, some runs are compared with single runs. With `rounding`, they may differ by rounding.
 
-    Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component states ``batched=True``
-    but mixes runs.
+    Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component that states
+    ``batched=True`` lets runs affect each other.
     """
     keep_freed_memory()
     check_together(filters.one(0))

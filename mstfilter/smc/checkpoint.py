@@ -36,7 +36,7 @@ _FORMAT = 1
 
 
 def save_state(path: Path, state: State, codec: Codec | None = None, *, compress: bool = False) -> None:
-    """Write a state after at least one step to an .npz file, atomically. The folder must exist.
+    """Write a state to an .npz file, atomically. The run must have made a step, and the folder must exist.
 
     `codec` encodes particles that `ArrayCodec` cannot store. `compress` makes the file smaller and writing slower.
     Raises InputError if the particles cannot be stored or the file cannot be written.

@@ -108,9 +108,9 @@ def run_variance(
     all particles share one ancestor at time 0. The bias from the lag is small if x_t hardly depends on x_{t-L}.
 
     The estimated variances are of first order in 1 / n, and too low for small n. In `experiments/run_variance`, 300
-    particles give estimates within 15 % of the variance over seeds. With 30 particles, a log evidence of variance 2
-    goes with variances of means that are estimated 90 % too low (`sizes.csv`). Use more particles if the log evidence
-    has a variance above 0.3.
+    particles give estimates within 15 % of the variance over seeds. With 30 particles, the log evidence of AR(1) has
+    a variance of 2, and the variances of means are estimated 90 % too low (`sizes.csv`). Use more particles if the
+    log evidence has a variance above 0.3.
 
     Parameters
     ----------

@@ -285,7 +285,7 @@ class Uniform(_Independent):
 
 
 def _cholesky(cov: np.ndarray) -> np.ndarray:
-    """Lower triangular root of each covariance; in `hypothetical`, NaN for a row that is not positive definite."""
+    """Lower triangular root of each covariance; in `hypothetical`, NaN for one that is not positive definite."""
     if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
         raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
     size = abs(cov).max(axis=(-1, -2), initial=0.0)

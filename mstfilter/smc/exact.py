@@ -69,7 +69,7 @@ def _matrices(
 
 
 def _varies(array: np.ndarray) -> dict[str, bool]:
-    """Parameters of a function of the matrix, as in `step_parameters`: ``t`` if the matrix changes with time."""
+    """Step parameters of a function that uses a matrix: ``t`` if the matrix changes with time, else none."""
     return {"t": True} if array.ndim == 3 else {}
 
 

@@ -20,7 +20,7 @@ to the log weights. `mstfilter.smc.Dynamics` makes a guided transition for any m
 
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
 `Transition` and an `Update`. Optional components are `Size` (number of particles), `Lookahead` (auxiliary filter),
-`Rejuvenation` (resample-move) and `Codec` (checkpoints of objects). `DensityTransition` extends
+`Rejuvenation` (resample-move) and `Codec` (checkpoints of object particles). `DensityTransition` extends
 `Transition`, and `WeightResampler` extends `Resampler`. Models and programs use `Distribution` objects.
 """
 
@@ -58,7 +58,7 @@ class Component(AtStep, ABC):
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
         The author of a component declares whether this holds. The default is True; write ``properly_weighted =
-        False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
+        False`` in the class to change the default. `mstfilter check` tests it for resamplers. A filter
         reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True

@@ -161,7 +161,7 @@ def _settle_pairs(
 
 
 def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
-    """(n,) index of the particle at each position. Each has floor(n / m) positions, n % m of them one more."""
+    """(n,) particle at each position. A particle has floor(n / m) positions; n % m random ones have one more."""
     particles = np.arange(m) if n == m else np.tile(np.arange(m), n // m)
     if n % m:
         particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
@@ -229,7 +229,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """Weights of one run by `checked_weights`, or weights (R, m) with maximum 1 of R runs, without the checks."""
+    """(m,) weights by `checked_weights` for one run; (R, m) weights with maximum 1, unchecked, for R runs."""
     if log_weights.ndim != 2:
         return checked_weights(log_weights, n)
     weights = log_weights - log_weights.max(axis=1, keepdims=True)
@@ -307,7 +307,7 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
 
 
 def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) index of the interval that contains each point, if weight i is the length of interval i of [0, 1)."""
+    """(n,) index of the interval that contains each point. Interval i of [0, 1) has length weight i / total."""
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
@@ -315,7 +315,7 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight. The points are first distributed among strata of equal weight.
+    """(n,) indices drawn independently by weight. Uniform points are first distributed among equal strata of [0, 1).
 
     For 10^6 points, the function is four times as fast as a binary search.
 

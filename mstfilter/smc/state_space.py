@@ -293,7 +293,7 @@ class RandomWalkMove(Rejuvenation):
 
 
 def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
-    """Each row of `new` if its `accepted` is True, else the row of `old`. Both are arrays or mappings of arrays."""
+    """Row i of `new` if ``accepted[i]``, otherwise row i of `old`. Both are arrays or mappings of arrays."""
     if isinstance(old, Mapping):
         return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
     rows = accepted if old.ndim == 1 else accepted.reshape(-1, *(1,) * (old.ndim - 1))

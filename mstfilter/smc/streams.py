@@ -106,7 +106,7 @@ def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
 
 
 def key_of(rng: np.random.Generator) -> Key:
-    """The key of the stream of a generator at any position in the stream."""
+    """The key of the stream of a generator. The position in the stream has no effect."""
     sequence = rng.bit_generator.seed_seq
     if isinstance(sequence, _KeySequence):
         return sequence.key

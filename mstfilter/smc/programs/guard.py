@@ -121,7 +121,7 @@ class Guard:
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
-        """Check the guide with draws of the model."""
+        """Check that the guide can draw what the model draws, and compare the two estimates of the evidence."""
         n, old = len(gain), 0.0 if self.past is None else self.past.log_weights
         try:
             drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
@@ -306,7 +306,7 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
 
     Each class is checked once.
 
-    For 1000 sorted draws, the integral of the density must differ from the empirical distribution function by less
+    For 1000 sorted draws, the integral of the density may differ from the empirical distribution function by less
     than .12. The false-alarm rate is 1e-12 (Dvoretzky, Kiefer, Wolfowitz).
     """
     from scipy.integrate import cumulative_trapezoid

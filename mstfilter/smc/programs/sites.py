@@ -71,7 +71,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     branches : sequence of callables
         Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
         `observe` and `switch`. Several branches may sample one name, and their values form one array. The entries of
-        particles that do not reach the call are NaN (0 for integers). A branch without particles is also called.
+        particles that do not reach a call are NaN (0 for integers). A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
         Arguments whose rows are split among the branches. A branch reads values shared by all particles from its
         closure.

@@ -201,7 +201,7 @@ def check_properties(
     example: Callable[..., Any] | None = None,
     exact: Callable[..., Any] | None = None,
 ) -> list[CheckResult]:
-    """Test all properties of a component that a contract states.
+    """Test all properties that a contract states for a component.
 
     ``example(rng, n)`` and ``exact(rng, n)`` replace the methods of the contract with these names.
     """
@@ -265,7 +265,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def skips_errors() -> Iterator[None]:
-    """Skip a general test if the component raises an exception, which the tests of the interface report."""
+    """Skip a general test if the component raises an exception. Other tests report the exception."""
     try:
         yield
     except Exception as error:

@@ -117,8 +117,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expected weight of each particle and group.
 
-        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is near the expectation. Near
-        means within four standard errors, plus 16 copies over all calls.
+        For an unbiased scheme, the evidence exceeds log(2 / p) with probability at most p. It is 0 if the mean is
+        near the expectation: within four standard errors, plus 16 copies over all calls.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)
