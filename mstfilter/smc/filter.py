@@ -12,7 +12,7 @@ A step for an observation y makes these calls::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-With ``resample="before"``, a step also resamples after an update that returns more than n particles.
+With ``resample="before"``, a step also resamples after the update if there are more than n particles.
 
 `ParticleFilter.step` has one line for each stage, and `_Step` has one method for each stage. Textbook filters have no
 `proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided filters have a transition
