@@ -122,8 +122,8 @@ class Shuffled(ResamplerWrapper):
 class Coalesced(ResamplerWrapper):
     """Merges particles that are equal by `equivalence`, and sums their weights, before the selection.
 
-    The first of the heaviest particles of each class is kept. The result represents the same distribution with fewer
-    particles. The number of particles grows again only if a transition or update makes more candidates.
+    The heaviest particle of each class is kept (the first of several). The result represents the same distribution
+    with fewer particles. The number of particles grows again only if a transition or update makes more candidates.
     ``notes["distinct"]`` is the number of different particles of positive weight.
     """
 
