@@ -108,7 +108,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Nearly certain log odds of the truth, so that probable partitions are as near to the truth as possible.
+    """Log odds that are nearly certain of the truth, so that the most probable partitions are close to the truth.
 
     A cell belongs to the true object of most of its readings.
     """

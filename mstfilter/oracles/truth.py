@@ -88,7 +88,7 @@ class RecordingTruth:
 
     @cached_property
     def _mended(self) -> dict[bytes, int]:
-        """The first pause with each frame, by the key of the frame with estimated missing readings."""
+        """The first pause at which each frame was taken, by the key of the frame with estimated missing depth."""
         from mstfilter.scene import foreground  # needs cv2, which the registry does not
 
         recording = self.recording
@@ -109,7 +109,7 @@ class RecordingTruth:
 
 
 class UsesTruth:
-    """A component that uses the truth. A component inherits `UsesTruth` together with its interface."""
+    """Base class of components that use the truth, in addition to the base class of their interface."""
 
     #: Data that the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
@@ -137,7 +137,7 @@ class UsesTruth:
 
 
 def uses_truth(component: Any) -> list[str]:
-    """Class names of those components that use the truth, among the component and its nested components, in order."""
+    """Class names of the components that use the truth: the component itself and nested components, in order."""
     return [type(part).__name__ for part in nested_components(component) if isinstance(part, UsesTruth)]
 
 

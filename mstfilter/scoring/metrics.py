@@ -120,7 +120,7 @@ def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
-    """Mean, weighted by size, of the largest intersection over union of some true objects with an object, or NaN."""
+    """Mean over the true objects `labels`, weighted by size, of the largest IoU with an object; NaN without any."""
     _, _, sizes, jaccard = _objects(table)
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():
@@ -135,10 +135,10 @@ def object_metrics(table: Overlap) -> dict[str, float]:
     - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Only
       hypothesis objects with at least a tenth of the true object's size count.
     - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
-    - *missed*: true objects of which no hypothesis object contains more than half, and that contain more than half of
-      no hypothesis object.
-    - *invented*: hypothesis objects of which no true object contains more than half, and that contain more than half
-      of no true object (as in Hoover et al. 1996).
+    - *missed*: true objects t for which no hypothesis object h exists such that h contains more than half of t, or t
+      more than half of h.
+    - *invented*: hypothesis objects h for which no true object t exists with the same property (as in Hoover et al.
+      1996).
 
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
     (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if neither the truth nor the hypothesis has objects.
@@ -183,8 +183,8 @@ def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
 def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
     """Index of the hypothesis of least expected loss, with the largest weighted mean quality against all hypotheses.
 
-    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. The hypothesis is the best
-    single answer among the hypotheses if the truth has their distribution.
+    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. It is the best
+    single answer among the hypotheses if the truth is distributed as the weighted hypotheses.
     """
     return int(np.argmax(pairwise_quality(labels) @ np.asarray(weights, dtype=np.float64)))
 
@@ -196,7 +196,7 @@ def diversity(quality: np.ndarray) -> float:
 
 
 def _patterns(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct columns of (k, m) small integers, and the number of times that each column occurs."""
+    """Distinct columns of an array (k, m) of small integers, and the number of times that each column occurs."""
     code = np.zeros(columns.shape[1], np.int64)
     for row in columns:  # renumbered after each row to keep the code small
         code = code * (int(row.max(initial=0)) + 1) + row

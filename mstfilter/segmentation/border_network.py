@@ -58,7 +58,7 @@ def encode_image(frame: Frame) -> np.ndarray:
 
 
 def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarray:
-    """Normals (3, H, W) of a smoothed disparity image. The components are along image rows, `up` and a third axis."""
+    """Normals (3, H, W) of a smoothed disparity image, along the image rows, `up` and a third axis."""
     smooth = cv2.GaussianBlur(disparity, (0, 0), 1.5)
     a = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8
     b = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
@@ -144,7 +144,7 @@ class BorderNetwork:
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:
-        """The output maps for a frame of any size. A missing pose is fitted to the plane of the table."""
+        """The output maps for a frame of any size. A missing pose is computed from the support plane."""
         h, w = frame.depth.shape
         small = reduced(frame)
         x = encode_image(small)

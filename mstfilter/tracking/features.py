@@ -87,7 +87,7 @@ class Matches:
     q: np.ndarray
 
     def within(self, first: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
-        """Indices of the pairs that start inside mask ``first`` (H, W) and, if ``last`` is given, end inside ``last``."""
+        """Indices of the pairs that start inside the mask ``first`` (H, W) and end inside ``last``, if given."""
         keep = first[self.before[:, 1], self.before[:, 0]]
         if last is not None:
             keep = keep & last[self.after[:, 1], self.after[:, 0]]

@@ -318,7 +318,7 @@ class MstRule(MotionRule):
                     yield kind, result.T, support
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
-        """Search a grid of shifts on the table for several rotations, and refine two shifts for each rotation."""
+        """Search a grid of shifts on the table for several rotations. Refine the two best shifts of each rotation."""
         n = round(_SEARCH_RADIUS / _SEARCH_STEP)
         shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
         shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]

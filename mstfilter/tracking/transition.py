@@ -65,8 +65,8 @@ class Warp(Bounded):
         With "splat", an object loses 3-14 % of its voxels per step.
     collisions : "deepest" or "label"
         Rule for a voxel that several objects cover. With "deepest", the voxel goes to the object in which it is
-        deepest or, for equal depths, to the object with the smaller residual. With "label", the voxel goes to the object with the
-        higher label, as in the authors' program.
+        deepest or, for equal depths, to the object with the smaller residual. With "label", the voxel goes to the
+        object with the higher label, as in the authors' program.
     """
 
     method: Literal["smooth", "splat"] = "smooth"
@@ -343,7 +343,7 @@ class TrackingTransition(Transition):
     def _track_all(
         self, rng: np.random.Generator, clip: Clip, segments: list[dict[int, Segment]]
     ) -> dict[bytes, tuple[str, tuple[Candidate, ...]]]:
-        """Kind and candidates of each distinct segment, by its key. A segment that is not tracked has no candidates."""
+        """Kind and candidates of each distinct segment, by key. A segment that is not tracked has no candidates."""
         tracks = self.flow.track(clip)
         found: dict[bytes, tuple[str, tuple[Candidate, ...]]] = {}
         moving: list[Track] = []
