@@ -125,7 +125,7 @@ class Floor(Proposal):
     objects : ObjectRule
         Rule that decides which pixels are above the table.
     threshold : float
-        Occupancy probability from which a voxel is occupied.
+        Voxels with at least this probability are occupied.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -163,7 +163,7 @@ class OccupiedComponents(Floor):
 class ImageComponents(Floor):
     """Connected components of the image above the table. Each component is completed to a 3-D shape.
 
-    ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
+    A component has at least ``objects.min_points`` pixels. Neighbouring pixels with depths that differ by more
     than 2 cm are not connected. `Floor` describes the parameters.
     """
 

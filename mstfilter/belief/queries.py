@@ -65,7 +65,7 @@ _LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 
 
 
 class Border(NamedTuple):
-    """A border in an image. The hypotheses disagree whether both sides of the border are one object."""
+    """A border in an image. The hypotheses disagree about whether both sides of the border are one object."""
 
     one_object: float  #: probability that both sides are one object, if both are objects
     pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
@@ -174,9 +174,9 @@ class Belief:
 
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
         k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
-        probabilities, it contains both voxels with the smaller probability. `a` and `b` (..., 3) are broadcast
-        against each other. If a = b, the result is the occupancy. If b has all voxels, the result is the extent of
-        the object at a.
+        probabilities, the smaller one is the probability that the object contains both voxels. `a` and `b` (..., 3)
+        are broadcast against each other. If a = b, the result is the occupancy. If b has all voxels, the result is
+        the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -254,7 +254,7 @@ class Belief:
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
         between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label
-        images. Parts of less than 200 pixels (in an image of 640 x 480) belong to the nearest larger part.
+        images. Parts of fewer than 200 pixels (in an image of 640 x 480) join the nearest larger part.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
         refined = self._refined_image(camera)
@@ -277,8 +277,9 @@ class Belief:
         """Entropy of the segmentation of the scene, in nats.
 
         ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. The entropy is the
-        information in the true segmentation. Without tolerance, the entropy is an upper bound of the information of
-        every outcome that the labels determine. The distance for the tolerance is `information.partition_distance`.
+        expected information of the true segmentation. Without tolerance, the entropy is an upper bound of the
+        information of every outcome that the labels determine. The distance for the tolerance is
+        `information.partition_distance`.
         """
         rows = canonical_rows(self._refined.objects)
         return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
@@ -405,7 +406,7 @@ def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cells a < b (m,) of neighbouring pixels that differ in `cells` (H, W), and one of the two pixels (m, 2)."""
+    """Cells a < b (m,) of neighbouring pixels in different `cells` (H, W), and one of the two pixels (m, 2)."""
     found = []
     for axis in (0, 1):
         one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))

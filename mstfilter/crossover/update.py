@@ -8,8 +8,8 @@
 
        ``log w = log w_i + log w_j + lambda log Q_j``
 
-   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. A candidate does not affect
-   its weight, so candidates are resampled first, and only the selected candidates are built.
+   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. The weights are
+   known in advance, so candidates are resampled first, and only the selected candidates are built.
 
 Without a proposal, the update only projects and weights the predictions. The projection follows the manifold filter
 of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, hardly any prediction agrees. So

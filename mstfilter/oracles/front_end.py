@@ -104,7 +104,7 @@ _WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
 
 @dataclass(frozen=True)
 class TrueCompletion(UsesTruth, Completer):
-    """The true voxels of the objects that a mask shows. A mask without true objects gets its visible surface.
+    """The true voxels of the objects that a mask shows. A mask without true objects gives its visible surface.
 
     `objects` determines which pixels can belong to an object. True voxels are assigned to pixels of their object. A
     mask with at least 75 % of an object's pixels gets all voxels of the object. An object is ignored if it covers

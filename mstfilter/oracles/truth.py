@@ -7,8 +7,8 @@ before a run. `bind_truth` binds all components of a filter that use the truth, 
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies bind the components automatically. The truth is not a field of the component, so binding
-changes neither the description nor the equality of a component. Binding changes the `component_key` of a component.
+``mstfilter run`` and studies bind the components automatically. The truth is not a field of the component, so bound
+and unbound components are equal and have the same description. Binding changes the `component_key` of a component.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class RecordingTruth:
 
 
 class UsesTruth:
-    """Base class of components that use the truth, in addition to the base class of their interface."""
+    """Additional base class of components that use the truth."""
 
     #: Data that the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)

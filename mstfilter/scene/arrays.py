@@ -24,7 +24,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array. Writeable memory is copied, so that no write to another array changes the result."""
+    """A read-only array. Writeable memory is copied, so that later writes to other arrays do not change it."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:

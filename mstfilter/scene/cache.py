@@ -147,7 +147,7 @@ class Cache:
         return self._n_bytes
 
     def forget(self) -> None:
-        """Drop the values last used before the two previous calls of `forget`.
+        """Drop the values that were last used before the two previous calls of `forget`.
 
         A loop over pauses that calls `forget` after each step keeps the values of the last two steps.
         """

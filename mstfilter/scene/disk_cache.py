@@ -3,7 +3,7 @@
 >>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
 ...     run()                                    # values with `stored_as` are stored, and found again
 
-Only values with the argument `stored_as` of `memo` are stored on disk. The library diskcache stores the entries and
+Only values for which `memo` gets `stored_as` are stored on disk. The library diskcache stores the entries and
 removes the least recently used entries beyond the limit. Entries are .npz files without pickled objects.
 """
 

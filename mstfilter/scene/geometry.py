@@ -7,7 +7,7 @@
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
 The noise of disparity does not depend on depth, so the support plane is found by a least-squares fit of an affine
-function to disparity. For every image size, the unit is 1/8 pixel of a Kinect (f = 525 pixels, b = 0.075 m).
+function to disparity. Its unit is 1/8 pixel of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _fit(frame: Frame) -> SupportPlane:
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """Camera pose in world axes with z up and the plane at z = 0. `plane` has a, b, c of disparity a u + b v + c."""
+    """Camera pose in world axes with z up and the plane at z = 0. `plane` is (a, b, c) of disparity a u + b v + c."""
     scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K

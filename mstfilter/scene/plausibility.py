@@ -186,7 +186,7 @@ _Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
-    """A finding for a value outside the `usual` limits. The finding stops the run outside the `possible` limits."""
+    """A finding for a value outside the `usual` limits. A value outside the `possible` limits stops the run."""
     if not usual[0] <= value <= usual[1]:
         yield Finding(not possible[0] <= value <= possible[1], text, hints)
 

@@ -303,7 +303,7 @@ class Recording:
 
 
 class UsesFiles(ABC):
-    """Base class of components that read files of the user, in addition to the base class of their interface."""
+    """Additional base class of components that read files of the user."""
 
     #: Fields with paths of files or folders, whose hashes a run records.
     path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")

@@ -297,7 +297,7 @@ class Occupancy:
         return content_key("occupancy", self.owner, self.probability)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
-        """The occupancy for new labels, only with owners in `known`. Changed voxels get probability 0 or 1."""
+        """The occupancy for new labels. Changed voxels get probability 0 or 1. Owners outside `known` are removed."""
         changed = before != after
         owner = np.where(changed | (after > 0), after, self.owner)
         p = np.where(changed, after > 0, self.probability)
@@ -440,7 +440,7 @@ class Hypothesis:
     mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
-        """Rigid motion of an object in world metres since its first observation or last change (`ObjectRecord`)."""
+        """Rigid motion of an object in world metres since its first observation or its last change of shape."""
         return self.record(label).motion
 
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:

@@ -1,7 +1,7 @@
 """Questions about a recording, and the answers of a weighted set of hypotheses.
 
-A question asks whether two voxels belong to one object. The recording alone determines the questions of a pause. The
-questions depend neither on the ground truth nor on a hypothesis. So all methods answer the same questions, and no
+A question asks whether two voxels belong to the same object. The recording alone determines the questions of a pause.
+The questions depend neither on the ground truth nor on a hypothesis. So all methods answer the same questions, and no
 answer has a better expected score than the true probabilities.
 
 >>> questions = ask(recording, t=2)                            # 20,000 pairs of voxels

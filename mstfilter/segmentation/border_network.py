@@ -5,10 +5,10 @@
 >>> seen.border[row, column], seen.foreground[row, column], seen.centre[row, column]
 
 A frame is reduced to 320 pixels per row (`encode_image`), and the output maps are interpolated to the size of the
-frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. At the input and
-the output, 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's border,
-and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre (Neven
-et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. In the input and
+the output, blocks of 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's
+border, and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre
+(Neven et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations

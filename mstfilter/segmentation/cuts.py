@@ -60,7 +60,7 @@ class SceneCutObjectness(CutValue):
     background_weight : float
         Area of each pixel that is not above the table. With area 1, as in SceneCut, the table contributes most of the
         optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives more random
-        cuts. With area 0, splits of the table do not change the value, and Markov chains often split the table.
+        cuts. With area 0, splits of the table do not change the value, and Markov chains waste steps on them.
     """
 
     background_weight: float = 0.003

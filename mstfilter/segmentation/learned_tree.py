@@ -2,7 +2,7 @@
 
 Watershed regions of a boundary map are merged in pairs. The pair with the lowest log odds is merged first. The log
 odds are linear in `FEATURES` of the border and of the union of two regions. The features are recomputed when a region
-grows. A model file has the weights of the features, which were fitted on simulated scenes only.
+grows. A model file has the weights of the features. The weights were fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees

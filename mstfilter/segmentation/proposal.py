@@ -72,7 +72,7 @@ class ObjectRule:
     Parameters
     ----------
     min_points : int
-        Number of depth readings of the smallest object.
+        Smallest number of depth readings of an object.
     mend : bool
         Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If
         False, every reading above the table can belong to an object, as published.
@@ -141,7 +141,7 @@ class TreeCutProposal(Proposal):
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is ``log
         p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability of a cut counts twice.
     threshold : float
-        Occupancy probability from which a voxel is occupied.
+        Voxels with at least this probability are occupied.
     """
 
     boundary: BoundaryModel = field(default_factory=ColourDepthBoundary)
@@ -247,8 +247,8 @@ def hypothesis_of(
 ) -> Hypothesis:
     """One hypothesis from the 3-D shapes of the segments of a frame, at the pause `birth`.
 
-    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. `threshold` is the
-    occupancy probability from which a voxel is occupied. `mstfilter.completion.arbitrate` assigns voxels that several
+    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. Voxels with
+    probability `threshold` or more are occupied. `mstfilter.completion.arbitrate` assigns voxels that several
     shapes contain.
     """
     labels = arbitrate(completions, grid, threshold)

@@ -87,7 +87,7 @@ class Regions:
 
 
 def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Split leaves (H, W) int at the outline of the object `pixels` (H, W) bool. Pixels outside objects become 0.
+    """Split leaves (H, W) int at the outline of `pixels` (H, W) bool. Other pixels become 0.
 
     Each connected part of a leaf becomes a leaf. Parts of a few pixels join the nearest larger part.
     """

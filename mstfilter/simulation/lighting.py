@@ -86,7 +86,7 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 class LightMap:
     """Raster of the light on the table, with points `spacing` metres apart.
 
-    A value is the mean, over the sources `lights` (k, 3), of the cosine of incidence, or 0 in shadow.
+    A value is the mean, over the sources `lights` (k, 3), of the cosine of the angle of incidence (0 in shadow).
     """
 
     def __init__(self, spacing: float, lights: np.ndarray) -> None:

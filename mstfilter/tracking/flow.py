@@ -3,7 +3,7 @@
 Two results are accumulated over the frames of the clip:
 
 - The first result is a grid of points of the first frame, followed forward (for rigid fits).
-- The second result is a pull map. For every pixel of the last frame, the pull map has the position in the first
+- The second result is a pull map. For every pixel of the last frame, the pull map has its position in the first
   frame. A label image of ``clip.before`` is indexed by the pull map to give the label image of ``clip.after``.
 
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
@@ -260,8 +260,8 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     """Whether each pixel has the same content in the first and last frame, (H, W) bool.
 
     The content is the same if two conditions hold. Depth differs by at most four standard deviations. After blur and
-    exposure matching, colour differs by at most 12 grey levels in every channel. Pixels that show the robot or have no
-    depth count as changed.
+    exposure matching, colour differs by at most 12 grey levels in every channel. Pixels that show the robot or have
+    no depth count as changed.
     """
     change = max_of_three(np.abs(smooth_colour(first) - matched_colour(last, first)))
     return same_depth(first, last) & (change <= 12.0)

@@ -6,7 +6,7 @@ depth m, the cost of a point is
 - ``min(|z - m| / s, cap)^2 + min(|colour difference| / c, cap)^2``, where s is the sensor noise at this range;
 - a constant if z is behind m by more than a margin (occluded);
 - a larger constant outside the image;
-- 0 without a reading, on the robot, or if it is occluded and the moved surface faces away (the point is not counted).
+- 0, and not counted, without a reading, on the robot, or if the point is occluded and its surface faces away.
 
 The score S is the mean cost of the counted points, plus two terms. The first term grows with the fraction of visible
 points on pixels that the flow traces back to another object. It distinguishes two objects that look the same. The
@@ -53,7 +53,7 @@ class MotionResidual:
 
     `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
     `target_weight` is added to S if the motion explains no point that the flow traces back to this object.
-    S is infinite if a smaller fraction of the points than `min_visible` would be visible, except at rest. An object
+    S is infinite if less than `min_visible` of the points would be visible, except for the identity. An object
     at rest can become hidden, but the image does not support a motion to one of many hidden positions.
     """
 

@@ -243,7 +243,7 @@ class MstRule(MotionRule):
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame. The refined motions are added.
+        Number of best candidates that are refined against the whole last frame. The refined motions are also used.
     search_above : float
         If every score is larger than this value, the object is searched for around its last position, upright and
         toppled. A negative value disables the search.

@@ -48,7 +48,7 @@ class Segment:
 def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     """The segments of a hypothesis in a frame, by label. Hidden objects have no segment.
 
-    The support contains the pixels above the table where measured and rendered depth differ by less than two voxels.
+    `Segment.support` has the pixels above the table where measured and rendered depth differ by less than two voxels.
     """
     labels, depth = render_hypothesis(hypothesis, frame.camera)
     with np.errstate(invalid="ignore"):

@@ -213,7 +213,7 @@ def _moved_box(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, 
 
 
 def _pull(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels (N, 3) of the source moved by T, and their depth inside (N,). N does not change by the motion."""
+    """Voxels (N, 3) of the source moved by T, and their depth inside (N,). N is the number of source voxels."""
     index, at_source = _moved_box(crop, T, grid)
     cell = np.rint(at_source - 0.5).astype(np.int64)
     turned = np.abs(T[:3, :3] - np.rint(T[:3, :3])).max()
