@@ -174,7 +174,7 @@ class Belief:
 
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
         k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
-        probabilities, the smaller one is the probability that the object contains both voxels. `a` and `b` (..., 3)
+        probabilities, the minimum is the probability that the object contains both voxels. `a` and `b` (..., 3)
         are broadcast against each other. If a = b, the result is the occupancy. If b has all voxels, the result is
         the extent of the object at a.
         """

@@ -38,7 +38,7 @@ class SceneObjects:
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw the shapes and textures of a scene, from all families of objects. Cartons and cans are more frequent."""
+    """Draw the shapes and textures of a scene, from all families of objects. Most frequent are cartons and cans."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []

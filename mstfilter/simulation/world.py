@@ -380,7 +380,7 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate fails, the
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If no candidate does so, the
     candidate with the best balance of moved and toppled objects is taken. Candidates that drop an object or leave an
     object in motion are discarded. Raises InputError if no candidate moves any object.
     """

@@ -259,9 +259,9 @@ def _pixel(at: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndar
 def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     """Whether each pixel has the same content in the first and last frame, (H, W) bool.
 
-    The content is the same if two conditions hold. Depth differs by at most four standard deviations. After blur and
-    exposure matching, colour differs by at most 12 grey levels in every channel. Pixels that show the robot or have
-    no depth count as changed.
+    The content is the same if two conditions hold. Depth differs by at most four standard deviations of the
+    difference. After blur and exposure matching, colour differs by at most 12 grey levels in every channel. Pixels
+    that show the robot or have no depth count as changed.
     """
     change = max_of_three(np.abs(smooth_colour(first) - matched_colour(last, first)))
     return same_depth(first, last) & (change <= 12.0)

@@ -149,7 +149,7 @@ def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionClu
 
 
 def refine_robust(T: np.ndarray, p: np.ndarray, q: np.ndarray, scale: float) -> np.ndarray:
-    """Reweighted least squares from ``T``, with Geman-McClure weights (1 + r^2 / scale^2)^-2 (scale in metres)."""
+    """Reweighted least squares started at ``T``, with Geman-McClure weights (1 + r^2 / scale^2)^-2 (`scale` in m)."""
     for _ in range(10):
         squared = ((move_points(T, p) - q) ** 2).sum(axis=-1)
         weights = (1.0 + squared / scale**2) ** -2
