@@ -25,7 +25,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
 
     If a hypothesis has probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
     ``source_probability`` concatenates the probabilities of all `Crop` objects. Each `ObjectView` has a row in
-    ``view_of`` (row of the viewed object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4),
+    ``view_of`` (row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4),
     ``view_key``. ``view_bits`` and ``view_signed`` concatenate the arrays of all `ObjectView` objects.
     """
     grid = hypotheses[0].grid
