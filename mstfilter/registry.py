@@ -13,9 +13,9 @@ A `Registry` joins the declarations of several packages. `mstfilter.presets.REGI
 Systematic()
 >>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
-A configuration is a nested mapping. A component in a configuration is a name, or a mapping with ``component`` and
-fields. The annotation of a field determines its kind. A field of type ``Resampler`` or ``Resampler | None`` holds a
-resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
+A configuration is a nested mapping. A component in a configuration is a name, or a mapping with the key ``component``
+and fields. The annotation of a field determines its kind. A field of type ``Resampler`` or ``Resampler | None`` holds
+a resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
 
 A component is imported when it is first built. Looking up a name imports no component. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add the class by an entry point ``kind.name`` of the group
@@ -98,7 +98,7 @@ class Registry:
     def check_names(self, cls: type, config: Mapping[str, Any], allow_files: bool = False) -> None:
         """Raise InputError if a field of `cls` names an unknown component, without importing components.
 
-        `make` checks names in nested components, because `make` imports components.
+        Names in nested components are checked by `make`, which imports the components.
         """
         hints = typing.get_type_hints(cls)
         for field, value in config.items():
@@ -150,7 +150,7 @@ class Registry:
     def build(
         self, kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: Any = None
     ) -> Any:
-        """A component from its name, or from a mapping with ``component`` and fields.
+        """A component from its name, or from a mapping with the key ``component`` and fields.
 
         A mapping without ``component`` changes fields of `default`. Error messages contain `where`, the path of the
         component in the configuration. With `allow_files`, ``./file.py:Class`` is loaded.
@@ -174,8 +174,8 @@ class Registry:
     ) -> Any:
         """Build a dataclass from plain values and nested components.
 
-        Fields that are not given have the values of `base`.
-        Raises InputError if a field or a component is unknown, or a value does not fit its field.
+        Fields that are not given have their values in `base`, or their defaults if `base` is None. Raises InputError
+        if a field or a component is unknown, or a value does not fit its field.
         """
         prefix = f"{where}: " if where else ""
         if inspect.isabstract(cls):
@@ -310,7 +310,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _abstract_error(prefix: str, cls: type) -> InputError:
-    """The error for a class without all methods of its interface."""
+    """The error for a class that lacks methods of its interface."""
     missing = sorted(getattr(cls, "__abstractmethods__", ()))
     origin = next(base.__name__ for base in reversed(cls.__mro__) if missing[0] in vars(base))
     hint = f"define {missing[0]} as {origin}.{missing[0]} describes it"
@@ -324,7 +324,7 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """Location ``package:Class`` or ``file.py:Class``. Classes of mstfilter belong to their top package."""
+    """Location ``package:Class`` or ``file.py:Class``, such as ``mstfilter.smc:Systematic`` for any module of smc."""
     if "__mst_file__" in vars(cls):
         return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
@@ -350,7 +350,7 @@ def _from_file(path: str, attribute: str) -> type:
 
 
 def load_file(path: str | Path) -> ModuleType:
-    """The module of a Python file of the user.
+    """The module made by executing a Python file of the user.
 
     A file is executed once per process for any spelling of its path, and again if its content has changed. Instances
     of its classes can be pickled, because unpickling loads the file.
@@ -422,7 +422,7 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:
-    """A plain value, checked against a field's annotation. A single value of a ``tuple[X, ...]`` needs no list."""
+    """A plain value, checked against a field's annotation. A ``tuple[X, ...]`` also accepts a single X."""
     from pydantic import TypeAdapter, ValidationError
 
     if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):

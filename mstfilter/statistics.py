@@ -47,7 +47,7 @@ class Difference:
     p : float
         Two-sided p value of the sign-flip test; NaN for one unit.
     n : int
-        Number of units with a value of both methods.
+        Number of units for which both methods have a value.
     p_holm : float
         `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
@@ -78,7 +78,7 @@ class Difference:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether both intervals exclude 0. Without a bootstrap interval, only the t interval is used."""
+        """Whether the t interval and the bootstrap interval exclude 0. Without the second, only the first is used."""
         low, high = np.fmin(self.low, self.low_bootstrap), np.fmax(self.high, self.high_bootstrap)
         return bool(low > 0 or high < 0)
 
@@ -93,8 +93,8 @@ def compare(first: Values, second: Values) -> Difference:
     Parameters
     ----------
     first, second : mapping, or (n,) array_like
-        A mapping from units to values, or values in the same order of units. Units without a finite value, such as
-        the seeds of runs in which all weights became zero, are omitted.
+        A mapping from units to values, or arrays of values with the same order of units. Units without a finite
+        value, such as the seeds of runs in which all weights became zero, are omitted.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
     The results are NaN for fewer than five values. The seed is fixed, so the same values give the same result. A
-    resample of equal values has an infinite t ratio. So a limit of the interval is infinite if most values are equal.
+    resample of equal values has an infinite t ratio. So if most values are equal, a limit is infinite.
 
     The p value is the larger of two p values. The equal-tailed p value adapts to the skewness like the interval
     (Efron, Tibshirani 1993, section 12.5). The p value of the absolute t ratio is larger for symmetric values with
@@ -202,7 +202,7 @@ def sign_flip(values: np.ndarray) -> float:
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """p values, adjusted by Holm's method (1979). NaN marks a missing comparison and is not changed."""
+    """p values, adjusted by Holm's method (1979). A NaN, which marks a missing comparison, is not changed."""
     values = np.asarray(p, dtype=float)
     out = np.full(len(values), np.nan)
     order = [k for k in np.argsort(values) if np.isfinite(values[k])]

@@ -86,9 +86,9 @@ class _Workspace(BaseModel):
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or must be empty. No other process may write the folder. The pose of the camera is
-    optional. `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further keyword
-    arguments, such as generator and seed, are stored in manifest.json.
+    The folder must be new or empty, and no other process may write into the folder. `camera` may lack a pose. `grid`
+    is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further keyword arguments, such
+    as generator and seed, are stored in manifest.json.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ def save_recording(
     progress: Callable[[int, int], None] = lambda done, total: None,
     **manifest: Any,
 ) -> Path:
-    """Write a recording as a new recording folder. If the camera moves, every frame stores its pose.
+    """Write a recording as a new recording folder. If the camera moves, the poses are stored in manifest.json.
 
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further keyword arguments, such as the generator, are stored in manifest.json.
@@ -265,7 +265,7 @@ class CameraFile(BaseModel):
 
     @classmethod
     def of(cls, camera: Camera, **more: Any) -> Self:
-        """The entries of a camera; `more` are additional entries of a subclass."""
+        """The entries of a camera. `more` has the additional entries of a subclass."""
         pose = None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist()
         size = {"width": camera.width, "height": camera.height}
         return cls(K=camera.K.tolist(), T_world_camera=pose, **size, **more)
@@ -396,7 +396,7 @@ class RecordingFolder(RecordingFormat):
 
 
 def _read_poses(path: Path) -> Any:
-    """Make the function `Recording.poses`. The first call of the function reads the file."""
+    """A function for `Recording.poses`, which reads the file at its first call."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:
