@@ -35,7 +35,7 @@ from mstfilter.scene import decode_image
 
 @dataclass(frozen=True)
 class Entry:
-    """Reference to a message: header stamp (s), log time (ns), and index among the messages with the same log time."""
+    """Reference to a message: header stamp (s), log time (ns), and index among messages with the same log time."""
 
     stamp: float
     logged: int

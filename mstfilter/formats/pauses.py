@@ -74,7 +74,7 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 
 
 def pauses_from_text(text: str) -> dict[str, Any]:
-    """The configuration of a pause rule, from a text that has the frames or times of pauses, or the name of the rule."""
+    """The configuration of a pause rule, from a text with the frames or times of pauses or the name of a rule."""
     words = text.replace(",", " ").split()
     if words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words):
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
@@ -86,7 +86,7 @@ _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if 
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Absolute difference (...) between the change of each block from `a` to `b` and the median change of all blocks."""
+    """Absolute difference (...) between the change of each block from `a` to `b` and the median change."""
     difference = b - a
     return np.abs(difference - np.median(difference))
 
@@ -184,7 +184,7 @@ class Settled(Still):
     """
 
     def watch(self) -> Callable[[float, np.ndarray], bool]:
-        """A function that takes the time and the colour image of the next frame, and returns whether it is a pause."""
+        """A function of time and colour image of the next frame, which returns whether this frame is a pause."""
         changes = deque[np.ndarray](maxlen=_RECENT)
         first = last = None  # images of the first frame of the interval and of the last frame
         began, found = 0.0, False

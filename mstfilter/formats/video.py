@@ -70,8 +70,7 @@ _NEGLIGIBLE = 0.5  # pixels
 def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarray | None:
     """Column and row in the distorted image for each pixel of the undistorted image, (H, W, 2) float32.
 
-    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... Returns None if every pixel moves by less than half
-    a pixel.
+    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... Returns None if all pixels move by less than 0.5.
     """
     if not any(distortion):
         return None
@@ -206,7 +205,7 @@ class Video:
         return stored, source, lambda index, camera: self._frame(index, stored, source).resized(camera)
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording of the video. The call computes pose and workspace; other images are read on access."""
+        """The recording of the video. The call computes pose and workspace. Frames are read on access."""
         stored, source, read = self.frame_reader()
         camera = stored.limited(self.max_pixels)
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
@@ -310,7 +309,7 @@ class VideoFormat(RecordingFormat, Bounded):
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:
-    """A label image (H, W) uint16 without the number 255, which is reserved for the robot: its object is renumbered."""
+    """A label image (H, W) uint16 in which object 255 has another number, because 255 is reserved for the robot."""
     free = np.setdiff1d(np.arange(256, 65536), labels)[0]
     return np.where(labels == 255, free, labels).astype(np.uint16)
 

@@ -4,8 +4,8 @@
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
-To use the scene in a contract, return the scene from the method `example`, or define ``example = scene_example`` in
-the file of a component.
+To use this input in a contract, return it from the contract's method `example`, or define ``example = scene_example``
+in the file of a component.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
+"""Contracts of evidence terms and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
 
 `contract_of` and `run_contract` accept components of every interface, also the interfaces of `mstfilter.smc`.
 """
@@ -131,7 +131,7 @@ class CompleterContract(StageContract):
     """The contract of every `Completer`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> list[np.ndarray]:
-        """The probabilities of the boxes of three objects, computed without a cache."""
+        """The estimated probabilities in the boxes of three objects, computed without a cache."""
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
@@ -201,7 +201,7 @@ def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool =
 def _estimated(
     completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
 ) -> list[np.ndarray]:
-    """The probabilities of boxes. Box k uses the random stream `first` + k."""
+    """The estimated probabilities in the boxes. Box k uses the random stream `first` + k."""
     bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     with _quiet():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
@@ -274,7 +274,7 @@ def run_contract(
     function ``example`` in the module of the component's class. Without such a function, components that use images
     get a scene, and other components get numbers.
 
-    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
+    For a `Transition`, `Proposal`, `Update` or `Rejuvenation`, ``exact(rng, n)`` returns exact draws and the
     observation, as the contract describes. The default is the function ``exact`` in the module of the class, if any.
     """
     cls = type(component)
