@@ -6,7 +6,7 @@ A message states the error, its place and the value found. Hints state how to co
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
 ('record the frame again',)
 
-`check_number`, `check_integer`, `check_choice` and `check_component` check fields with the same wording.
+`check_number`, `check_integer`, `check_choice` and `check_component` check fields and raise uniform errors.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class InputWarning(_WithHints, UserWarning):
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Put `where` before the message of an InputError in the block, unless the message contains it."""
+    """Put `where` before the message of an InputError that the block raises, unless the message contains it."""
     try:
         yield
     except InputError as error:

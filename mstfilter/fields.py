@@ -12,8 +12,8 @@
 Traceback (most recent call last):
 mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
 
-Three kinds of annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of `Bounded` such as the
-interface of a component, also as ``Interface | None``. Other annotations are not checked.
+A field is checked if its annotation is a number with `Bounds`, a ``Literal``, or a subclass of `Bounded` such as the
+interface of a component, also as ``Interface | None``. Other fields are not checked.
 
 After these checks, the ``__post_init__`` of the class is called. It can check conditions on several fields.
 """

@@ -231,7 +231,7 @@ def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """Differences of a folder from its SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
+    """Differences between a folder and its SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
     lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -308,7 +308,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
 
 
 def _try_to_write(folder: Path, temporary: Path) -> None:
-    """Make a file in a folder and remove it. If possible the file has no name, so that it ends with the process."""
+    """Make a file in a folder and remove it. If possible the file has no name, so that a killed process leaves none."""
     if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:

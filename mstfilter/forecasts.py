@@ -47,7 +47,7 @@ class ForecastTable:
 
     @classmethod
     def of(cls, p: ArrayLike, y: ArrayLike, count: ArrayLike = 1.0) -> ForecastTable:
-        """A table of forecasts p (m,) with outcomes y (m,), or shares of outcome 1, each counted `count` times."""
+        """A table of forecasts p (m,) and outcomes or shares of outcome 1, y (m,), each counted `count` times."""
         p, y = np.asarray(p, dtype=np.float64), np.asarray(y, dtype=np.float64)
         if p.ndim != 1 or p.shape != y.shape:
             raise InputError(f"forecasts have shape {p.shape} and outcomes {y.shape}, expected (m,) twice")
@@ -160,7 +160,7 @@ class Recalibration:
 
     @classmethod
     def fit(cls, table: ForecastTable) -> Recalibration:
-        """The non-decreasing map with the least squared error. Forecasts are weighted by their numbers."""
+        """The non-decreasing map with the least squared error. Each forecast is weighted by its `count`."""
         from scipy.optimize import isotonic_regression
 
         kept = table.count > 0

@@ -48,7 +48,7 @@ def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], 
 
 
 def short_repr(component: Any) -> str:
-    """A short repr: a dataclass with the fields that differ from their defaults; the class name of other objects."""
+    """A short repr: for a dataclass, the fields that differ from the defaults; for other objects, the class name."""
     parts = []
     for field in dataclasses.fields(component) if dataclasses.is_dataclass(component) else ():
         value = getattr(component, field.name, None)

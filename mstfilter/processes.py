@@ -4,7 +4,7 @@
 ...     pool = ProcessPoolExecutor(2)
 
 A new Python interpreter searches modules in the working folder first. So an unknown file ``multiprocessing.py`` there
-would be executed. Processes that start in the block do not search the working folder first. New processes find the
+would be executed. Processes started in a block `environment` do not search this folder first. New processes find the
 caller's modules, because `multiprocessing` and joblib pass on the search path.
 """
 

@@ -14,8 +14,8 @@ Systematic()
 >>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
 A configuration is a nested mapping. A component in a configuration is a name, or a mapping with the key ``component``
-and fields. The annotation of a field determines its kind. A field of type ``Resampler`` or ``Resampler | None`` holds
-a resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
+and fields. The annotation of a field determines the kind of its component. A field of type ``Resampler`` or
+``Resampler | None`` holds a resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
 
 A component is imported when it is first built. Looking up a name imports no component. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add the class by an entry point ``kind.name`` of the group
@@ -274,7 +274,7 @@ def merged(config: Mapping[str, Any], *changes: Mapping[str, Any]) -> dict[str, 
 
 
 def _nested(override: str) -> dict[str, Any]:
-    """The change that ``path=value`` describes."""
+    """The change that ``path=value`` describes, as nested mappings."""
     path, equals, text = override.partition("=")
     parts = path.strip().split(".")
     if not equals or not all(parts) or not text.strip():
@@ -324,7 +324,7 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """Location ``package:Class`` or ``file.py:Class``, such as ``mstfilter.smc:Systematic`` for any module of smc."""
+    """Location of a class: ``package:Class`` with a package such as ``mstfilter.smc``, or ``file.py:Class``."""
     if "__mst_file__" in vars(cls):
         return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
@@ -402,7 +402,7 @@ def _classes_of(module: ModuleType) -> list[type]:
 
 
 def _reduce(instance: object, protocol: Any) -> Any:
-    """Pickle an instance with the path of its file, because other processes cannot import the module by name."""
+    """Pickle an instance with the path of the class's file, as other processes cannot import the module by name."""
     reduced: Any = object.__reduce_ex__(instance, max(int(protocol), 2))
     how, arguments, *state = reduced
     cls = type(instance)
@@ -413,7 +413,7 @@ def _reduce(instance: object, protocol: Any) -> Any:
 
 
 def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """An instance without its state. The user's file that defines the class must have the hash `digest`."""
+    """A new instance, for unpickling. The user's file that defines the class must have the hash `digest`."""
     module = _MODULES.get((Path(path), digest)) or load_file(path)
     cls = getattr(module, name)
     if cls.__mst_source__ != digest:

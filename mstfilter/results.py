@@ -12,7 +12,7 @@ that defines the method. The error of a failed check names the class, the file a
 >>> Mine().score((1, 2))                       # doctest: +SKIP
 InputError: Mine.score (mine.py, line 2) returns a list, expected an array of shape (2,)
 
-The error of a method that changes its read-only input has the same form.
+A method that changes its read-only input causes an error with the same information.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Checked(Bounded):
 
 
 def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
-    """A method with a checked result. A call by an overriding method of a subclass is not checked again."""
+    """A method whose result is checked. A call from an overriding method of a subclass is not checked."""
 
     @functools.wraps(method)
     def call(self: Any, *arguments: Any, **named: Any) -> Any:

@@ -69,7 +69,7 @@ class Difference:
 
     @property
     def p_claim(self) -> float:
-        """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
+        """The larger of `p` and `p_bootstrap`, times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
         A small sample of skewed differences often has no values from the longer tail. The factor corrects the p value
         for this missing tail. The factor was chosen by simulation in `experiments/comparison`.
@@ -136,8 +136,8 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
-    The results are NaN for fewer than five values. The seed is fixed, so the same values give the same result. A
-    resample of equal values has an infinite t ratio. So if most values are equal, a limit is infinite.
+    The results are NaN for fewer than five values. The seed is fixed, so results can be repeated. A resample of equal
+    values has an infinite t ratio. So if most values are equal, a limit of the interval is infinite.
 
     The p value is the larger of two p values. The equal-tailed p value adapts to the skewness like the interval
     (Efron, Tibshirani 1993, section 12.5). The p value of the absolute t ratio is larger for symmetric values with
@@ -241,7 +241,7 @@ def slope(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def conclusion(difference: Difference, first: str, second: str, where: str = "", unit: str = "scene") -> str:
-    """The conclusion from a difference, as a sentence. `unit` names the units that pair the values."""
+    """The conclusion from a difference, as a sentence. `unit` is the word for a paired unit."""
     d, at = difference, f" on {where}" if where else ""
     if d.n == 0:
         return f"{first} and {second}{at}: no {unit} has both."

@@ -192,7 +192,7 @@ class Redwood(VideoFormat):
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a folder is a recording folder. The camera.json of a recording folder has a workspace."""
+    """Whether a folder is a recording folder: it has a manifest.json, or a camera.json with a workspace."""
     camera = path / "camera.json"
     ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
     return ours or (path / "manifest.json").is_file()
@@ -257,7 +257,7 @@ def _paired(
 
 
 def _seconds(number: Decimal) -> Decimal | None:
-    """A time stamp in seconds, from a decimal fraction or an integer Unix time in s, ms, us or ns; else None."""
+    """A time stamp in seconds, from a number with decimals or an integer Unix time in s, ms, us or ns; else None."""
     if number != number.to_integral_value() or number.as_tuple().exponent != 0:
         return number
     unit = next((unit for unit in (1, 10**3, 10**6, 10**9) if 10**9 <= number / unit < 10**10), None)

@@ -86,7 +86,7 @@ _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if 
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Absolute difference (...) between the change of each block from `a` to `b` and the median change."""
+    """Absolute difference between the change of each block from `a` to `b` and the median change of all blocks."""
     difference = b - a
     return np.abs(difference - np.median(difference))
 

@@ -70,7 +70,7 @@ _NEGLIGIBLE = 0.5  # pixels
 def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarray | None:
     """Column and row in the distorted image for each pixel of the undistorted image, (H, W, 2) float32.
 
-    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... Returns None if all pixels move by less than 0.5.
+    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... None if all pixels move by less than half a pixel.
     """
     if not any(distortion):
         return None

@@ -12,7 +12,7 @@ A shape is in metres, in the frame of the camera (x right, y down, z forward) or
 
 * ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a point cloud (ply without triangles), read by open3d.
 * ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probabilities of voxels with edge ``voxel_size``.
-  ``origin`` (3,) is the lowest corner of the array, whose axes are those of the frame.
+  ``origin`` (3,) is the corner with the smallest coordinates, and the axes are those of the frame.
 
 A mesh occupies a voxel if the voxel's centre is inside the mesh. The centre is inside if rays in at least two of
 three directions cross the mesh an odd number of times, so small holes have no effect. A point cloud occupies the
@@ -107,7 +107,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return bound_to(self, _shapes=found, other=other)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probability 1 on the visible surface. `complete_each` adds the voxels of the external shape."""
+        """Probabilities: 1 on the visible surface, 0 elsewhere. `complete_each` adds the external shape."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
@@ -118,7 +118,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks by the shapes in the folder. `views` is not used.
+        """Extend several masks to volumes by the shapes in the folder. `views` is not used.
 
         Raises InputError if `at` was not called before, or if a mask has no shapes.
         """
@@ -153,7 +153,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return Completion(offset, p, seen.points, key.hex()[:16])
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
-        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once."""
+        """Occupancy (X, Y, Z) float32 of the shape in a file, computed only once."""
         data = read_bytes(path, "a shape")
         T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
         key = (content_key(path.suffix, data, T), grid.key)
@@ -172,7 +172,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
 
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
-    """The masks and the names of the shape files of a pause. `shape` is the shape (H, W) of the image.
+    """The mask and the shape files of each object at a pause. `shape` is the shape (H, W) of the image.
 
     Shape files are not read. Raises InputError if a file or folder is missing, or a mask or weights.json is invalid.
     """
@@ -247,7 +247,7 @@ def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
 
 
 def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """The array's values at the centres of the grid's voxels, read from the nearest voxel; 0 outside the array."""
+    """Occupancy (X, Y, Z): the value of the array's voxel at the centre of each grid voxel; 0 outside the array."""
     values = arrays["occupancy"]
     if values.ndim != 3 or values.dtype.kind not in "bfiu" or not values.size:
         raise InputError(f"{path}: occupancy has shape {values.shape} and type {values.dtype}, expected (A, B, C)")

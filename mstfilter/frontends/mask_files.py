@@ -60,8 +60,8 @@ class PauseMasks:
 def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
     """Read the masks of a pause. `shape` is the shape (H, W) of the image.
 
-    Files are read at each call, but unchanged content is parsed once. Raises InputError if the folder has no masks
-    for the pause, or if a file is invalid.
+    Files are read at each call, but unchanged content is parsed only once. Raises InputError if the folder has no
+    masks for the pause, or if a file is invalid.
     """
     if not str(folder):
         raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")

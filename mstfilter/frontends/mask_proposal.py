@@ -116,7 +116,7 @@ class MaskGenerator(Protocol):
 
 
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
-    """Run a mask generator on the last frame of each clip, and write the masks, made disjoint or nested.
+    """Run a mask generator on the last frame of each clip, and write its masks into a folder.
 
     `nested_masks` makes the masks disjoint or nested, with the argument `share`.
     """

@@ -33,8 +33,8 @@ def filter_folder(
 ) -> RunFolder:
     """Filter the images of a folder while they arrive, and return the run folder.
 
-    Except for wall times, the files of each pause are those of a run on the complete folder with the same pause rule.
-    An interrupted live run cannot be resumed.
+    The files of each pause, except wall times, are identical to those of a run on the complete folder with the same
+    pause rule. An interrupted live run cannot be resumed.
 
     Parameters
     ----------

@@ -32,8 +32,8 @@ _CORNERS = {
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, which must not be empty, and other voxels.
 
-    Returns corners (v, 3) int, in voxels from the lower corner of the grid, and the corners' indices (f, 3) int of
-    each triangle. Seen from outside, the corners of a triangle are in counter-clockwise order.
+    Returns corners (v, 3) int, in voxels from the lower corner of the grid, and the indices (f, 3) int of the corners
+    of each triangle. Seen from outside, the corners of a triangle are in counter-clockwise order.
     """
     padded = np.pad(mask, 1)
     quads = []

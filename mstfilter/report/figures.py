@@ -170,11 +170,11 @@ def time_figure(
 ) -> str:
     """Quality of all hypotheses over time, or another measure of the runs, with one panel per family.
 
-    `values` is family -> arm -> pause -> values. A pause has one value for each scene and seed, or for each
-    hypothesis. `arms` names the compared methods in the order of their boxes (`figure_groups` splits long lists).
-    Methods without values are not drawn. If `every_arm` lists up to twelve methods, each has the same colour in all
-    figures with this list. A box contains the middle half of the values, the bar is the median, and whiskers reach
-    the 5th and 95th percentile. Points are values, and lines join the means.
+    `values` is a nested mapping family -> arm -> pause -> values. A pause has one value for each scene and seed, or
+    for each hypothesis. `arms` names the compared methods in the order of their boxes (`figure_groups` splits long
+    lists). Methods without values are not drawn. If `every_arm` lists up to twelve methods, each has the same colour
+    in all figures with this list. A box contains the middle half of the values, the bar is the median, and whiskers
+    reach the 5th and 95th percentile. Points are values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)

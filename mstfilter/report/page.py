@@ -22,7 +22,7 @@ _LONGEST = 6  # lists up to this length are written in full
 
 
 def fill_template(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
-    """The text of a template of this package, with `content` and the style sheet filled in. Missing values are errors."""
+    """The text of a page from a template of this package and `content`. Missing values raise an error."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     folder = files("mstfilter.report") / "templates"

@@ -115,7 +115,7 @@ def overlay(
 ) -> np.ndarray:
     """An image (H, W, 3) with a label image (H, W) drawn over it: translucent fill and contours.
 
-    Inside objects the image is grey (luma of ITU-R BT.601), so that an object has the hue of its label.
+    Inside objects the image is grey (luma of ITU-R BT.601), so that an object has the hue of its label's colour.
     """
     above = overlay_layer(labels, colours, fill=fill, line=line).astype(float)
     alpha = above[..., 3:] / 255

@@ -127,7 +127,7 @@ def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
-    """Number and widest place (pixel) of each object that is large enough in the image, the largest object first."""
+    """Number and position (at the widest part) of each object that is large enough in the image, largest first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
     min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]

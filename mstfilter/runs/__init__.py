@@ -8,7 +8,7 @@
 >>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
 >>> rows = score_pauses(run.estimates(), read_truth(recording))
 
-The same call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
+A repeated call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
 an uninterrupted run have the same result. The module `run` filters, and `run_folder` reads and writes files.
 """
 

@@ -98,7 +98,7 @@ class _LocalRun:
         return [self._outcomes[k] for k in range(len(self._jobs))]
 
     def _next_job(self, worker: _Worker) -> int | None:
-        """The next job: with the ``share`` of the worker's last job, else with one of no worker, else the first."""
+        """The next job: one with the worker's ``share``, else with a ``share`` that no worker has, else the first."""
         other_shares = {share for other, share in self._share_of.items() if other is not worker}
 
         def rank(k: int) -> tuple[bool, bool]:

@@ -191,7 +191,7 @@ class StudyFolder:
         return found
 
     def records(self) -> list[dict[str, Any]]:
-        """The rows of `rows` with additional lists, such as ``qualities``, with one value per hypothesis."""
+        """The rows of `rows`, with additional lists such as ``qualities``, which has one value per hypothesis."""
         rows = []
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
@@ -206,8 +206,8 @@ class StudyFolder:
     def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
         """Add the recalibrated log loss to rows, in place.
 
-        The forecasts of a scene are recalibrated on the other scenes of its family and arm. No run of a scene, with
-        any seed, is used to recalibrate this scene.
+        The forecasts of a scene are recalibrated on the other scenes of its family and arm. Runs of the same scene
+        with other seeds are not used.
         """
         groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
         for row in rows:

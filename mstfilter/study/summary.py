@@ -138,7 +138,7 @@ class Summary:
     def is_better(self, family: str, arm: str) -> bool:
         """Whether the study shows that the reference is better than an arm on a family.
 
-        One endpoint must be better with an adjusted p value, and the intervals of both endpoints must exclude a loss
+        One endpoint must be better by its adjusted p value, and the intervals of both endpoints must exclude a loss
         of 0.005 or more. Each endpoint needs at least 20 scenes.
         """
         found = []

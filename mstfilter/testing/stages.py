@@ -1,6 +1,6 @@
 """Contracts of evidence terms and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
 
-`contract_of` and `run_contract` accept components of every interface, also the interfaces of `mstfilter.smc`.
+`contract_of` and `run_contract` accept components of every interface, including those in `mstfilter.smc`.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class StageContract(Contract):
     example = staticmethod(scene_example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        """The result of the filter step that uses the component."""
+        """The result of the proposal, transition or update that uses the component."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
         if isinstance(owner, Proposal):
@@ -237,7 +237,7 @@ class MotionRuleContract(StageContract):
 
 
 def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
-    """The visible objects of a hypothesis in the clip, by label."""
+    """Label and track of each visible object of a hypothesis in the clip."""
     clip = inputs["observation"]
     flow = DenseFlow().track(clip)
     segments = segments_of(_correct(inputs), clip.before)
