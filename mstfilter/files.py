@@ -231,7 +231,7 @@ def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """Differences between a folder and its SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
+    """Differences of files from SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
     lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -281,7 +281,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
     An existing folder must be empty, unless `empty` is false. For each missing part of `path`, a test file is made
-    and removed, because permissions do not reveal a read-only file system, a name that is too long, or a full disk.
+    and removed, because permissions do not reveal read-only file systems, too long names, or a full disk.
     """
     if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
@@ -308,7 +308,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
 
 
 def _try_to_write(folder: Path, temporary: Path) -> None:
-    """Make a file in a folder and remove it. If possible the file has no name, so that a killed process leaves none."""
+    """Make a file in a folder and remove it. If possible the file has no name, so a killed process leaves no file."""
     if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:

@@ -59,7 +59,7 @@ class Pause:
     state: State  #: the state of the filter
     info: Info  #: the record of the step
     latency_s: float  #: seconds from the push of the last frame to the result
-    #: Numbers of frames so far: "pushed"; dropped for the reasons "late", "no depth" or "overflow" (the queue is full);
+    #: Numbers of frames so far: "pushed"; dropped for the reasons "late", "no depth" or "overflow" (queue is full);
     #: "thinned", which are removed from a long clip.
     counts: dict[str, int]
 
