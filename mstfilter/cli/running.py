@@ -302,5 +302,5 @@ def _execute_all(
 
 
 def _compared(folder: Path, name: str) -> Path:
-    """The folder of the comparison run `name` of the run in `folder`; `folder` itself for the empty name."""
+    """The folder of the comparison run `name` inside the run folder `folder`; `folder` itself if `name` is empty."""
     return folder / "compare" / name.replace(" ", "-") if name else folder

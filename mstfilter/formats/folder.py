@@ -5,17 +5,15 @@
 >>> recording = RecordingFolder().open(Path("recordings/mine"))
 >>> save_recording(recording, "recordings/copy")
 
-The layout::
-
-    manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
-    camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
-
-    rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
-    instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
-
-    voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
-    poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
-    SHA256SUMS           hashes of these files
+===================  ==========================================================================================
+manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
+camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
+rgb/, depth/         000000.png, ...: 8-bit RGB images, 16-bit depth images (0 = no reading)
+instance/, robot/    000000.png, ...: optional object number of each pixel, optional robot mask
+voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
+poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+SHA256SUMS           hashes of these files
+===================  ==========================================================================================
 
 Frames with role ``static`` are the pauses. If camera.json has no pose, the support plane at the first pause defines
 the world axes. If camera.json has no workspace, a grid is placed around the visible table. A recording is written

@@ -1,4 +1,4 @@
-"""Front ends from other programs: segmentations and shapes in folders, and networks in files.
+"""Front ends that use other programs: segmentations and shapes in folders, and networks in files.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP

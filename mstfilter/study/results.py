@@ -3,19 +3,16 @@
 >>> folder = StudyFolder.open("studies/first")
 >>> folder.description["reference"], len(folder.rows())
 
-Layout::
-
-    study.json       description, arms with their configuration, scenes, seeds, the folder of every run
-
-    runs/NAME/       one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz: counts of
-                     its forecasts
-
-    runs.csv         one row per pause and run: metrics first, time and memory last
-    summary.csv      one row per family, arm and metric: mean over scenes and its interval
-
-    differences.csv  every arm minus the reference: paired differences, intervals, p values, conclusions
-    failures.csv     runs that failed, and why
-    logs/            output of the workers
+================  =====================================================================================
+study.json        description, arms with their configuration, scenes, seeds, the folder of every run
+runs/NAME/        one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz:
+                  numbers of its forecasts, by forecast and outcome
+runs.csv          one row per pause and run: metrics first, time and memory last
+summary.csv       one row per family, arm and metric: mean over scenes and its interval
+differences.csv   every arm minus the reference: paired differences, intervals, p values, conclusions
+failures.csv      runs that failed, and why
+logs/             output of the workers
+================  =====================================================================================
 """
 
 from __future__ import annotations

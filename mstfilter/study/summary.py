@@ -80,7 +80,7 @@ class Compared:
     difference : Difference
         For the primary endpoints, `p_holm` is `p_claim` adjusted over both endpoints, all families and all arms.
     reported_only : bool
-        Whether the adjustment and the conclusions omit the arm.
+        Whether the arm is left out of the conclusions and of the adjustment of p values.
     """
 
     family: str
