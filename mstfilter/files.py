@@ -127,7 +127,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def _reserve(file: Path, target: Path) -> int:
-    """Open and lock a lock file. If the file is locked, raise InputError that names the other process."""
+    """Open and lock a lock file. If the file is locked, raise an InputError that names the other process."""
     while True:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
         with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file

@@ -1,7 +1,8 @@
 """Finds components by name, and builds components from a configuration.
 
 A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class
-that the components inherit. ``__components__`` maps kinds to names, and names to classes or ``/a/file.py:Class``:
+from which the components inherit. ``__components__`` maps kinds to names, and names to classes or
+``/a/file.py:Class``:
 
 >>> __interfaces__ = {"resampler": "Resampler"}
 >>> __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
@@ -83,7 +84,7 @@ class Registry:
         return names
 
     def interface(self, kind: str) -> type:
-        """Import the class that components of a kind inherit."""
+        """Import the class from which components of a kind inherit."""
         return _import(next(where for where, other in self._interfaces.items() if other == kind))
 
     def kind_of(self, annotation: Any) -> str | None:

@@ -88,7 +88,7 @@ Values = Mapping[Any, float] | Sequence[float] | np.ndarray
 
 
 def compare(first: Values, second: Values) -> Difference:
-    """The difference `first` minus `second` over the units that have values in `first` and in `second`.
+    """The paired difference `first` minus `second`, over the units that have values in both.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ class Stream:
     reaches `max_frames`, frames with little motion are removed from the clip. `counts` has the number of dropped and
     removed frames. At most three times `max_frames` frames are in memory.
 
-    An error of a thread is raised by the next call of `push`, `wait` or `close`.
+    An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
     def __init__(

@@ -113,7 +113,7 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
 
 
 def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
-    """Overlay of the disagreement of the hypotheses of a pause, for the template. None if all hypotheses agree."""
+    """Overlay that shows where the hypotheses of a pause disagree, for the template. None if all hypotheses agree."""
     disagreement = belief.disagreement(camera)
     if not disagreement.any():
         return None

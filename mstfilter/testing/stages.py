@@ -136,7 +136,7 @@ class CompleterContract(StageContract):
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
     def _seen(self, cut: bool = False) -> tuple[list[ObservedBox], Clip]:
-        """Boxes of three objects, and the clip."""
+        """Boxes of the three objects in the example, and the example's clip."""
         inputs = self.inputs(1)
         return _boxes(self.make(), _correct(inputs), inputs["observation"], cut), inputs["observation"]
 
