@@ -49,7 +49,7 @@ def objects(rng, n):
 
 
 def different(rng, n):
-    """Objects that differ: `Coalesced` gives the copies of equal ones to the first of them."""
+    """Distinct objects, because `Coalesced` gives all copies of equal objects to the first of them."""
     return Population(tuple(f"particle {k}" for k in range(n)), rng.standard_normal(n)), None
 
 
@@ -62,7 +62,7 @@ ARRAYS = (numbers, vectors, mapping)
 
 @dataclass(frozen=True)
 class Move(smc.Transition):
-    """``function(rng, x, y)``."""
+    """Moves all particles x by ``function(rng, x, y)``."""
 
     function: Any
 
@@ -72,7 +72,7 @@ class Move(smc.Transition):
 
 @dataclass(frozen=True)
 class Draw(smc.Proposal):
-    """``function(rng, n)``."""
+    """Draws n particles by ``function(rng, n)``."""
 
     function: Any
 
@@ -81,12 +81,12 @@ class Draw(smc.Proposal):
 
 
 def mixture(rng, x, y):
-    """A jump with probability 0.1."""
+    """A random walk with a large step with probability 0.1."""
     return x + np.where(rng.random(len(x)) < 0.1, 3.0, 0.3) * rng.standard_normal(len(x))
 
 
 def kernel_smoothing(rng, x, y):
-    """Liu and West (2001): shrinks to the mean and keeps the variance; still for a single particle."""
+    """Liu and West (2001): shrinks to the mean and keeps the variance. A single particle does not move."""
     a = 0.95
     return a * x + (1 - a) * x.mean() + np.sqrt(1 - a * a) * x.std() * rng.standard_normal(len(x))
 
