@@ -2,7 +2,7 @@
 
 Commands: ``filter SEED N`` (bootstrap AR(1)), ``backward:METHOD SEED N`` (N paths of a filter of N particles by the
 method ``backward_sampling_METHOD``), ``SCHEME SEED N`` (resampling N even normalised weights), and
-``log:SCHEME SEED N`` (the same from log weights). The answer is one line of JSON. The first calls include compilation.
+``log:SCHEME SEED N`` (the same from log weights). The answer is one line of JSON. First calls include compilation.
 """
 
 from __future__ import annotations

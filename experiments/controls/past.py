@@ -11,8 +11,8 @@ The arms are samples of the latest image (`samples`), `mst`, and four changes of
 
 There are two scores, averaged over the pauses t >= 1. Quality is the mean `objects` quality of the hypotheses.
 Information is the log loss of forecasts of "these two voxels belong to one object" in nats, after recalibration on
-the other scenes of the family. Mean quality rewards a filter that becomes certain by processing one image several times;
-information does not.
+the other scenes of the family. Mean quality rewards a filter that becomes certain by processing one image several
+times; information does not.
 
 Writes past.csv: the mean of each score and arm, the arm minus `samples`, and `mst` minus the arm, with t intervals.
 Finished scenes are not run again.
