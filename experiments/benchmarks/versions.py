@@ -4,12 +4,12 @@
     python experiments/benchmarks/versions.py OTHER_CHECKOUT --only smc --rounds 60
 
 In every round both checkouts run the same tasks in random order, each in a process that stays alive for all rounds.
-Times are processor time. A ratio is the median over the rounds of (this checkout / other checkout) within a round;
+Times are processor time. A ratio is the median over the rounds of (this checkout / other checkout) within a round.
 `ratio_of_shortest` is the ratio of the shortest times, which other programs on the machine disturb least.
 
-The names of tasks start with their area. `smc`: single filters (a random walk, a model of `StateSpaceModel.of`, a
-hidden Markov model, programs), batches of 200 seeds, the first 200 steps of a program that is run for the first time,
-and resampling of a million weights. `mst`: all steps of the preset ``mst`` on the scene ``demo`` and on the full-size
+The names of tasks start with their area. Tasks of `smc` are single filters (a random walk, a model of
+`StateSpaceModel.of`, a hidden Markov model, programs), batches of 200 seeds, and resampling of a million weights.
+Another task is the first 200 steps of a program that is run for the first time. Tasks of `mst` are all steps of the preset ``mst`` on the scene ``demo`` and on the full-size
 scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
 """
 

@@ -3,7 +3,7 @@
     python experiments/completion/compare.py TRAINED_FOLDER [--out experiments/completion/results]
 
 No network was trained on the objects of these samples, and two of their kinds of shapes are not in the training data.
-completion.csv has the mean IoU by completer and group of samples, after voxels in free space are removed. For all
+The table has the mean IoU by completer and group of samples, after voxels in free space are removed. For all
 samples together, the IoU has a 95 % interval over scenes. `volume` is the median ratio of estimated to true volume.
 """
 

@@ -23,8 +23,8 @@ class HilbertMap(Completer):
     or below the table).
     The posterior of the weights is normal about its mode (Laplace), and the probability of a voxel averages over it.
     (H. Wright, W. Zhi, M. Johnson-Roberson, T. Hermans, "V-PRISM: probabilistic mapping of unknown tabletop scenes",
-    2024; there one softmax for all objects of a scene, here one map for each mask, because completions of a frame do
-    not depend on one another.)
+    2024. V-PRISM has one softmax for all objects of a scene. This class has one map for each mask, because completions
+    of a frame do not depend on one another.)
 
     Parameters
     ----------

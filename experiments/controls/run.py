@@ -8,8 +8,8 @@ The scenes are tuning scenes. The score is the objects quality against the true 
   perhaps in view). The clip must not lower the quality.
 - shuffled: If the inner frames of every clip are in random order, the gain over samples must be smaller. `ends` uses
   only the first and last frame of a clip, and `frozen` never finds a motion. `flow` finds motions only by optical
-  flow. The columns `moved: ...` show tracking without segmentation: the true labels of the previous pause are tracked
-  over one clip, and the value is the mean IoU of the objects that moved.
+  flow. The columns `moved: ...` show tracking without segmentation. The true labels of the previous pause are tracked
+  over one clip. The value is the mean IoU of the objects that moved.
 - start: At t = 0, `mst` and samples of the latest image must have the same quality.
 
 Samples are `samples_only` with as many samples as `mst` has.

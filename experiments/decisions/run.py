@@ -19,7 +19,7 @@ On the first `--regret` scenes of a family all candidates are simulated at every
 the coverage after the best candidate. The regret of a policy is `best` minus the coverage after the policy's choice.
 
 Finished scenes are not run again; with `--scenes 0` the tables are made from the finished scenes. summary.csv has the
-differences from the random policy, paired by scene; decisions.png has the means.
+differences from the random policy, paired by scene. decisions.png has the means.
 """
 
 from __future__ import annotations

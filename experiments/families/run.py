@@ -3,8 +3,8 @@
     python experiments/families/run.py            # an hour on one core; finished scenes are not run again
     python experiments/families/run.py --smoke --out DIR    # half a minute
 
-Writes counts.csv (one row per scene: physics and visibility), difficulty.csv (one row per first pause: quality of the
-single-frame baseline and of floors, in the image and in space), summary.csv and pictures. All seeds are tuning seeds.
+Writes counts.csv (one row per scene: physics and visibility), difficulty.csv, summary.csv and pictures. A row of
+difficulty.csv has the quality of the single-frame baseline and of floors on a first pause, in the image and in space. All seeds are tuning seeds.
 """
 
 from __future__ import annotations

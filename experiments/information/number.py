@@ -3,9 +3,9 @@
     python experiments/information/number.py STUDY [--out experiments/information/results]
 
 number.csv has one row per number of hypotheses, with means over the scenes that were run with all numbers. The
-columns are the recalibrated log loss (nats, lower is better) and its difference from the row above, paired by scene
-with a 95 % interval; the calibration error of the forecasts without recalibration; the quality of the estimate
-(`Belief.estimate`) and the mean quality; processor seconds of a step.
+columns have the recalibrated log loss (nats, lower is better) and its difference from the row above, paired by scene
+with a 95 % interval. Further columns have the calibration error of the forecasts without recalibration, the quality
+of the estimate (`Belief.estimate`), the mean quality, and the processor seconds of a step.
 """
 
 from __future__ import annotations

@@ -9,9 +9,9 @@ Holm over endpoints, families and arms. The differences are also printed as tabl
 the quality of visible, hidden and never seen objects, averaged over cases; a case is one object at one pause t >= 1.
 NAME_time.csv has the core seconds of steps t >= 1. They differ between the first filter seed, in which an arm may be
 the first to process a recording, and later seeds, which use shared results on disk. With --pooled,
-NAME_pooled_differences.csv has the differences over the scenes of all families together, NAME_pooled_described.csv
-the differences in further metrics, and NAME_pooled_pauses.csv the means by pause and the change from pause 1 to the
-last pause with its 95 % interval over scenes.
+NAME_pooled_differences.csv has the differences over the scenes of all families together, and
+NAME_pooled_described.csv has these differences in further metrics. NAME_pooled_pauses.csv has the means by pause, and
+the change from pause 1 to the last pause with its 95 % interval over scenes.
 """
 
 from __future__ import annotations
