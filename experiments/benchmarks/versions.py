@@ -9,8 +9,8 @@ Times are processor time. A ratio is the median over the rounds of (this checkou
 
 The names of tasks start with their area. Tasks of `smc` are single filters (a random walk, a model of
 `StateSpaceModel.of`, a hidden Markov model, programs), batches of 200 seeds, and resampling of a million weights.
-Another task is the first 200 steps of a program that is run for the first time. Tasks of `mst` are all steps of the preset ``mst`` on the scene ``demo`` and on the full-size
-scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
+Another task is the first 200 steps of a program that is run for the first time. Tasks of `mst` are all steps of the
+preset ``mst`` on the scene ``demo`` and on the full-size scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
 """
 
 from __future__ import annotations

@@ -20,11 +20,10 @@ class HilbertMap(Completer):
     """Occupancy as Bayesian logistic regression on radial features, after V-PRISM.
 
     The training data are occupied voxels (the visible surface) and empty voxels (observed as free, on other surfaces,
-    or below the table).
-    The posterior of the weights is normal about its mode (Laplace), and the probability of a voxel averages over it.
-    (H. Wright, W. Zhi, M. Johnson-Roberson, T. Hermans, "V-PRISM: probabilistic mapping of unknown tabletop scenes",
-    2024. V-PRISM has one softmax for all objects of a scene. This class has one map for each mask, because completions
-    of a frame do not depend on one another.)
+    or below the table). The posterior of the weights is normal about its mode (Laplace), and the probability of a
+    voxel averages over it. (H. Wright, W. Zhi, M. Johnson-Roberson, T. Hermans, "V-PRISM: probabilistic mapping of
+    unknown tabletop scenes", 2024. V-PRISM has one softmax for all objects of a scene. This class has one map for
+    each mask, because completions of a frame do not depend on one another.)
 
     Parameters
     ----------

@@ -7,13 +7,15 @@ loop is repeated six times. All policies start from the same scene. The objects 
 scored, identified by their true labels. Objects that have left the workspace have an IoU of 0.
 
 Columns of runs.csv, one row per scene, policy and number of pushes k:
-coverage: IoU of each scored object with the best object of a hypothesis, averaged with the volumes at the start as
-weights, and over the hypotheses. quality: `objects` quality against the objects on the table.
-recalibrated_log_loss:
-log loss of forecasts of "these two voxels belong to one object" at the present pause, in nats, after recalibration on
-the other scenes of the family, with one recalibration for all policies. brier and log_loss: Brier score and log loss
-of the same forecasts without recalibration. lost: number of objects that have left the workspace. entropy: entropy
-of the segmentation in nats, by the weights of the hypotheses.
+
+- coverage: the IoU of each scored object with the best object of a hypothesis, averaged over the objects with their
+  volumes at the start as weights, and over the hypotheses.
+- quality: the `objects` quality against the objects on the table.
+- recalibrated_log_loss: the log loss of forecasts of "these two voxels belong to one object" at the present pause, in
+  nats. Forecasts are recalibrated on the other scenes of the family, with one recalibration for all policies.
+- brier and log_loss: the scores of the same forecasts without recalibration.
+- lost: the number of objects that have left the workspace.
+- entropy: the entropy of the segmentation in nats, by the weights of the hypotheses.
 
 On the first `--regret` scenes of a family all candidates are simulated at every push of the random policy: `best` is
 the coverage after the best candidate. The regret of a policy is `best` minus the coverage after the policy's choice.

@@ -4,7 +4,8 @@
     python experiments/families/run.py --smoke --out DIR    # half a minute
 
 Writes counts.csv (one row per scene: physics and visibility), difficulty.csv, summary.csv and pictures. A row of
-difficulty.csv has the quality of the single-frame baseline and of floors on a first pause, in the image and in space. All seeds are tuning seeds.
+difficulty.csv has the quality of the single-frame baseline and of floors on a first pause, in the image and in space.
+All seeds are tuning seeds.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
     python experiments/fingerprints/run.py after.json --against before.json
 
 There are hashes of the hypotheses (labels, weights, parents) for each preset, scene and pause. There are also hashes
-of the simulated images and true volumes, and of particles and log evidence of filters of `mstfilter.smc`. Hashes can be
-compared only on one machine with one set of library versions, so the repository stores no hashes.
+of the simulated images and true volumes, and of particles and log evidence of filters of `mstfilter.smc`. Hashes can
+be compared only on one machine with one set of library versions, so the repository stores no hashes.
 """
 
 from __future__ import annotations

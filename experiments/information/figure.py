@@ -4,8 +4,8 @@
 
 Writes reliability.csv and reliability.png: the share of true answers by forecast, for forecasts of some methods that
 "these two voxels belong to one object". The forecasts are pooled over families, scenes and pauses t >= 1. Intervals
-are 95 % bootstrap intervals over scenes. Forecasts strictly between 0 and 1 are in bins of width .2. Prints the calibration error of each method,
-computed from its pooled forecasts with ten bins.
+are 95 % bootstrap intervals over scenes. Forecasts strictly between 0 and 1 are in bins of width .2. Prints the
+calibration error of each method, computed from its pooled forecasts with ten bins.
 """
 
 from __future__ import annotations
