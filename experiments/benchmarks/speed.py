@@ -182,7 +182,7 @@ def main() -> None:
     median = {name: float(np.median([r[name] for r in rows])) for name in rows[0]}
 
     def ratio(a: str, b: str) -> str:
-        """Median over the rounds of the ratio of the times of a and b in one round."""
+        """Median over the rounds of the ratio a / b in one round."""
         if a not in rows[0] or b not in rows[0]:
             return "not measured"
         return f"{np.median([r[a] / r[b] for r in rows]):.2f}"

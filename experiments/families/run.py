@@ -39,7 +39,7 @@ MOVED = 0.01  # metres
 
 
 def visible(scene: SimulatedScene) -> np.ndarray:
-    """Numbers of visible pixels (n,) of the objects without sensor noise, scaled to an image of 640 x 480 pixels."""
+    """Visible pixels (n,) of each object without sensor noise, scaled to an image of 640 x 480 pixels."""
     camera = scene.camera
     rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
     geom, _, _ = scene.world.cast(np.array(camera.position), rays, (1,))

@@ -230,7 +230,7 @@ def table(particles: Particles, path: Path, smoke: bool) -> Path:
 
 
 def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int) -> list[tuple[int, np.ndarray]]:
-    """For each graph and each of `rounds` draws: index of the graph, and the directed edges (m, 2) of the draw."""
+    """Index of the graph and directed edges (m, 2), for each of `rounds` draws of each graph."""
     rng, found = np.random.default_rng(SEED), []
     for k, graph in enumerate(graphs):
         links = graph.networkx()

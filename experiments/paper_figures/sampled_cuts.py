@@ -103,7 +103,7 @@ class Drawn:
 
     @classmethod
     def of(cls, tree: Tree, cuts: Sequence[np.ndarray]) -> Drawn:
-        """The part of a tree with all merges above `LEAST` and all merges that a cut divides."""
+        """The merges of a tree above `LEAST`, and the merges that a cut divides."""
         odds = np.where(np.arange(tree.n_nodes) < tree.n_leaves, -np.inf, tree.odds)
         taken = np.zeros(tree.n_nodes, bool)  # has a node of a cut strictly inside
         for cut in cuts:

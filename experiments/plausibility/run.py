@@ -140,7 +140,7 @@ def seen_from(scene: Scene, k: int, motion: RigidTransform) -> tuple[np.ndarray,
 
 
 def moved(x: float = 0, y: float = 0, pan: float = 0, tilt: float = 0) -> Callable[[Scene], Scene | None]:
-    """A change that displaces the camera from pause 1 on: x m to the right, y m down, pan and tilt in degrees."""
+    """Displaces the camera from pause 1 on: x m to the right, y m down, pan and tilt in degrees."""
     motion = RigidTransform.from_components([x, y, 0], Rotation.from_euler("yx", [pan, tilt], degrees=True))
 
     def change(scene: Scene) -> Scene | None:
@@ -162,7 +162,7 @@ def followed(scene: Scene) -> Scene | None:
 
 
 def shifted(x: float = 0, y: float = 0, scale: float = 1) -> Callable[[Scene], Scene | None]:
-    """A change that shifts depth by shares x and y of the image width, and scales it about the image centre."""
+    """Shifts depth by shares x and y of the image width, and scales it about the image centre."""
 
     def change(scene: Scene) -> Scene:
         height, width = scene.depth.shape[1:]

@@ -156,7 +156,7 @@ def reference(flow: Flow, root: Path, template: Path) -> tuple[dict[str, bytes],
 
 
 def contents(root: Path, flow: Flow) -> dict[str, bytes]:
-    """Bytes of all files by path, without contents that have times, and without temporary files that may be left."""
+    """Bytes of all files by path, without contents that have times and without temporary files."""
     found = content(root, lambda name: name.endswith(_TIMES))
     return {name: data for name, data in found.items() if not (flow.leaves and ".partial" in name)}
 

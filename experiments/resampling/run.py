@@ -71,7 +71,7 @@ def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Ite
 
 
 def rows(part: str, setting: str, scheme: str, unit: int, found: dict[str, float]) -> Iterator[Row]:
-    """One row per measure that is finite; a run in which all weights became zero has no errors."""
+    """One row per finite measure; a run whose weights all became zero has no errors."""
     for measure, value in ((m, v) for m, v in found.items() if np.isfinite(v)):
         yield dict(zip(FIELDS, (part, setting, scheme, measure, unit, value), strict=True))
 
