@@ -15,7 +15,7 @@ Columns of runs.csv, one row per scene, policy and number of pushes k:
   nats. Forecasts are recalibrated on the other scenes of the family, with one recalibration for all policies.
 - brier and log_loss: the scores of the same forecasts without recalibration.
 - lost: the number of objects that have left the workspace.
-- entropy: the entropy of the segmentation in nats, by the weights of the hypotheses.
+- entropy: the entropy of the segmentation, in nats.
 
 On the first `--regret` scenes of a family all candidates are simulated at every push of the random policy: `best` is
 the coverage after the best candidate. The regret of a policy is `best` minus the coverage after the policy's choice.
