@@ -5,7 +5,7 @@
 >>> state, infos = mstfilter.preset("mst").run(recording.clips(), seed=0)
 >>> state.population.best.volumes()
 
-`mstfilter.presets` has the assembled filters, `mstfilter.smc` the filter itself, and `mstfilter.scene` cameras,
+`mstfilter.presets` has assembled filters, `mstfilter.smc` has the particle filter, and `mstfilter.scene` has cameras,
 recordings and hypotheses.
 """
 

@@ -1,4 +1,4 @@
-"""Errors and warnings that a user can correct.
+"""Errors and warnings about problems that a user can correct.
 
 A message states the error, its place and the value found. Hints state how to correct the error.
 
@@ -6,7 +6,7 @@ A message states the error, its place and the value found. Hints state how to co
 >>> InputError("depth image 000003.png is empty", "record the frame again").hints
 ('record the frame again',)
 
-`check_number`, `check_integer`, `check_choice` and `check_component` check fields with the same wording.
+`check_number`, `check_integer`, `check_choice` and `check_component` check fields and raise uniform errors.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class InputWarning(_WithHints, UserWarning):
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Put `where` before the message of an InputError in the block, unless the message contains it."""
+    """Put `where` before the message of an InputError that the block raises, unless the message contains it."""
     try:
         yield
     except InputError as error:
@@ -69,14 +69,14 @@ def naming(where: str) -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """The message of an exception, or its class name; ``NAME is missing`` for a KeyError."""
+    """The message of an exception, or its class name if it has no message; ``NAME is missing`` for a KeyError."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
 
 
 def printable(text: str) -> str:
-    """One line of at most 1500 characters, in which control characters of a terminal are escape sequences.
+    """A text as one line of at most 1500 characters, in which control characters are replaced by printable codes.
 
     Names and values in files of unknown origin may contain control characters.
     """
@@ -86,7 +86,7 @@ def printable(text: str) -> str:
 
 
 def suggestion(name: str, names: Iterable[str]) -> list[str]:
-    """A hint with the known name that is closest to an unknown name; no hint if no known name is close."""
+    """A list of one hint with the known name closest to an unknown name; an empty list if no known name is close."""
     return [f"did you mean {close}?" for close in difflib.get_close_matches(name, list(names), n=1)]
 
 
@@ -143,9 +143,9 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
 
 
 def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
-    """The error for a library that cannot be imported, although `what` needs the library.
+    """The error for a library that `what` needs and that cannot be imported.
 
-    `library` is the name of the library. By default, the library is the module in the exception.
+    `library` is the name of the library. The default is the name of the module in `error`.
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
@@ -156,11 +156,11 @@ def missing_library(error: ImportError, what: str, *hints: str, library: str = "
 
 
 def install_hint(library: str) -> str:
-    """The command that installs a library, by the name of the library's module."""
+    """The command that installs the library whose module has the name `library`."""
     return f"pip install {_PACKAGES.get(library, library)}"
 
 
-#: What pip installs for a library if the name is another, or the library belongs to an extra of this package.
+#: What pip installs for a library that has another name there, or that belongs to an extra of this package.
 _PACKAGES = {
     "cv2": "opencv-python-headless",
     "pytest": "'mstfilter[check]'",
@@ -173,8 +173,8 @@ _PACKAGES = {
 def place_in_user_file(error: BaseException) -> str | None:
     """``FILE, line N: text`` for the line of a user's file that raised an exception; None if there is no such line.
 
-    The line is in the deepest frame of the traceback (or of its cause) in a Python file that belongs neither to this
-    package nor to an installed library. For a syntax error, the line is in the file that the error names.
+    The line is in the deepest frame (of the error, or else of its cause) whose file belongs neither to this package
+    nor to an installed library. For a syntax error, the line is in the file that the error names.
     """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{short_path(error.filename)}, line {error.lineno}: {(error.text or '').strip()}"

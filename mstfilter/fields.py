@@ -12,10 +12,10 @@
 Traceback (most recent call last):
 mstfilter.errors.InputError: power is 2.0, expected a finite exponent above 0 and below 1
 
-Fields with three kinds of annotations are checked: a number with `Bounds`, a ``Literal``, and a subclass of
-`Bounded`, such as the interface of a component, alone or as ``Interface | None``. Other annotations are not checked.
+A field is checked if its annotation is a number with `Bounds`, a ``Literal``, or a subclass of `Bounded` such as the
+interface of a component, also as ``Interface | None``. Other fields are not checked.
 
-After the checks of single fields, ``__post_init__`` is called and can check conditions on several fields.
+After these checks, the ``__post_init__`` of the class is called. It can check conditions on several fields.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Share = Annotated[float, Bounds(at_least=0, at_most=1)]
 
 
 class Bounded:
-    """Base class of dataclasses whose fields are checked, before a ``__post_init__`` of the class is called."""
+    """Base class of dataclasses whose fields are checked before the ``__post_init__`` of the class is called."""
 
     def __init_subclass__(cls, **named: Any) -> None:
         super().__init_subclass__(**named)
@@ -120,7 +120,7 @@ _Component = TypeVar("_Component")
 
 
 def bound_to(component: _Component, **attributes: Any) -> _Component:
-    """A copy of a frozen component with further attributes that are not fields, such as the files of a pause."""
+    """A copy of a frozen component with additional attributes that are not fields, such as data of one pause."""
     bound = copy.copy(component)
     for name, value in attributes.items():
         object.__setattr__(bound, name, value)

@@ -1,4 +1,4 @@
-"""Writes files and folders safely: a kill, a power failure or a second process leaves no damaged file.
+"""Writes files and folders so that a killed process, a power failure or a second process leaves no damaged file.
 
 >>> with atomic_path(folder / "metrics.csv") as path:
 ...     path.write_text(text, encoding="utf-8")
@@ -59,8 +59,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep"] = "refuse") -> Iterator[Path]:
     """An empty temporary folder beside `path`, which is renamed to `path` at the end of the block.
 
-    `existing` determines the action if `path` then has a folder with content. "refuse" raises InputError, "replace"
-    removes the earlier folder, and "keep" removes the new folder. An empty folder is always replaced.
+    `existing` determines what happens if a folder with content then exists at `path`. "refuse" raises InputError,
+    "replace" removes the earlier folder, and "keep" removes the new folder. An empty folder is always replaced.
     """
     target = Path(os.path.realpath(path))
     _make_folders(target.parent)
@@ -127,7 +127,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def _reserve(file: Path, target: Path) -> int:
-    """Open and lock a lock file. If the file is locked, raise InputError that names the other process."""
+    """Open and lock a lock file. If the file is locked, raise an InputError that names the other process."""
     while True:
         descriptor = _lock(file, os.O_RDWR | os.O_CREAT)
         with contextlib.suppress(FileNotFoundError):  # the process that had the lock has removed the file
@@ -159,10 +159,10 @@ def _lock(path: Path, flags: int) -> int | None:
 
 
 def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> None:
-    """Remove temporary files of ended processes in a folder, for the file `name` or for all files.
+    """Remove the temporary files that ended processes left in a folder, for the file `name` or for all files.
 
-    If a process was killed while it replaced a folder, the earlier folder gets its name back. Give `older_than_s`
-    unless the name is locked, because another process may just have made a temporary file.
+    If a process was killed while it replaced a folder, the earlier folder gets its name back. Set a minimum age
+    `older_than_s` unless `name` is locked, because another process may be writing the files.
     """
     for path in folder.iterdir() if folder.is_dir() else ():
         match = _TEMPORARY.fullmatch(path.name)
@@ -175,7 +175,7 @@ def sweep(folder: Path, name: str | None = None, older_than_s: float = 0.0) -> N
 
 
 def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
-    """Files below a folder whose relative paths do not match `own`, without temporary files and locks."""
+    """Files below a folder whose relative paths do not match `own`, except temporary files and locks."""
     paths = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
     own = re.compile(rf"{own.pattern}|(.+/)?\.[^/]+\.lock")
     return sorted(p.as_posix() for p in paths if not own.fullmatch(p.as_posix()) and not _is_temporary(p))
@@ -207,9 +207,9 @@ def _make_folders(folder: Path) -> list[Path]:
 
 
 def _sync(target: Path, *paths: Path) -> None:
-    """Wait until files, and the names in folders, are stored on the disk.
+    """Wait until the contents of files and folders are stored on the disk.
 
-    If the final place `target` of the files is in a temporary folder, the complete folder is synced instead.
+    Returns immediately if `target`, the final path, is in a temporary folder, which is synced when it is complete.
     """
     if os.name != "posix" or _is_temporary(target.absolute()):
         return
@@ -231,7 +231,7 @@ def write_sums(folder: Path, names: Iterable[str] = ()) -> None:
 
 
 def damaged_files(folder: Path) -> list[str]:
-    """Differences of a folder from its SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
+    """Differences of files from SHA256SUMS, such as ``state.npz has changed`` or ``rgb.png is missing``."""
     if not (folder / SUMS).is_file():
         return [f"{SUMS} is missing"]
     lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -280,8 +280,8 @@ def writing(what: str, *hints: str) -> Iterator[None]:
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
-    An existing folder must be empty, unless `empty` is false. A file is made and removed for each missing name,
-    because permissions alone do not show read-only file systems, long names, or a full disk.
+    An existing folder must be empty, unless `empty` is false. For each missing part of `path`, a test file is made
+    and removed, because permissions do not reveal read-only file systems, too long names, or a full disk.
     """
     if os.path.isdir(path) and not folder:
         raise InputError(f"{path} is a folder, expected the name of a file to write")
@@ -308,7 +308,7 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
 
 
 def _try_to_write(folder: Path, temporary: Path) -> None:
-    """Make a file in a folder and remove it. If possible the file has no name, so that a kill leaves no file."""
+    """Make a file in a folder and remove it. If possible the file has no name, so a killed process leaves no file."""
     if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:
@@ -360,8 +360,8 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
 def weights_file(given: str, name: str, where: str) -> tuple[str, str]:
     """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
 
-    Raises InputError if the file is not given or does not exist; `where` is an address for the hint. The hash of an
-    unchanged file is computed once.
+    Raises InputError if the file is not given or does not exist. The hint refers to the address `where`. The hash of
+    an unchanged file is computed once.
     """
     path = Path(given)
     if not given or not path.is_file():

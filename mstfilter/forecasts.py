@@ -1,7 +1,7 @@
 """Scores of forecasts: Brier score, log loss, calibration, recalibration.
 
-A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table. For each
-value of p, the table has the numbers of outcomes 0 and 1. Tables can be pooled.
+A forecast of an event is a probability p, and its outcome y is 0 or 1. Many forecasts are stored as a table, which
+has the numbers of outcomes 0 and 1 for each value of p. Tables can be pooled.
 
 >>> import numpy as np
 >>> table = ForecastTable.of(p=[0.9, 0.9, 0.2, 0.2], y=[1, 1, 0, 1])
@@ -47,7 +47,7 @@ class ForecastTable:
 
     @classmethod
     def of(cls, p: ArrayLike, y: ArrayLike, count: ArrayLike = 1.0) -> ForecastTable:
-        """A table of forecasts p (m,) with outcomes y (m,) in [0, 1], each counted `count` times."""
+        """A table of forecasts p (m,) and outcomes or shares of outcome 1, y (m,), each counted `count` times."""
         p, y = np.asarray(p, dtype=np.float64), np.asarray(y, dtype=np.float64)
         if p.ndim != 1 or p.shape != y.shape:
             raise InputError(f"forecasts have shape {p.shape} and outcomes {y.shape}, expected (m,) twice")
@@ -64,14 +64,14 @@ class ForecastTable:
 
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
-        """A table with the summed numbers of outcomes of several tables."""
+        """A table in which the numbers of outcomes of several tables are summed."""
         p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
         count = no + yes
         return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)
 
     @cached_property
     def count(self) -> np.ndarray:
-        """Number (k,) of times that each forecast was given."""
+        """Number of times that each distinct forecast was given, (k,)."""
         return self.no + self.yes
 
     @property
@@ -101,9 +101,9 @@ class ForecastTable:
         return ForecastTable.of(p, share, self.count)
 
     def reliability(self, n_bins: int = 10) -> Reliability:
-        """The reliability diagram on bins of equal numbers of forecasts.
+        """The reliability diagram, with about equal numbers of forecasts in all bins.
 
-        Equal forecasts stay in one bin, so bins can have different sizes.
+        Equal forecasts are in the same bin, so the bins can have different sizes.
         """
         middle = np.cumsum(self.count) - self.count / 2  # rank of each forecast
         which = np.minimum((n_bins * middle / max(self.n, 1e-300)).astype(np.int64), n_bins - 1)
@@ -152,7 +152,7 @@ class Recalibration:
     p : (k,) float
         Forecasts in ascending order.
     probability : (k,) float
-        Probabilities, non-decreasing.
+        Probability that replaces each forecast, non-decreasing.
     """
 
     p: np.ndarray
@@ -160,7 +160,7 @@ class Recalibration:
 
     @classmethod
     def fit(cls, table: ForecastTable) -> Recalibration:
-        """The non-decreasing map of least squared error, weighted by the numbers of forecasts."""
+        """The non-decreasing map with the least squared error. Each forecast is weighted by its `count`."""
         from scipy.optimize import isotonic_regression
 
         kept = table.count > 0
@@ -173,9 +173,9 @@ class Recalibration:
         return cls(p[~flat], fitted[~flat])
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
-        """Recalibrated forecasts (...)."""
+        """Recalibrated forecasts, in the shape of `p`."""
         return np.clip(np.interp(p, self.p, self.probability), CLIP, 1 - CLIP)
 
     def log_loss(self, table: ForecastTable) -> float:
-        """Mean log loss in nats of the forecasts of a table after recalibration."""
+        """Mean log loss, in nats, of the forecasts in a table after their recalibration."""
         return table.with_forecasts(self(table.p)).log_loss()

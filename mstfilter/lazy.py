@@ -1,13 +1,13 @@
 """Lazy imports: names of a package are imported at their first use, and methods import drawing code when called.
 
-The ``__init__.py`` of a package has its documentation and two lines:
+The ``__init__.py`` of a package contains the package's documentation and two lines:
 
 >>> from mstfilter.lazy import attach
 >>> __getattr__, __dir__, __all__ = attach(__name__, __file__)      # doctest: +SKIP
 
 The stub ``__init__.pyi`` lists the public names, with one ``from module import name as name`` statement per module.
-Type checkers read the same file. So ``import mstfilter.scene`` is fast, and ``from mstfilter.scene import Camera``
-imports only the module of `Camera` (the scheme of Scientific Python's SPEC 1).
+Type checkers also read the stub. With lazy imports, ``import mstfilter.scene`` is fast, and ``from mstfilter.scene
+import Camera`` imports only the module of `Camera` (the scheme of Scientific Python's SPEC 1).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mstfilter.errors import MissingLibraryError, missing_library
 
 
 def exported(init: str | Path) -> dict[str, str]:
-    """Mapping from public names to modules, from the stub beside an ``__init__.py``."""
+    """Mapping from public names to modules, read from the stub beside an ``__init__.py``."""
     tree = ast.parse(Path(init).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [statement for statement in tree.body if isinstance(statement, ast.ImportFrom)]
     return {alias.name: str(statement.module) for statement in imports for alias in statement.names}
@@ -48,7 +48,7 @@ def attach(package: str, init: str) -> tuple[Callable[[str], Any], Callable[[], 
 
 
 def short_repr(component: Any) -> str:
-    """The text of a dataclass with the fields that differ from their defaults; the class name for other objects."""
+    """A short repr: for a dataclass, the fields that differ from the defaults; for other objects, the class name."""
     parts = []
     for field in dataclasses.fields(component) if dataclasses.is_dataclass(component) else ():
         value = getattr(component, field.name, None)
@@ -69,9 +69,9 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def late(location: str, summary: str) -> Callable[..., Any]:
-    """A method that calls ``module:function`` and imports the module at the first call.
+    """A method that calls the function `location` (``module:function``) and imports the module at the first call.
 
-    Methods that draw and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend
+    Methods that plot and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend
     on `mstfilter.report` and `mstfilter.formats`.
     """
     module, _, name = location.partition(":")
@@ -86,9 +86,9 @@ def late(location: str, summary: str) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> Iterator[Callable[..., None]]:
-    """The function that reports progress, which updates a bar of `mstfilter.report.progress` if `progress` is True.
+    """A function to call with progress. If `progress` is True, it updates a bar of `mstfilter.report.progress`.
 
-    Otherwise the function is `progress` itself, or a function without effect if `progress` is False.
+    Otherwise it is the function `progress`, or a function without effect if `progress` is False.
     """
     if progress is True:
         with getattr(import_module("mstfilter.report.progress"), bars)(*([what] if what else [])) as advance:

@@ -1,4 +1,4 @@
-"""Presets, which are assembled filters that have names.
+"""Presets: filters that are assembled from components and have names.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst")
@@ -15,7 +15,7 @@ or ``models/base.toml``, which has the common parts of `mst` and its baselines:
 ``wrap = { proposal = "first_pause" }``  the base's proposal becomes the field `proposal` of this component
 =======================================  =============================================================================
 
-``base`` has no update. ``base`` can be extended but is not a preset.
+``base`` has no update, so it can be extended but is not a preset.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def load_config(name: str, overrides: Iterable[str] = (), *, allow_files: bool =
 
 
 def _read(name: str, parents: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The configuration in a preset file, merged into the configuration of the base."""
+    """The configuration in a preset file, merged into the configuration of the file's base."""
     path = find_preset(name, to_extend=bool(parents))
     config = read_toml(path, "a preset")
     base, wraps = config.pop("base", ""), config.pop("wrap", {})

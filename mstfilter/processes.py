@@ -3,9 +3,9 @@
 >>> with environment(OMP_NUM_THREADS="1"):
 ...     pool = ProcessPoolExecutor(2)
 
-A new Python interpreter puts the working folder first in its module search path. So a file ``multiprocessing.py`` in
-a folder with unknown files would be executed. Processes that are started in the block do not search the working
-folder first. New processes find the caller's modules, because `multiprocessing` and joblib pass on the search path.
+A new Python interpreter searches modules in the working folder first. So an unknown file ``multiprocessing.py`` there
+would be executed. Processes started in a block `environment` do not search this folder first. New processes find the
+caller's modules, because `multiprocessing` and joblib pass on the search path.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def environment(**variables: str) -> Iterator[None]:
 
 
 def check_main_guard(what: str) -> None:
-    """Raise InputError if new processes would repeat the call of `what` in a script.
+    """Raise InputError if each new process would run the caller's script again, including its call of `what`.
 
     `multiprocessing` imports the script in each new process, except the code below ``if __name__ == "__main__":``.
     """

@@ -5,7 +5,7 @@
 
 All readers use `open_regular`, which opens only regular files, because reading a pipe or a device might never end.
 The file size is compared with a limit. The unpacked size of arrays is read from headers before memory is allocated.
-All errors are `InputError` with the name of the file.
+Functions that take a path raise `InputError` with this path.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mstfilter.files import reading
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-#: Largest file, and largest array file when it is unpacked, in bytes. The environment variable raises it.
+#: Limit of the size of a file, and of the unpacked arrays of a file, in bytes. The environment variable sets it.
 MAX_FILE = int(os.environ.get("MSTFILTER_MAX_BYTES", 2**29))
 MAX_TEXT = 2**25  #: Largest text file that is parsed, in bytes: parsed values need 20 times the memory
 MAX_WEIGHTS = 2**32  #: Largest file of weights of a network, in bytes
@@ -132,7 +132,7 @@ def unpack_arrays(file: IO[bytes], limit: int | None = None) -> dict[str, np.nda
 
 
 def _check_array(file: IO[bytes], size: int) -> None:
-    """Raise ValueError unless the array of a .npy file needs at most the `size` of the file and has no objects."""
+    """Raise ValueError unless the array of a .npy file has no objects and fits into `size` bytes."""
     first = np.lib.format.read_magic(file) == (1, 0)
     shape, _, dtype = (np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0)(file)
     if dtype.hasobject:

@@ -1,7 +1,8 @@
 """Finds components by name, and builds components from a configuration.
 
 A package declares its components in its ``__init__.py``: ``__interfaces__`` maps a kind of component to the class
-that the components inherit. ``__components__`` maps kinds to names, and names to classes or ``/a/file.py:Class``:
+from which the components inherit. ``__components__`` maps kinds to names, and names to classes or
+``/a/file.py:Class``:
 
 >>> __interfaces__ = {"resampler": "Resampler"}
 >>> __components__ = {"resampler": {"systematic": "Systematic", "residual": "Residual"}}
@@ -13,9 +14,9 @@ A `Registry` joins the declarations of several packages. `mstfilter.presets.REGI
 Systematic()
 >>> REGISTRY.build("update", {"component": "crossover", "eta": 3, "free_space": "none"})
 
-A configuration is a nested mapping. A component in a configuration is a name, or a mapping with ``component`` and
-fields. The annotation of a field determines its kind. A field of type ``Resampler`` or ``Resampler | None`` holds a
-resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
+A configuration is a nested mapping. A component in a configuration is a name, or a mapping with the key ``component``
+and fields. The annotation of a field determines the kind of its component. A field of type ``Resampler`` or
+``Resampler | None`` holds a resampler, and a field of type ``tuple[Evidence, ...]`` holds a list of evidence terms.
 
 A component is imported when it is first built. Looking up a name imports no component. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add the class by an entry point ``kind.name`` of the group
@@ -83,7 +84,7 @@ class Registry:
         return names
 
     def interface(self, kind: str) -> type:
-        """Import the class that components of a kind inherit."""
+        """Import the class from which components of a kind inherit."""
         return _import(next(where for where, other in self._interfaces.items() if other == kind))
 
     def kind_of(self, annotation: Any) -> str | None:
@@ -98,7 +99,7 @@ class Registry:
     def check_names(self, cls: type, config: Mapping[str, Any], allow_files: bool = False) -> None:
         """Raise InputError if a field of `cls` names an unknown component, without importing components.
 
-        `make` checks names in nested components, because `make` imports components.
+        Names in nested components are checked by `make`, which imports the components.
         """
         hints = typing.get_type_hints(cls)
         for field, value in config.items():
@@ -150,7 +151,7 @@ class Registry:
     def build(
         self, kind: str, spec: Any, where: str | None = None, allow_files: bool = False, default: Any = None
     ) -> Any:
-        """A component from its name, or from a mapping with ``component`` and fields.
+        """A component from its name, or from a mapping with the key ``component`` and fields.
 
         A mapping without ``component`` changes fields of `default`. Error messages contain `where`, the path of the
         component in the configuration. With `allow_files`, ``./file.py:Class`` is loaded.
@@ -174,8 +175,8 @@ class Registry:
     ) -> Any:
         """Build a dataclass from plain values and nested components.
 
-        Fields that are not given have the values of `base`.
-        Raises InputError if a field or a component is unknown, or a value does not fit its field.
+        Fields that are not given have their values in `base`, or their defaults if `base` is None. Raises InputError
+        if a field or a component is unknown, or a value does not fit its field.
         """
         prefix = f"{where}: " if where else ""
         if inspect.isabstract(cls):
@@ -274,7 +275,7 @@ def merged(config: Mapping[str, Any], *changes: Mapping[str, Any]) -> dict[str, 
 
 
 def _nested(override: str) -> dict[str, Any]:
-    """The change that ``path=value`` describes."""
+    """The change that ``path=value`` describes, as nested mappings."""
     path, equals, text = override.partition("=")
     parts = path.strip().split(".")
     if not equals or not all(parts) or not text.strip():
@@ -310,7 +311,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _abstract_error(prefix: str, cls: type) -> InputError:
-    """The error for a class without all methods of its interface."""
+    """The error for a class that lacks methods of its interface."""
     missing = sorted(getattr(cls, "__abstractmethods__", ()))
     origin = next(base.__name__ for base in reversed(cls.__mro__) if missing[0] in vars(base))
     hint = f"define {missing[0]} as {origin}.{missing[0]} describes it"
@@ -324,7 +325,7 @@ def _location(package: str, cls: str) -> str:
 
 
 def _location_of(cls: type) -> str:
-    """Location ``package:Class`` or ``file.py:Class``. Classes of mstfilter belong to their top package."""
+    """Location of a class: ``package:Class`` with a package such as ``mstfilter.smc``, or ``file.py:Class``."""
     if "__mst_file__" in vars(cls):
         return str(cls.__mst_file__)  # type: ignore[attr-defined]
     package = ".".join(cls.__module__.split(".")[:2])
@@ -350,7 +351,7 @@ def _from_file(path: str, attribute: str) -> type:
 
 
 def load_file(path: str | Path) -> ModuleType:
-    """The module of a Python file of the user.
+    """The module made by executing a Python file of the user.
 
     A file is executed once per process for any spelling of its path, and again if its content has changed. Instances
     of its classes can be pickled, because unpickling loads the file.
@@ -402,7 +403,7 @@ def _classes_of(module: ModuleType) -> list[type]:
 
 
 def _reduce(instance: object, protocol: Any) -> Any:
-    """Pickle an instance with the path of its file, because other processes cannot import the module by name."""
+    """Pickle an instance with the path of the class's file, as other processes cannot import the module by name."""
     reduced: Any = object.__reduce_ex__(instance, max(int(protocol), 2))
     how, arguments, *state = reduced
     cls = type(instance)
@@ -413,7 +414,7 @@ def _reduce(instance: object, protocol: Any) -> Any:
 
 
 def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """An instance without its state. The user's file that defines the class must have the hash `digest`."""
+    """A new instance, for unpickling. The user's file that defines the class must have the hash `digest`."""
     module = _MODULES.get((Path(path), digest)) or load_file(path)
     cls = getattr(module, name)
     if cls.__mst_source__ != digest:
@@ -422,7 +423,7 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
 
 
 def _plain(hint: Any, value: Any, where: str) -> Any:
-    """A plain value, checked against a field's annotation. A single value of a ``tuple[X, ...]`` needs no list."""
+    """A plain value, checked against a field's annotation. A ``tuple[X, ...]`` also accepts a single X."""
     from pydantic import TypeAdapter, ValidationError
 
     if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):

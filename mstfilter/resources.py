@@ -31,7 +31,7 @@ def models_folder() -> Path:
 
 
 def examples_folder() -> Path:
-    """The folder of the example components of the documentation, and of the tests of the example components."""
+    """The folder with the example components of the documentation and the tests of these components."""
     return _folder_with("resampler.py", "_examples", "docs/examples")
 
 
@@ -47,7 +47,7 @@ def training_program(name: str) -> ModuleType:
 
 
 def _folder_with(file: str, installed: str, in_checkout: str) -> Path:
-    """A folder inside the installed package, or beside the package in a checkout."""
+    """The folder that contains `file`: inside the installed package, or beside the package in a checkout."""
     package = Path(__file__).resolve().parent
     folders = (package / installed, package.parent / in_checkout)
     for folder in folders:
@@ -79,7 +79,7 @@ def find_preset(name: str, to_extend: bool = False) -> Path:
 
 
 def starter_kinds(target: str = "") -> list[str]:
-    """Kinds of component that have a starting file for `target`, "scenes" or "numbers", or for any target."""
+    """Kinds of component with a starting file for the target "scenes" or "numbers"; by default, for either target."""
     folders = map(_folder, [target] if target else _TARGETS)
     return sorted({path.stem for folder in folders for path in folder.glob("*.py")} | set(_BOTH))
 

@@ -1,7 +1,7 @@
 """Checks of the values that methods of components return.
 
-An interface declares the check of a result beside the method. The check applies to every class that defines the
-method. The error of a failed check names the class, the file and the line of the method:
+An interface declares the check of a method's result by a decorator of the method. The check applies to every class
+that defines the method. The error of a failed check names the class, the file and the line of the method:
 
 >>> class Score(Checked):
 ...     @returns(lambda self, found, particles: check_array(found, (len(particles),)))
@@ -12,7 +12,7 @@ method. The error of a failed check names the class, the file and the line of th
 >>> Mine().score((1, 2))                       # doctest: +SKIP
 InputError: Mine.score (mine.py, line 2) returns a list, expected an array of shape (2,)
 
-The error of a method that changes its read-only input has the same form.
+A method that changes its read-only input causes an error with the same information.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _PACKAGE = Path(__file__).parent
 
 
 def returns(check: Callable[..., Any]) -> Callable[[_Method], _Method]:
-    """Mark a method of an interface: ``check(self, result, *arguments)`` returns the result or raises InputError.
+    """Declare the check of a method: ``check(self, result, *arguments)`` returns the result or raises InputError.
 
     The message of the error begins with a verb: "returns None, expected ...".
     """
@@ -50,7 +50,7 @@ def returns(check: Callable[..., Any]) -> Callable[[_Method], _Method]:
 
 
 class Checked(Bounded):
-    """Base class of interfaces with methods that are marked by `returns`, and of components with bounded fields."""
+    """Base class of interfaces with methods that `returns` decorates, and of components with bounded fields."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -64,7 +64,7 @@ class Checked(Bounded):
 
 
 def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
-    """A method with a checked result. A call by an overriding method of a subclass is not checked again."""
+    """A method whose result is checked. A call from an overriding method of a subclass is not checked."""
 
     @functools.wraps(method)
     def call(self: Any, *arguments: Any, **named: Any) -> Any:
@@ -107,7 +107,7 @@ def _name_of(component: Any, method: str) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """The text of a value in an error message: its type, and for an array also the type and shape."""
+    """The text of a value in an error message: its type, and for an array also the shape and the type of elements."""
     if value is None or isinstance(value, (bool, int, float)):
         return repr(value)
     if isinstance(value, type):
@@ -164,7 +164,7 @@ def check_array(
     kinds : str
         Kinds of numbers, as in `numpy.dtype.kind`: "b" bool, "iu" integers, "f" floats.
     at_least, at_most : float
-        Range of the values. Values outside the range by a rounding error are clipped.
+        Range of the values. Values that are outside the range by no more than a rounding error are clipped.
     finite : bool
         Whether infinite values are errors. NaN always is an error.
     """
@@ -238,7 +238,7 @@ _BOUND = ("a score of -inf rules a hypothesis out: bound it from below",)
 
 
 def _scaling(low: float, high: float) -> list[str]:
-    """Hints for converting other numbers to probabilities."""
+    """Hints for converting numbers that are not probabilities to probabilities."""
     if high <= _TOLERANCE:
         return ["of log probabilities: np.exp(values)"]
     if low < 0:

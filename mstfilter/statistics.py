@@ -47,7 +47,7 @@ class Difference:
     p : float
         Two-sided p value of the sign-flip test; NaN for one unit.
     n : int
-        Number of units with a value of both methods.
+        Number of units for which both methods have a value.
     p_holm : float
         `p_claim` adjusted for all comparisons of the table. `p_holm` equals `p_claim` for a single comparison.
     p_bootstrap : float
@@ -69,7 +69,7 @@ class Difference:
 
     @property
     def p_claim(self) -> float:
-        """The larger of `p` and `p_bootstrap` times 1 + abs(skewness), at most 1; NaN for fewer than two units.
+        """The larger of `p` and `p_bootstrap`, times 1 + abs(skewness), at most 1; NaN for fewer than two units.
 
         A small sample of skewed differences often has no values from the longer tail. The factor corrects the p value
         for this missing tail. The factor was chosen by simulation in `experiments/comparison`.
@@ -78,7 +78,7 @@ class Difference:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether both intervals exclude 0. Without a bootstrap interval, only the t interval is used."""
+        """Whether the t interval and the bootstrap interval exclude 0. Without the second, only the first is used."""
         low, high = np.fmin(self.low, self.low_bootstrap), np.fmax(self.high, self.high_bootstrap)
         return bool(low > 0 or high < 0)
 
@@ -88,13 +88,13 @@ Values = Mapping[Any, float] | Sequence[float] | np.ndarray
 
 
 def compare(first: Values, second: Values) -> Difference:
-    """The difference `first` minus `second` over the units that have values in `first` and in `second`.
+    """The paired difference `first` minus `second`, over the units that have values in both.
 
     Parameters
     ----------
     first, second : mapping, or (n,) array_like
-        A mapping from units to values, or values in the same order of units. Units without a finite value, such as
-        the seeds of runs in which all weights became zero, are omitted.
+        A mapping from units to values, or arrays of values with the same order of units. Units without a finite
+        value, such as the seeds of runs in which all weights became zero, are omitted.
 
     Raises
     ------
@@ -136,8 +136,8 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
-    The results are NaN for fewer than five values. The seed is fixed, so the same values give the same result. A
-    resample of equal values has an infinite t ratio. So a limit of the interval is infinite if most values are equal.
+    The results are NaN for fewer than five values. The seed is fixed, so results can be repeated. A resample of equal
+    values has an infinite t ratio. So if most values are equal, a limit of the interval is infinite.
 
     The p value is the larger of two p values. The equal-tailed p value adapts to the skewness like the interval
     (Efron, Tibshirani 1993, section 12.5). The p value of the absolute t ratio is larger for symmetric values with
@@ -159,7 +159,8 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
     """Ratios (mean of a resample - mean) / (standard deviation of the resample) of all resamples.
 
-    The ratio of a resample of equal values is infinite. Quantiles interpolate, so infinite ratios are set to +-1e200.
+    If all values of a resample are equal, its ratio is infinite. Such ratios are set to +-1e200, because quantiles
+    interpolate.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]
@@ -202,7 +203,7 @@ def sign_flip(values: np.ndarray) -> float:
 
 
 def holm(p: Sequence[float]) -> np.ndarray:
-    """p values, adjusted by Holm's method (1979). NaN marks a missing comparison and is not changed."""
+    """p values, adjusted by Holm's method (1979). A NaN, which marks a missing comparison, is not changed."""
     values = np.asarray(p, dtype=float)
     out = np.full(len(values), np.nan)
     order = [k for k in np.argsort(values) if np.isfinite(values[k])]
@@ -241,7 +242,7 @@ def slope(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def conclusion(difference: Difference, first: str, second: str, where: str = "", unit: str = "scene") -> str:
-    """The conclusion from a difference, as a sentence. `unit` names the units that pair the values."""
+    """The conclusion from a difference, as a sentence. `unit` is the word for a paired unit."""
     d, at = difference, f" on {where}" if where else ""
     if d.n == 0:
         return f"{first} and {second}{at}: no {unit} has both."

@@ -4,8 +4,8 @@
 >>> model.description["network"], model.tensors["head.bias"].shape
 >>> write_model(folder, {"architecture": "completion-unet", "network": {...}}, tensors)
 
-`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder is refused if its files
-do not match. Weights are stored in half precision. No file is unpickled.
+`model.toml` names the architecture and has a SHA-256 hash of `weights.safetensors`. A folder is refused if the hash
+does not match. Weights are stored in half precision. No file is unpickled.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class TrainedModel:
 
 
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
-    """The model of the package with this name, or else the model in the folder with this path.
+    """The model in the package that has this name, or else the model in the folder with this path.
 
     Raises InputError if the model is missing, damaged, or of another architecture.
     """

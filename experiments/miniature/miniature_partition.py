@@ -225,7 +225,6 @@ def partition_filter(world: Miniature, n: int, completer: TableCompleter, pairs:
         pairs=pairs,
         mend=False,
         least_agreement=0.0,  # a row of readings has no surface
-        occupied_log_odds=0.0,  # the table is calibrated
         reach=0.0,
     )
     return ParticleFilter(

@@ -1,4 +1,4 @@
-"""Fits `PartitionUpdate.occupied_log_odds` to tuning scenes.
+"""Fits `NetworkCompleter.log_odds` to tuning scenes.
 
     python experiments/partition_fit/calibration.py [--seeds 5] [--smoke --out FOLDER]
 
@@ -8,8 +8,8 @@ first voxel occupied?" and "do both belong to one object?". Each scene is scored
 others.
 
 scenes/*.npz: what is kept of one scene (finished scenes are not run again). calibration.csv: losses in nats and
-calibration errors for each value. reliability.png: how often forecasts come true, without and with the default of
-`PartitionUpdate`.
+calibration errors for each value. reliability.png: how often forecasts come true, without and with the default
+value.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 from scipy.special import expit, logit
 
 import mstfilter
+from mstfilter.completion import NetworkCompleter
 from mstfilter.files import write_csv
 from mstfilter.forecasts import SOFTENING, ForecastTable
-from mstfilter.partition import PartitionUpdate
 from mstfilter.scoring import ask
 from mstfilter.simulation import cached_recording
 
@@ -34,7 +34,7 @@ SMALL = {"width": 160, "height": 120, "n_actions": 1}
 def of_scene(family: str, seed: int, small: bool) -> dict[str, np.ndarray]:
     """Of every question: probabilities of its voxels, whether hypotheses give them to one object, and the answer."""
     recording = mstfilter.open_recording(cached_recording(family, seed, **(SMALL if small else {})))
-    filter = mstfilter.preset("mst", "update.occupied_log_odds=0.0")
+    filter = mstfilter.preset("mst", "update.completer.log_odds=0.0")
     state, p, same, truth = filter.start(0), [], [], []
     for t, clip in enumerate(recording.clips()):
         state, _ = filter.step(state, clip)
@@ -79,7 +79,7 @@ def draw(scenes: list[dict[str, np.ndarray]], path: Path) -> None:
 
     plt.style.use("mstfilter.report.figures")
     figure, places = plt.subplots(1, 2, figsize=(8, 4.1), sharey=True, layout="constrained")
-    default = PartitionUpdate().occupied_log_odds
+    default = NetworkCompleter().log_odds
     for k, question in enumerate(("is this voxel occupied?", "do these two belong to one object?")):
         place = places[k]
         place.plot([0, 1], [0, 1], color=".6", lw=1)
@@ -127,13 +127,13 @@ def main() -> None:
         errors = [table.reliability(15).error for table in tables(scenes, a)]
         rows.append(
             {
-                **{"field": "occupied_log_odds", "value": f"{a}", "loss": f"{(occupied + same) / 2:.4f}"},
+                **{"field": "log_odds", "value": f"{a}", "loss": f"{(occupied + same) / 2:.4f}"},
                 **{"occupied_loss": f"{occupied:.4f}", "same_loss": f"{same:.4f}"},
                 **{"occupied_error": f"{errors[0]:.3f}", "same_error": f"{errors[1]:.3f}"},
             }
         )
     total = held_out(by_log_odds.mean(axis=2))
-    rows.append({"field": "occupied_log_odds", "value": "held out", "loss": f"{total:.4f}"})
+    rows.append({"field": "log_odds", "value": "held out", "loss": f"{total:.4f}"})
     draw(scenes, chosen.out / "reliability.png")
     names = list(dict.fromkeys(name for row in rows for name in row))
     rows = [{name: row.get(name, "") for name in names} for row in rows]

@@ -62,7 +62,7 @@ class TrackingOnly(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """Return the projected predictions with their weights; at the first pause, the proposed samples."""
+        """Return the predictions after `free_space`, with their weights; at the first pause, the proposed samples."""
         if predicted is None:
             return union(None, proposed)
         refined, quality = self.free_space.refine(predicted.particles, observation)
@@ -125,7 +125,7 @@ class Floor(Proposal):
     objects : ObjectRule
         Rule that decides which pixels are above the table.
     threshold : float
-        Smallest probability of an occupied voxel.
+        Voxels with at least this probability are occupied.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -135,7 +135,7 @@ class Floor(Proposal):
     properly_weighted: ClassVar[bool] = False
 
     def occupied(self, rng: np.random.Generator, clip: Clip) -> np.ndarray:
-        """Labels (X, Y, Z), 1 in the completed space above the table."""
+        """Labels (X, Y, Z), 1 at all visible and completed voxels above the table."""
         found = self.objects.foreground(clip.after, clip.grid)
         completed = self.completer.complete(child(rng, "completion"), found.frame, [found.pixels], clip.grid)
         return hypothesis_of(completed, clip.grid, clip.index, self.threshold).labels
@@ -143,7 +143,7 @@ class Floor(Proposal):
 
 @dataclass(frozen=True)
 class OneBlob(Floor):
-    """One object that fills the completed space above the table. `Floor` describes the parameters."""
+    """One object with all visible and completed voxels above the table. `Floor` describes the parameters."""
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         labels = one_blob(self.occupied(rng, observation))
@@ -161,9 +161,9 @@ class OccupiedComponents(Floor):
 
 @dataclass(frozen=True)
 class ImageComponents(Floor):
-    """Connected components of the image above the table. Each component is completed.
+    """Connected components of the image above the table. Each component is completed to a 3-D shape.
 
-    ``objects.min_points`` is the size of the smallest component. Neighbouring pixels with depths that differ by more
+    A component has at least ``objects.min_points`` pixels. Neighbouring pixels with depths that differ by more
     than 2 cm are not connected. `Floor` describes the parameters.
     """
 

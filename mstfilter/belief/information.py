@@ -63,7 +63,7 @@ def outcome_information(
     outcomes : (n, k) integer
         The outcome of each hypothesis in each group of cells. Identical rows are the same outcome.
     distances : callable
-        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells; not called if `tolerance` is 0.
+        ``distances(distinct outcomes, sizes)`` returns (d, d) numbers of cells that differ. Unused for tolerance 0.
     sizes : (k,) int
         Number of cells in each group.
     tolerance : float
@@ -85,7 +85,7 @@ def hamming(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def canonical_rows(rows: np.ndarray) -> np.ndarray:
-    """Partitions (n, k) with parts numbered by their first cell and 0 for free. Equal rows are equal partitions."""
+    """Partitions (n, k) with parts numbered in order of first cells; 0 is free. Equal rows are equal partitions."""
     return np.stack([canonical(row) for row in rows]) if rows.size else rows
 
 

@@ -65,7 +65,7 @@ _LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 
 
 
 class Border(NamedTuple):
-    """A border in an image. The hypotheses disagree whether both sides of the border are one object."""
+    """A border in an image. The hypotheses disagree about whether both sides of the border are one object."""
 
     one_object: float  #: probability that both sides are one object, if both are objects
     pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
@@ -145,7 +145,7 @@ class Belief:
     # Voxels and regions ---------------------------------------------------------------------------------------
 
     def voxel(self, points: Any) -> np.ndarray:
-        """Voxels (..., 3) that contain world points (..., 3) in metres. A point outside raises InputError."""
+        """Voxels (..., 3) that contain world points (..., 3) in metres. Points outside the grid raise InputError."""
         points = np.asarray(points, dtype=np.float64)
         if points.shape[-1:] != (3,):
             raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
@@ -174,9 +174,9 @@ class Belief:
 
         ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
         k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
-        probabilities, the smaller probability is that of both voxels. `a` and `b` (..., 3) are broadcast against each
-        other. If a = b, the result is the occupancy. If b has all voxels, the result is the extent of the object at
-        a.
+        probabilities, the minimum is the probability that the object contains both voxels. `a` and `b` (..., 3)
+        are broadcast against each other. If a = b, the result is the occupancy. If b has all voxels, the result is
+        the extent of the object at a.
         """
         at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
         found = np.zeros(at_a.shape)
@@ -254,7 +254,7 @@ class Belief:
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
         between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label
-        images. Parts of less than 200 pixels (in an image of 640 x 480) belong to the nearest larger part.
+        images. Parts of fewer than 200 pixels (in an image of 640 x 480) join the nearest larger part.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
         refined = self._refined_image(camera)
@@ -277,8 +277,9 @@ class Belief:
         """Entropy of the segmentation of the scene, in nats.
 
         ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. The entropy is the
-        information of the true segmentation. Without tolerance, the entropy is an upper bound of the information of
-        every outcome that the labels determine. The distance for the tolerance is `information.partition_distance`.
+        expected information of the true segmentation. Without tolerance, the entropy is an upper bound of the
+        information of every outcome that the labels determine. The distance for the tolerance is
+        `information.partition_distance`.
         """
         rows = canonical_rows(self._refined.objects)
         return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
@@ -324,7 +325,7 @@ class Belief:
     def most_informative(
         self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
     ) -> Action | None:
-        """The action of largest expected information; if several actions have the same information, the first action.
+        """The action of largest expected information, or the first of several such actions.
 
         The result is None if no action has `at_least` nats, for example if the hypotheses agree on all outcomes.
         """
@@ -353,7 +354,7 @@ class Belief:
         """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
 
         The loss is 1 - quality (weighted coverage in the form ``objects``). The result is the best single answer
-        among the hypotheses if the true scene has their distribution.
+        among the hypotheses if the true scene is distributed as the belief.
         """
         hypotheses, mass = self._merged
         return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
@@ -405,7 +406,7 @@ def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Different cells a < b (m,) of pairs of neighbouring pixels of an image (H, W), and a pixel (m, 2) of a pair."""
+    """Cells a < b (m,) of neighbouring pixels in different `cells` (H, W), and one of the two pixels (m, 2)."""
     found = []
     for axis in (0, 1):
         one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))

@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _report(error: Exception, given: list[str]) -> int:
-    """Print an error, and return the exit code, which is 2 if the user can correct the error."""
+    """Print an error, and return the exit code: 2 if the user can correct the error, otherwise 1."""
     place = place_in_user_file(error)
     if isinstance(error, ModuleNotFoundError) and place is None:
         error = missing_library(error, " ".join(["mstfilter", *given[:1]]))

@@ -68,7 +68,7 @@ def new(
         str, typer.Option("--for", metavar="scenes|numbers", help="What the particles are. Default: scenes.")
     ] = "",
 ) -> None:
-    """Write a working component with comments, which the user then changes."""
+    """Write a working component with comments, to be changed by the user."""
     from mstfilter.testing import write_starter
 
     commands = write_starter(kind, path, target)

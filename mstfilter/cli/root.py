@@ -76,7 +76,7 @@ def read_source(path: Path, format: str, options: list[str] | None, pauses: str)
 
 
 def print_summary(numbers: RunNumbers) -> None:
-    """Print the gain from earlier images, and for each pause the hypotheses, objects, sample size and quality."""
+    """Print the gain from earlier images, and for each pause the hypotheses, objects, ESS and quality."""
     for sentence in numbers.value_of_the_past:
         print(sentence)
     for t, step in enumerate(numbers.steps):

@@ -119,7 +119,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="New folder for recording, run and report.")] = Path("demo"),
     seed: Seed = 3,
 ) -> None:
-    """Simulate a robot at a cluttered table, filter with and without predictions, and write a report."""
+    """Simulate a robot at a cluttered table, filter the recording with and without predictions, write a report."""
     from mstfilter.formats import open_recording
     from mstfilter.presets import load_config
     from mstfilter.report import read_numbers, write_report
@@ -261,7 +261,7 @@ def quality(
 
 
 def _numbers(rows: Sequence[Any], names: Sequence[str], width: int) -> str:
-    """The mean of each column over rows, as cells of a table."""
+    """The mean over `rows` of each column in `names`, as cells of a table."""
     return "".join(f"{fmean(getattr(row, name) for row in rows):>{width}.3f}" for name in names)
 
 
@@ -302,5 +302,5 @@ def _execute_all(
 
 
 def _compared(folder: Path, name: str) -> Path:
-    """The folder of the comparison run `name` of the run in `folder`; `folder` itself for the empty name."""
+    """The folder of the comparison run `name` inside the run folder `folder`; `folder` itself if `name` is empty."""
     return folder / "compare" / name.replace(" ", "-") if name else folder

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -23,7 +23,7 @@ from mstfilter.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architectur
 from mstfilter.completion.extrude import Extrude
 from mstfilter.completion.observed import ObservedBox, observed_in
 from mstfilter.errors import missing_library
-from mstfilter.fields import Share
+from mstfilter.fields import Bounds, Share
 from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
 
 if TYPE_CHECKING:
@@ -46,12 +46,16 @@ class NetworkCompleter(Completer, UsesFiles):
         If the network keeps less than the share `least_surface` of a large visible surface, the whole surface gets at
         least probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
         network removes much of their surface. With 0, the network's probabilities are used.
+    log_odds : float
+        Added to the log odds of every voxel with a probability between 0 and 1. The network is calibrated for the
+        masks of its training scenes. The default was fitted to runs of `mst` (`experiments/partition_fit`).
     architecture : Architecture, optional
         The architecture of the model in the folder. The default is the architecture of this package's network.
     """
 
     weights: str = "completion"
     least_surface: Share = 2 / 3
+    log_odds: Annotated[float, Bounds()] = 0.6
     architecture: Architecture | None = None
 
     @property
@@ -83,14 +87,11 @@ class NetworkCompleter(Completer, UsesFiles):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        if abs(grid.voxel_size - LATTICE) < 1e-6:
-            return super().complete_each(rngs, frame, masks, grid, views)
-        lattice = _lattice(grid)  # the boxes of all views are boxes of it
+        lattice = grid if abs(grid.voxel_size - LATTICE) < 1e-6 else _lattice(grid)  # views have boxes of it
         found = super().complete_each(rngs, frame, masks, lattice, views)
-        return [
-            self._on_grid(one, frame, np.asarray(mask, dtype=bool), grid, lattice)
-            for one, mask in zip(found, masks, strict=True)
-        ]
+        if lattice is not grid:
+            found = [self._on_grid(one, frame, m, grid, lattice) for one, m in zip(found, masks, strict=True)]
+        return [one.shifted(self.log_odds) for one in found]
 
     def _on_grid(
         self, one: Completion, frame: Frame, mask: np.ndarray, grid: VoxelGrid, lattice: VoxelGrid
@@ -101,7 +102,7 @@ class NetworkCompleter(Completer, UsesFiles):
         corners = np.array([one.offset, one.offset + one.probability.shape]) * LATTICE / grid.voxel_size
         low, high = np.floor(corners[0] + 1e-6).astype(np.int64), np.ceil(corners[1] - 1e-6).astype(np.int64)
         high = np.maximum(np.minimum(high, grid.shape), low)
-        seen = observed_in(frame, mask, grid, self, low, high)
+        seen = observed_in(frame, np.asarray(mask, dtype=bool), grid, self, low, high)
         p = np.zeros(seen.surface.shape, np.float32)
         if p.size:
             index = np.indices(p.shape).reshape(3, -1).T + low

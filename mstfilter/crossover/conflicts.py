@@ -86,7 +86,7 @@ class ConflictGraph:
         return components_in_conflict(self.networkx())
 
     def by_label(self, side: int, values: np.ndarray) -> np.ndarray:
-        """Values (n,) of the vertices as a table (65536,) by the labels of `side`; 0 for labels without an object."""
+        """Table (65536,) of vertex `values` (n,), indexed by the labels of `side`; 0 for labels without an object."""
         table = np.zeros(MAX_LABEL + 1, values.dtype)
         of_side = self.side == side
         table[self.label[of_side]] = values[of_side]
@@ -193,7 +193,7 @@ def _check_structure(
 
 
 class Structure(Checked, ABC):
-    """Draws the painting order of conflicting objects, and the edges along which objects may be merged."""
+    """Samples the painting order of conflicting objects, and the edges along which objects may be merged."""
 
     @returns(_check_structure)
     @abstractmethod

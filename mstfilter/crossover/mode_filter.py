@@ -74,7 +74,7 @@ class ModeFilter(Bounded):
         return out
 
     def _grown(self, box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
-        """A box enlarged to the cells whose window contains a cell of the box."""
+        """The box of all cells whose window contains a cell of `box`."""
         half = self.window // 2
         return tuple(slice(max(s.start - half, 0), min(s.stop + half, n)) for s, n in zip(box, shape, strict=True))
 

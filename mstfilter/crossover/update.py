@@ -8,12 +8,12 @@
 
        ``log w = log w_i + log w_j + lambda log Q_j``
 
-   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. Candidates are therefore resampled
-   before they are built, and only selected candidates are built.
+   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. The weights are
+   known in advance, so candidates are resampled first, and only the selected candidates are built.
 
 Without a proposal, the update only projects and weights the predictions. The projection follows the manifold filter
-of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, few predicted states agree. So every
-particle is projected onto the set of states that agree with the observation.
+of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, hardly any prediction agrees. So
+every particle is projected onto the set of states that agree with the observation.
 
 A crossover has four steps (paper, figure 5):
 
@@ -72,7 +72,7 @@ class Crossover(Bounded):
     Parameters
     ----------
     structure : Structure
-        Draws the painting order and the edges along which objects may be merged.
+        Samples the painting order and the edges along which objects may be merged.
     merge : {"share", "printed", "always", "never"}
         Probability of a merge along a directed edge (`mstfilter.crossover.conflicts`).
     mode_filter : ModeFilter
@@ -143,7 +143,7 @@ class CrossoverUpdate(Update):
     def update(
         self, rng: np.random.Generator, predicted: Population | None, proposed: Population | None, observation: Clip
     ) -> Population:
-        """The candidates of all pairs; each hypothesis is built at its first access.
+        """The candidates of all pairs of a sample and a prediction. Each candidate is built at its first access.
 
         Without a prediction, the proposed samples are returned. Without a proposal, refined predictions are returned.
         """
@@ -156,7 +156,7 @@ class CrossoverUpdate(Update):
         return prediction if proposed is None else self._crossed(rng, prediction, proposed)
 
     def _crossed(self, rng: np.random.Generator, predicted: Population, proposed: Population) -> Population:
-        """Candidates of all pairs of a sample and a refined prediction."""
+        """Candidates of all pairs of a sample and a prediction that `free_space` has changed."""
         check_grids("predicted", predicted.particles, predicted.particles[0].grid)
         check_grids("proposed", proposed.particles, predicted.particles[0].grid)
         i, j = _pairs(child(rng, "order"), len(proposed), len(predicted), self.eta)

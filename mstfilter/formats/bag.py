@@ -1,16 +1,16 @@
-"""ROS 1 bags, ROS 2 bags and MCAP files: colour, depth and CameraInfo topics.
+"""Reads ROS 1 bags, ROS 2 bags and MCAP files with colour, depth and CameraInfo topics.
 
 >>> Bag(colour="/camera/color/image_raw", depth="/camera/aligned_depth_to_color/image_raw").open(Path("session.bag"))
 
 The parameters `colour` and `depth` are needed only if several topics are suitable. The camera matrix is K (P for
 rectified images) in the ``camera_info`` topic that belongs to the colour topic. A frame consists of a colour and a
-depth image with mutually nearest header time stamps. The two time stamps differ by at most `tolerance_s` seconds.
-Depth must be registered to colour, and both images must have the same size and ``frame_id``. Transforms (tf) are not
-read. The camera is assumed not to move, and its pose is computed from the table.
+depth image whose header time stamps are mutually nearest and differ by at most `tolerance_s` seconds. Depth must be
+registered to colour, and both images must have the same size and ``frame_id``. Transforms (tf) are not read. The
+camera is assumed not to move, and its pose is computed from the table.
 
 Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
-encoding 32FC1 is in metres. Compressed depth is a PNG, or a header of 12 bytes (quantisation A, B of 32FC1) and a PNG
-(transport ``compressedDepth``). The library rosbags (extra ``bags``) reads the files without ROS.
+encoding 32FC1 is in metres. Compressed depth is a PNG. In the transport ``compressedDepth``, a header of 12 bytes
+(quantisation A, B of 32FC1) precedes the PNG. The library rosbags (extra ``bags``) reads the files without ROS.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mstfilter.scene import decode_image
 
 @dataclass(frozen=True)
 class Entry:
-    """A message: header stamp (s), log time (ns), and index among the messages with the same log time."""
+    """Reference to a message: header stamp (s), log time (ns), and index among messages with the same log time."""
 
     stamp: float
     logged: int
@@ -104,7 +104,7 @@ class BagFile:
         raise InputError(f"bag {self.path} lists messages of {topic} but holds none", "copy it again")
 
     def index(self, topic: str) -> list[Entry]:
-        """Entries of all messages of a topic, in the order of the file. Every message is read once."""
+        """Entries of all messages of a topic, in the order of the file. The call reads every message."""
         entries: list[Entry] = []
         for logged, message in self._messages(topic):
             stamp = message.header.stamp
@@ -143,7 +143,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def image_encoding(message: Any, compressed: bool) -> str:
-    """The encoding of an image message. A compressed image has ``16UC1``, ``32FC1`` or ``compressed colour``."""
+    """The encoding of an image message; ``16UC1``, ``32FC1`` or ``compressed colour`` for a compressed image."""
     if not compressed:
         return str(message.encoding)
     named = str(message.format)

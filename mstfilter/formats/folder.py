@@ -5,17 +5,15 @@
 >>> recording = RecordingFolder().open(Path("recordings/mine"))
 >>> save_recording(recording, "recordings/copy")
 
-The layout::
-
-    manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
-    camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
-
-    rgb/000000.png       8-bit RGB         depth/000000.png     16-bit, 0 = no reading
-    instance/000000.png  optional: object number of each pixel      robot/000000.png   optional: robot mask
-
-    voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
-    poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
-    SHA256SUMS           hashes of these files
+===================  ==========================================================================================
+manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
+camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
+rgb/, depth/         000000.png, ...: 8-bit RGB images, 16-bit depth images (0 = no reading)
+instance/, robot/    000000.png, ...: optional object number of each pixel, optional robot mask
+voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
+poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
+SHA256SUMS           hashes of these files
+===================  ==========================================================================================
 
 Frames with role ``static`` are the pauses. If camera.json has no pose, the support plane at the first pause defines
 the world axes. If camera.json has no workspace, a grid is placed around the visible table. A recording is written
@@ -86,9 +84,9 @@ class _Workspace(BaseModel):
 class RecordingWriter:
     """Writes a recording folder, frame by frame.
 
-    The new folder must not exist, or must be empty. No other process may write the folder. The pose of the camera is
-    optional. `grid` is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further keyword
-    arguments, such as generator and seed, are stored in manifest.json.
+    The folder must be new or empty, and no other process may write into the folder. `camera` may lack a pose. `grid`
+    is the workspace. `depth_scale` is in metres per unit of the 16-bit depth images. Further keyword arguments, such
+    as generator and seed, are stored in manifest.json.
     """
 
     def __init__(
@@ -211,7 +209,7 @@ def save_recording(
     progress: Callable[[int, int], None] = lambda done, total: None,
     **manifest: Any,
 ) -> Path:
-    """Write a recording as a new recording folder. If the camera moves, every frame stores its pose.
+    """Write a recording as a new recording folder. If the camera moves, the poses are stored in manifest.json.
 
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further keyword arguments, such as the generator, are stored in manifest.json.
@@ -265,7 +263,7 @@ class CameraFile(BaseModel):
 
     @classmethod
     def of(cls, camera: Camera, **more: Any) -> Self:
-        """The entries of a camera; `more` are additional entries of a subclass."""
+        """The entries of a camera. `more` has the additional entries of a subclass."""
         pose = None if camera.T_world_camera is None else camera.T_world_camera.as_matrix().tolist()
         size = {"width": camera.width, "height": camera.height}
         return cls(K=camera.K.tolist(), T_world_camera=pose, **size, **more)
@@ -396,7 +394,7 @@ class RecordingFolder(RecordingFormat):
 
 
 def _read_poses(path: Path) -> Any:
-    """Make the function `Recording.poses`. The first call of the function reads the file."""
+    """A function for `Recording.poses`, which reads the file at its first call."""
 
     @cache
     def load() -> dict[int, dict[int, np.ndarray]]:

@@ -192,14 +192,14 @@ class Redwood(VideoFormat):
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a folder is a recording folder. The camera.json of a recording folder has a workspace."""
+    """Whether a folder is a recording folder: it has a manifest.json, or a camera.json with a workspace."""
     camera = path / "camera.json"
     ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
     return ours or (path / "manifest.json").is_file()
 
 
 def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()) -> list[Path]:
-    """Image files of a folder, except names in `known`, ordered by the numbers in the names."""
+    """Image files of a folder, except files with names in `known`, ordered by the number in the name."""
     if not folder.is_dir():
         raise InputError(f"not a folder of colour and depth images: {folder} is missing", "it holds rgb/ and depth/")
     new = [folder / name for name in set(os.listdir(folder)).difference(known)]
@@ -215,7 +215,7 @@ def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()
 
 
 def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Path]]) -> list[tuple[Path, Path]]:
-    """Pairs of images with the same number that are completely written and later than the pair `after`."""
+    """Pairs of images with equal numbers that are completely written and later than the last pair in `after`."""
     last = _number(after[0][0]) if after else Decimal(-2)
     of_number = {_number(file): file for file in depth}
     pairs = [(file, of_number[n]) for file in colour if (n := _number(file)) in of_number and n > last]
@@ -235,7 +235,7 @@ def _number(file: Path) -> Decimal:
 def _paired(
     path: Path, colour: list[Path], depth: list[Path], tolerance_s: float
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
-    """Pairs of files, and the times of the pairs in seconds. If names are frame numbers, no times are returned."""
+    """Pairs of files, and the times of the pairs in seconds; no times if the names are frame numbers."""
     numbers = [[_number(file) for file in files] for files in (colour, depth)]
     seconds = [[_seconds(number) for number in side] for side in numbers]
     if all(value is not None for side in seconds for value in side):
@@ -257,7 +257,7 @@ def _paired(
 
 
 def _seconds(number: Decimal) -> Decimal | None:
-    """A time stamp in seconds, from a decimal fraction or an integer Unix time in s, ms, us or ns; else None."""
+    """A time stamp in seconds, from a number with decimals or an integer Unix time in s, ms, us or ns; else None."""
     if number != number.to_integral_value() or number.as_tuple().exponent != 0:
         return number
     unit = next((unit for unit in (1, 10**3, 10**6, 10**9) if 10**9 <= number / unit < 10**10), None)
@@ -359,7 +359,7 @@ class Tum(VideoFormat):
 
 
 def _table(path: Path, columns: int) -> list[list[str]]:
-    """Rows of a text file without comments."""
+    """Rows of a text file as lists of words, without comments."""
     lines = read_text(path, "a TUM folder", "it holds rgb.txt and depth.txt").splitlines()
     rows = []
     for number, line in enumerate(lines, 1):
@@ -379,7 +379,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 
 
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
-    """Camera poses at given times. Each pose is from the line with the nearest time stamp."""
+    """Camera poses at given times, each from the line of the file with the nearest time stamp."""
     try:
         rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
         if not np.isfinite(rows).all():

@@ -2,8 +2,9 @@
 
 >>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
 
-A clip goes from one pause to the next. At a pause, neither the robot nor a hand should be in the image. Only the
-recording folder of mstfilter stores the pauses. For other layouts, a rule of this module finds the pauses.
+A clip goes from one pause to the next. At a pause, neither the robot nor a hand should be in the image. Only
+recording folders in the layout of mstfilter store their pauses. For other layouts, a rule of this module finds the
+pauses.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def _numbers(words: list[str]) -> dict[str, Any]:
 
 
 def pauses_from_text(text: str) -> dict[str, Any]:
-    """The configuration of a pause rule from a text with numbers or the name of the rule."""
+    """The configuration of a pause rule, from a text with the frames or times of pauses or the name of a rule."""
     words = text.replace(",", " ").split()
     if words and ".py:" not in text and all(w[0].isdigit() or w[0] in "-." for w in words):
         return {"component": "at", **{k: v for k, v in _numbers(words).items() if v}}
@@ -86,7 +87,7 @@ _MAX_LEVELS = 4.0  # largest threshold of a block in units of `levels`, also if 
 
 
 def _changes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(...) absolute value of the change of each block from `a` to `b` minus the median change."""
+    """Absolute difference between the change of each block from `a` to `b` and the median change of all blocks."""
     difference = b - a
     return np.abs(difference - np.median(difference))
 
@@ -96,10 +97,10 @@ class Still(PauseRule):
     """Middle frames of the intervals in which the image does not change, for a camera that does not move.
 
     Images are reduced to blocks of grey levels. Two images differ if more than 0.1 % of the blocks change by more
-    than the noise of the block. A still interval is a sequence of frames that do not differ from the first frame of
-    the sequence, so slow motion also ends an interval. Each interval of at least `hold_s` seconds gives one pause at
-    its middle frame. Changes that all blocks share (exposure, flicker) are ignored. The noise of each block is
-    measured in the video, so the scene must be at rest for a quarter of the video.
+    than their noise. A still interval is a sequence of frames that do not differ from the first frame of the
+    sequence, so slow motion also ends an interval. Each interval of at least `hold_s` seconds gives one pause at its
+    middle frame. Changes that all blocks share (exposure, flicker) are ignored. The noise of each block is measured
+    in the video, so the scene must be at rest for a quarter of the video.
 
     An interval also gives a pause if a robot waits in the image, or moves and changes the image by less than a grey
     level. Check the pauses, and replace wrong pauses by explicit frame numbers.
@@ -163,7 +164,7 @@ class Still(PauseRule):
         return blocks[int(top * h) : int(np.ceil(bottom * h)), int(left * w) : int(np.ceil(right * w))]
 
     def _limit(self, changes: np.ndarray) -> np.ndarray:
-        """Change (h, w) in grey levels at which a block differs: a multiple of the noise of the block at rest.
+        """Change (h, w) in grey levels above which a block differs: a multiple of the block's noise at rest.
 
         `changes` (n, h, w) are the changes between consecutive images.
         """
@@ -176,7 +177,7 @@ class Still(PauseRule):
 
 @dataclass(frozen=True)
 class Settled(Still):
-    """The frames at which the image has been still for `hold_s` seconds, found while the frames arrive.
+    """Frames at which the image has been still for `hold_s` seconds. They are found while frames arrive.
 
     The parameters are the same as in `Still`. Each pause is the frame at which a still interval reaches a length of
     `hold_s` seconds. The noise is measured in the last hundred frames. A pause depends on earlier frames only, so a
@@ -184,7 +185,7 @@ class Settled(Still):
     """
 
     def watch(self) -> Callable[[float, np.ndarray], bool]:
-        """A function that takes time and colour image of the next frame and returns whether the frame is a pause."""
+        """A function of time and colour image of the next frame, which returns whether this frame is a pause."""
         changes = deque[np.ndarray](maxlen=_RECENT)
         first = last = None  # images of the first frame of the interval and of the last frame
         began, found = 0.0, False

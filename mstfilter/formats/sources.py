@@ -4,8 +4,8 @@
 >>> open_recording("session.mcap")
 >>> open_recording("rgbd_dataset", options=["K=525,525,319.5,239.5"], pauses="0s,4.2s")
 
-Options ``FIELD=VALUE`` set fields of the format, which ``mstfilter list format`` shows. Commas separate the values of
-a list. The format ``./file.py:Class`` is a class in a file of the user. Each other format is a class of
+Options ``FIELD=VALUE`` set fields of the format. ``mstfilter list format`` shows these fields. Commas separate the
+values of a list. The format ``./file.py:Class`` is a class in a file of the user. Each other format is a class of
 `mstfilter.formats`.
 """
 
@@ -101,7 +101,7 @@ def format_settings(options: Sequence[str]) -> dict[str, Any]:
 
 
 def _with_lists(text: str) -> str:
-    """Convert ``K=1,2,3`` to ``K=["1", "2", "3"]``. The type of the field later converts the texts to numbers."""
+    """Convert ``K=1,2,3`` to ``K=["1", "2", "3"]``. The texts become numbers later, by the type of the field."""
     path, equals, value = text.partition("=")
     if not equals or "," not in value or value.strip()[:1] in "[{\"'":
         return text

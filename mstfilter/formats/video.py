@@ -13,9 +13,9 @@ checks every frame on access. For arrays in memory use `Recording.from_arrays`.
 >>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
 >>> video.recording(pauses=Still(), world=KnownWorld())
 
-The default camera pose is computed from the support plane of the first pause. Stored camera poses are used only
-relative to the pose at the first pause, because the table is seldom at z = 0 in the world axes of a stored
-trajectory. A `Camera` has no distortion, so distorted images are undistorted on access.
+By default, the camera pose at the first pause is computed from the support plane. Stored camera poses are used only
+relative to the stored pose at the first pause, because the table is seldom at z = 0 in the axes of stored poses. A
+`Camera` has no distortion, so distorted images are undistorted on access.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _NEGLIGIBLE = 0.5  # pixels
 def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarray | None:
     """Column and row in the distorted image for each pixel of the undistorted image, (H, W, 2) float32.
 
-    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... Returns None if no pixel moves by half a pixel.
+    `distortion` has OpenCV's coefficients k1, k2, p1, p2, k3, ... None if all pixels move by less than half a pixel.
     """
     if not any(distortion):
         return None
@@ -89,7 +89,7 @@ def undistortion_map(camera: Camera, distortion: tuple[float, ...]) -> np.ndarra
 
 
 def _undistort(image: np.ndarray, source: np.ndarray | None, outside: float = 0, smooth: bool = False) -> np.ndarray:
-    """The undistorted image. If `smooth`, values are interpolated, which is wrong for depth and labels."""
+    """The undistorted image. `smooth` interpolates the values, which would be wrong for depth and labels."""
     import cv2
 
     if source is None:
@@ -188,7 +188,7 @@ class Video:
         )
 
     def frame_reader(self) -> tuple[Camera, Any, Callable[[int, Camera], Frame]]:
-        """The camera without a pose, the undistortion map, and a function of index and camera that reads a frame."""
+        """The camera without a pose, the undistortion map, and a function (index, camera) that reads a frame."""
         if not self.times:
             raise InputError(f"{self.path} has no pair of a colour and a depth image")
         if len(self.K) != 4:
@@ -205,7 +205,7 @@ class Video:
         return stored, source, lambda index, camera: self._frame(index, stored, source).resized(camera)
 
     def recording(self, pauses: PauseRule, world: KnownWorld) -> Recording:
-        """The recording of the video. Pose and workspace are computed during the call. Images are read on access."""
+        """The recording of the video. The call computes pose and workspace. Frames are read on access."""
         stored, source, read = self.frame_reader()
         camera = stored.limited(self.max_pixels)
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
@@ -279,7 +279,7 @@ class VideoFormat(RecordingFormat, Bounded):
     tolerance_s : float
         Largest difference in seconds between the time stamps of the colour and the depth image of a frame.
     start_s, stop_s : float
-        Part of the video to use, in seconds after its first frame.
+        Times of the first and the last frame to use, in seconds after the first frame of the video.
     max_pixels : int
         Images with more pixels are reduced to this number. 0 means no limit.
     pauses : PauseRule
@@ -309,7 +309,7 @@ class VideoFormat(RecordingFormat, Bounded):
 
 
 def object_numbers(labels: np.ndarray) -> np.ndarray:
-    """Instance image (H, W) uint16 in which no object has the number 255, which is reserved for the robot."""
+    """A label image (H, W) uint16 in which object 255 has another number, because 255 is reserved for the robot."""
     free = np.setdiff1d(np.arange(256, 65536), labels)[0]
     return np.where(labels == 255, free, labels).astype(np.uint16)
 

@@ -1,4 +1,4 @@
-"""Front ends from other programs: segmentations and shapes in folders, and networks in files.
+"""Front ends that use other programs: segmentations and shapes in folders, and networks in files.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
@@ -11,7 +11,7 @@
 ==================  ===================================================================
 
 The networks of the published system, COB and SiamMask, and the tracker SAM 2 are files in ``models/published``. The
-registry loads these files like components of users. The package has no weights of these networks.
+registry loads these files like component files of users. The package has no weights of these networks.
 """
 
 from mstfilter.lazy import attach

@@ -4,15 +4,15 @@
 
 Each pause has a subfolder, whose name is the number of the pause (`Clip.index`), from 0:
 
-* ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, not 0 on the object.
-* ``shapes/000001/cup/a.ply``, ``b.npz``: shapes of this object. Each hypothesis draws one shape.
+* ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, nonzero on the object.
+* ``shapes/000001/cup/a.ply``, ``.../cup/b.npz``: shapes of the object. Each hypothesis draws one shape.
 * ``shapes/000001/cup/weights.json``: optional weights of the shapes, for example {"a.ply": 2, "b.npz": 1}.
 
-A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world:
+A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world. The file types are:
 
 * ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a point cloud (ply without triangles), read by open3d.
 * ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probabilities of voxels with edge ``voxel_size``.
-  ``origin`` (3,) is the first corner, and the axes are the axes of the frame.
+  ``origin`` (3,) is the corner with the smallest coordinates, and the axes are those of the frame.
 
 A mesh occupies a voxel if the voxel's centre is inside the mesh. The centre is inside if rays in at least two of
 three directions cross the mesh an odd number of times, so small holes have no effect. A point cloud occupies the
@@ -53,7 +53,7 @@ from mstfilter.scene import (
 
 _MESHES = (".ply", ".obj", ".stl", ".off")
 _MASK = "mask.png"
-#: Smallest IoU of a mask with the stored mask, both without pixels that cannot belong to an object.
+#: Smallest IoU at which a mask gets the shapes of a stored mask, over pixels that can belong to an object.
 _MIN_IOU = 0.5
 _WEIGHTS = "weights.json"
 #: Directions of the rays of the inside test; not along the axes, so that they miss edges of axis-parallel meshes.
@@ -73,9 +73,9 @@ class ObjectShapes:
 class ExternalCompletion(ClipCompleter, UsesFiles):
     """Completion by the shapes in a folder.
 
-    A mask gets the shapes of the stored mask with the highest IoU, at least 0.5. If the object has several shapes,
-    each hypothesis draws one shape by weight. Voxels observed as free are cleared, and the visible surface is
-    occupied.
+    A mask gets the shapes of the stored mask with the highest IoU, which must be at least 0.5. If the object has
+    several shapes, each hypothesis draws one shape by weight. Voxels observed as free are cleared, and the visible
+    surface is occupied.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
     axes : {"camera", "world"}
         The coordinate frame of the shapes.
     other : Completer, optional
-        Completer of masks without a stored mask. By default, a mask without a stored mask is an error.
+        Completer of masks that match no stored mask. By default, such masks are an error.
     """
 
     folder: str = ""
@@ -107,7 +107,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return bound_to(self, _shapes=found, other=other)
 
     def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probability 1 on the visible surface. `complete_each` adds the voxels of the external shape."""
+        """Probabilities: 1 on the visible surface, 0 elsewhere. `complete_each` adds the external shape."""
         return seen.surface.astype(np.float32)
 
     def complete_each(
@@ -118,7 +118,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks by the shapes in the folder. Views are not used.
+        """Extend several masks to volumes by the shapes in the folder. `views` is not used.
 
         Raises InputError if `at` was not called before, or if a mask has no shapes.
         """
@@ -130,7 +130,7 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
     def _place(self, rng: np.random.Generator, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> Completion:
         shapes: tuple[ObjectShapes, ...] = self.__dict__["_shapes"]
-        # The given mask has no pixels without reading in the grid, so those of the stored masks do not count.
+        # The given mask has only pixels with a reading in the grid, so other pixels of stored masks do not count.
         known = np.zeros(mask.size, bool)
         known[frame_points(frame, grid)[0]] = True
         ious = [(mask & s.mask).sum() / max((mask | (s.mask & known.reshape(mask.shape))).sum(), 1) for s in shapes]
@@ -153,14 +153,14 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         return Completion(offset, p, seen.points, key.hex()[:16])
 
     def _volume(self, path: Path, camera: Camera, grid: VoxelGrid) -> np.ndarray:
-        """Occupancy (X, Y, Z) float32 of a shape in the grid, computed once."""
+        """Occupancy (X, Y, Z) float32 of the shape in a file, computed only once."""
         data = read_bytes(path, "a shape")
         T = camera.pose.as_matrix() if self.axes == "camera" else np.eye(4)
         key = (content_key(path.suffix, data, T), grid.key)
         return memo("external_shape", key, lambda: place_shape(path, data, T, grid))
 
     def _reaching(self, shape: np.ndarray, frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> ExternalCompletion:
-        """A copy of the completer with enough padding that the box of the mask contains a shape (X, Y, Z)."""
+        """A copy of the completer with enough padding that the box of the mask contains the `shape` (X, Y, Z)."""
         occupied = occupied_box(shape > 0)
         readings = grid.index_of(frame.points[mask & frame.valid])
         readings = readings[grid.contains(readings)]
@@ -172,9 +172,9 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
 
 
 def read_shapes(folder: str | Path, pause: int, shape: tuple[int, int]) -> tuple[ObjectShapes, ...]:
-    """The objects of a pause. `shape` is the shape (H, W) of the image.
+    """The mask and the shape files of each object at a pause. `shape` is the shape (H, W) of the image.
 
-    Shapes are not read. Raises InputError if a file or folder is missing, or if a mask or weights.json is invalid.
+    Shape files are not read. Raises InputError if a file or folder is missing, or a mask or weights.json is invalid.
     """
     if not str(folder):
         raise InputError(
@@ -203,7 +203,7 @@ def _read_object(folder: Path, shape: tuple[int, int]) -> ObjectShapes:
 
 
 def place_shape(path: Path, data: bytes, T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Occupancy (X, Y, Z) float32 of the shape of a file, moved by `T` (4, 4) into the world.
+    """Occupancy (X, Y, Z) float32 of the shape in a file, moved by `T` (4, 4) into the world.
 
     Raises InputError if the file is invalid, or the shape is outside the grid or larger than two grid diagonals.
     """
@@ -247,7 +247,7 @@ def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
 
 
 def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """The array's values at the centres of the grid's voxels, read from the nearest voxel; 0 outside the array."""
+    """Occupancy (X, Y, Z): the value of the array's voxel at the centre of each grid voxel; 0 outside the array."""
     values = arrays["occupancy"]
     if values.ndim != 3 or values.dtype.kind not in "bfiu" or not values.size:
         raise InputError(f"{path}: occupancy has shape {values.shape} and type {values.dtype}, expected (A, B, C)")
@@ -264,7 +264,7 @@ def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: Vo
 
 
 def _cloud(points: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Occupancy of the voxels with points, and of the voxels that these voxels enclose."""
+    """Occupancy (X, Y, Z): 1 for voxels that contain points, and for voxels that these voxels enclose."""
     from scipy.ndimage import binary_fill_holes
 
     index = grid.index_of(points)
@@ -277,7 +277,7 @@ def _cloud(points: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) and triangles (m, 3) of a file; a point cloud has no triangles."""
+    """Vertices (n, 3) and triangles (m, 3) in a file; a point cloud has no triangles."""
     o3d = import_open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh: Any = o3d.io.read_triangle_mesh(str(path))
@@ -290,7 +290,7 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh(points: np.ndarray, triangles: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """Occupancy (X, Y, Z) of a mesh: 1 for voxels with odd numbers of crossings in two of three directions."""
+    """Occupancy (X, Y, Z): 1 if rays in at least two of three directions cross the mesh an odd number of times."""
     o3d = import_open3d()
     low = np.clip(grid.index_of(points.min(axis=0)) - 1, 0, grid.shape)
     high = np.clip(grid.index_of(points.max(axis=0)) + 2, 0, grid.shape)

@@ -14,12 +14,12 @@ The files and subfolders are numbered by pause (`Clip.index`), from 0:
 A file has one set of masks with the shape of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
 
 * ``.png``: label image, 8 or 16 bits, in which 0 means no mask.
-* ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,), in ascending order of
-  the labels.
+* ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,) of the masks, or of the
+  labels in ascending order.
 
 Scores are at least 0. Missing scores are 1. Without weights.json, the weight of an alternative is the mean score of
-its largest masks. Weights need not sum to 1. If several objects are uncertain independently of each other, use nested
-masks in one alternative.
+the masks that no other mask contains. Weights need not sum to 1. If several objects are independently uncertain, use
+nested masks in one alternative.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mstfilter.reading import MAX_FILE, read_bytes, read_json, unpack_arrays
 from mstfilter.scene import content_key, memo, read_labels
 from mstfilter.segmentation import Tree
 
-MAX_MASKS = 65535  #: Largest label, and largest number of masks of a file
+MAX_MASKS = 65535  #: Largest label, and largest number of masks in a file
 _SUFFIXES = (".png", ".npz")
 _WEIGHTS = "weights.json"
 #: Number of axes, kinds of type, and words for an error, of the arrays in an npz file.
@@ -60,8 +60,8 @@ class PauseMasks:
 def read_masks(folder: str | Path, pause: int, shape: tuple[int, int]) -> PauseMasks:
     """Read the masks of a pause. `shape` is the shape (H, W) of the image.
 
-    Files are read at each call, but their content is parsed once. Raises InputError if the folder has no masks for
-    the pause, or if a file is invalid.
+    Files are read at each call, but unchanged content is parsed only once. Raises InputError if the folder has no
+    masks for the pause, or if a file is invalid.
     """
     if not str(folder):
         raise InputError("the folder of masks is not given", "set folder, for example proposal.folder=masks")
@@ -153,7 +153,7 @@ def _parsed(
 
 
 def _mean_of_largest(masks: np.ndarray, scores: np.ndarray) -> float:
-    """Mean score of the masks that no other mask contains; 1 without masks."""
+    """Mean score of the masks that no other mask contains; 1 if there are no masks."""
     if len(scores) == 0:
         return 1.0
     if masks.ndim == 2:

@@ -3,8 +3,8 @@
 >>> filter = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")
 >>> MaskProposal("masks").sample(np.random.default_rng(0), clip, 10)
 
-`mstfilter.frontends.mask_files` describes the folder. For each sample, an alternative is drawn by weight, and the
-segmentation is a cut of the alternative's tree of masks. Each distinct mask is completed once.
+`mstfilter.frontends.mask_files` describes the folder. For each sample, an alternative segmentation of the image is
+drawn by weight, and then a cut of the tree of its masks. Each distinct mask is extended to a 3-D volume once.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from mstfilter.smc import Population, Proposal, child
 
 @dataclass(frozen=True)
 class MaskProposal(Proposal, UsesFiles):
-    """Hypotheses from a folder of instance masks with alternatives.
+    """Hypotheses from a folder of instance masks with alternative segmentations.
 
     Parameters
     ----------
     folder : str
         The folder of masks.
     sampler : CutSampler
-        Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution of
-        `mstfilter.frontends.mask_trees`.
+        Sampler of cuts of the tree of nested masks. At temperature 1, the cuts have the distribution that
+        `mstfilter.frontends.mask_trees` defines.
     objects : ObjectRule
-        Rule that decides which masks are objects. Other masks, such as the mask of the table, are background. A
-        background mask that contains masks is always split into its parts.
+        Rule that decides which masks are objects. Other masks, such as that of the table, are background. A
+        background mask that contains other masks is always split into its parts.
     completer : Completer
     threshold : float
         Smallest probability of an occupied voxel.
@@ -98,13 +98,13 @@ class MaskProposal(Proposal, UsesFiles):
 
 
 def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np.ndarray:
-    """Stop probabilities (N,), set to 0 at masks that contain masks and are not objects, such as the table."""
+    """Stop probabilities (N,), set to 0 at background masks (such as the table) that contain other masks."""
     inner = np.arange(tree.n_nodes) >= tree.n_leaves
     return np.where(inner & ~is_object, 0.0, stop)
 
 
 def _number(content: bytes) -> int:
-    """An integer of 62 bits that identifies the random streams of a mask by the content of the mask."""
+    """A 62-bit number from a hash of a mask's content, which identifies the random streams of the mask."""
     return int.from_bytes(content_key(content)[:8], "big") >> 2
 
 
@@ -116,9 +116,9 @@ class MaskGenerator(Protocol):
 
 
 def write_automatic_masks(folder: str, clips: Iterable[Clip], generator: MaskGenerator, share: float = 0.9) -> None:
-    """Run a mask generator on the last frame of each clip, and write its masks, which may contain each other.
+    """Run a mask generator on the last frame of each clip, and write its masks into a folder.
 
-    `share` is passed to `nested_masks`.
+    `nested_masks` makes the masks disjoint or nested, with the argument `share`.
     """
     for clip in clips:
         found = generator.generate(clip.after.rgb.copy())

@@ -11,8 +11,8 @@ a mask contains masks, its remaining pixels are also a leaf. The root is the who
 
 A walk from the largest masks down the tree defines the distribution of the cuts. If a mask with score s contains
 masks with mean score m, the walk stops at this mask with probability s / (s + m). Otherwise the walk visits the inner
-masks and the remaining pixels. `node_values` returns values w such that the Gibbs distribution exp(sum of w over the
-cut) is the distribution of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
+masks and the remaining pixels. For the values w of `node_values`, the Gibbs distribution of cuts, proportional to
+exp(sum of w over the cut), is that of the walk. Every `CutSampler` at temperature 1 draws from this distribution.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CLIP = 1e-9  # other probabilities are at least this far from 0 and 1
 
 
 def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[Tree, np.ndarray]:
-    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and the stop probabilities (N,) of its nodes.
+    """The tree of masks (n, H, W) bool with scores (n,) >= 0, and the probabilities (N,) to stop at its nodes.
 
     Raises InputError if a mask is empty, if two masks are equal, or if two masks overlap and are not nested.
     """
@@ -58,7 +58,7 @@ def mask_tree(masks: np.ndarray, scores: Sequence[float] | np.ndarray) -> tuple[
 
 
 def label_tree(labels: np.ndarray, scores: np.ndarray | None = None) -> tuple[Tree, np.ndarray]:
-    """The tree of a label image (H, W), 0 without mask. `scores` (n,) are in ascending order of the labels."""
+    """Tree and stop probabilities of a label image (H, W), 0 = no mask. `scores` (n,) are in order of the labels."""
     present, image = np.unique(labels, return_inverse=True)
     image = image.reshape(labels.shape) - 1 if (present == 0).any() else image.reshape(labels.shape)
     n = int((present != 0).sum())
@@ -67,7 +67,7 @@ def label_tree(labels: np.ndarray, scores: np.ndarray | None = None) -> tuple[Tr
 
 
 def check_scores(scores: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
-    """Scores as float64 (n,). Raises InputError if their number is not n, or if a score is negative or not finite."""
+    """Scores as float64 (n,). Raises InputError unless there are n scores, which are finite and at least 0."""
     scores = np.asarray(scores, dtype=np.float64)
     if scores.shape != (n,):
         raise InputError(f"scores have shape {scores.shape}, expected one for each of {n} masks")
@@ -131,11 +131,11 @@ def nested_masks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Make masks with arbitrary overlaps disjoint or nested, and return masks and scores.
 
-    Use this function for the output of automatic mask generators. Masks are processed in order of decreasing score,
-    and each mask is compared with all kept masks. Two masks are neighbours if they share at most ``1 - share`` of the
-    smaller mask. Two masks are nested if they share at least `share` of the smaller mask, and the smaller area is
-    less than `share` of the larger area. In all other cases the mask is removed. In nested pairs, the smaller mask
-    loses the pixels outside the larger mask. Common pixels of neighbours belong to the mask with the higher score.
+    Use this function for automatic mask generators. Masks are processed in order of decreasing score, and each mask
+    is compared with all kept masks. Two masks are neighbours if they share at most ``1 - share`` of the smaller mask.
+    Two masks are nested if they share at least `share` of the smaller mask, and the smaller area is less than `share`
+    of the larger area. Otherwise the mask with the lower score is removed. In nested pairs, the smaller mask loses
+    the pixels outside the larger mask. Common pixels of neighbours belong to the mask with the higher score.
     """
     check_number("share", share, above=0.5, at_most=1)
     masks = np.asarray(masks, dtype=bool)

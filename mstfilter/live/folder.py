@@ -33,8 +33,8 @@ def filter_folder(
 ) -> RunFolder:
     """Filter the images of a folder while they arrive, and return the run folder.
 
-    The files of each pause are identical to the files of a run on the complete folder with the same pause rule. An
-    interrupted live run cannot be resumed.
+    The files of each pause, except wall times, are identical to those of a run on the complete folder with the same
+    pause rule. An interrupted live run cannot be resumed.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def filter_folder(
     seed : int
         Seed of all random streams.
     idle_s : float
-        The run ends if no image arrives for `idle_s` seconds.
+        The run ends when no image has arrived for `idle_s` seconds.
     replace, allow_files, n_threads
         See `mstfilter.runs.filter_recording`.
     on_pause : callable

@@ -7,7 +7,7 @@
 ...     stream.hypotheses, stream.belief
 
 One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last
-complete clip. The results are identical to the results of a run on the recorded frames with the same pauses.
+complete clip. The results are identical to those of a run on the recorded frames with the same pauses.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Pause:
     state: State  #: the state of the filter
     info: Info  #: the record of the step
     latency_s: float  #: seconds from the push of the last frame to the result
-    #: Frames so far: pushed; dropped because they were late, had no depth, or found the queue full (overflow);
-    #: thinned, which were removed from a long clip.
+    #: Numbers of frames so far: "pushed"; dropped for the reasons "late", "no depth" or "overflow" (queue is full);
+    #: "thinned", which are removed from a long clip.
     counts: dict[str, int]
 
     @property
@@ -110,7 +110,7 @@ class Stream:
     reaches `max_frames`, frames with little motion are removed from the clip. `counts` has the number of dropped and
     removed frames. At most three times `max_frames` frames are in memory.
 
-    An error of a thread is raised by the next call of `push`, `wait` or `close`.
+    An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
     def __init__(
@@ -310,7 +310,7 @@ class Stream:
         self._track()
 
     def _track(self) -> None:
-        """Restart the optical-flow trackers at the first frame of the clip."""
+        """Restart the optical-flow trackers at the first frame of the current clip."""
         self._trackers = [flow.begin(self._clip[0].frame) for flow in self._flows]
         for tracker in self._trackers:
             for item in self._clip[1:]:

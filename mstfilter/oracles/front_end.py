@@ -42,8 +42,8 @@ _REACH = 4.0  # distance to a true border up to which strength is kept, in pixel
 class TrueMasks(UsesTruth, Proposal):
     """Identical hypotheses from the true masks of the clip's last frame.
 
-    The `foreground` of `objects` determines which pixels can belong to an object. Completed voxels of probability
-    `threshold` or more are occupied.
+    The method `foreground` of `objects` determines which pixels can belong to an object. Completed voxels of
+    probability `threshold` or more are occupied.
     """
 
     completer: Completer = field(default_factory=Extrude)
@@ -104,11 +104,11 @@ _WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
 
 @dataclass(frozen=True)
 class TrueCompletion(UsesTruth, Completer):
-    """The true voxels of the objects that a mask shows. A mask without true objects keeps its visible surface.
+    """The true voxels of the objects that a mask shows. A mask without true objects gives its visible surface.
 
     `objects` determines which pixels can belong to an object. True voxels are assigned to pixels of their object. A
-    mask with 75 % of an object's pixels gets all voxels of the object. An object is ignored if it covers less than
-    10 % of a mask and the mask covers less than half of the object.
+    mask with at least 75 % of an object's pixels gets all voxels of the object. An object is ignored if it covers
+    less than 10 % of a mask and the mask covers less than half of the object.
     """
 
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
@@ -127,7 +127,7 @@ class TrueCompletion(UsesTruth, Completer):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        """Complete several masks of a frame at a pause; views are not used."""
+        """The completions of several masks of a frame at a pause. `views` are not used."""
         t = self.truth.pause_of(frame)
         owner = np.where(self.objects.foreground(frame, grid).pixels, self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(

@@ -9,9 +9,9 @@
 Oracles find the time of an observation from the index of its clip. A resampler gets no clip. So for true selection,
 `TrueQuality` weights the candidates by their true quality, and `LargestWeights` selects the n best candidates.
 
-Replacing one stage by its oracle shows the gain from a perfect stage in the present filter. Replacing all other
-stages shows the loss from the remaining stage in an otherwise perfect filter. Gain and loss are not equal, because a
-stage can correct errors of another stage.
+Replacing one stage by its oracle shows the gain if this stage were perfect. Replacing all other stages shows the loss
+from this stage if all other stages were perfect. Gain and loss are not equal, because a stage can correct errors of
+another stage.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class TrueQuality(UsesTruth, Evidence):
 
 @dataclass(frozen=True)
 class TruePairs(UsesTruth, PairOdds):
-    """Nearly certain log odds of the truth, so that probable partitions are as near to the truth as possible.
+    """Log odds that are nearly certain of the truth, so that the most probable partitions are close to the truth.
 
     A cell belongs to the true object of most of its readings.
     """

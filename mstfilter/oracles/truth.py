@@ -7,8 +7,8 @@ before a run. `bind_truth` binds all components of a filter that use the truth, 
 >>> filter = bind_truth(filter, recording)            # the same filter if no component uses the truth
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-``mstfilter run`` and studies bind the components automatically. The truth is not a field of the component, so binding
-changes neither the description nor the equality of a component. Binding changes the `component_key` of a component.
+``mstfilter run`` and studies bind the components automatically. The truth is not a field of the component, so bound
+and unbound components are equal and have the same description. Binding changes the `component_key` of a component.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class RecordingTruth:
 
     @cached_property
     def _mended(self) -> dict[bytes, int]:
-        """The first pause with each frame, by the key of the frame with estimated missing readings."""
+        """The first pause at which each frame was taken, by the key of the frame with estimated missing depth."""
         from mstfilter.scene import foreground  # needs cv2, which the registry does not
 
         recording = self.recording
@@ -109,7 +109,7 @@ class RecordingTruth:
 
 
 class UsesTruth:
-    """A component that uses the truth. A component inherits `UsesTruth` together with its interface."""
+    """Additional base class of components that use the truth."""
 
     #: Data that the component needs from a recording.
     needs: ClassVar[tuple[Need, ...]] = ("voxels",)
@@ -137,7 +137,7 @@ class UsesTruth:
 
 
 def uses_truth(component: Any) -> list[str]:
-    """Class names of those components that use the truth, among the component and its nested components, in order."""
+    """Class names of the components that use the truth: the component itself and nested components, in order."""
     return [type(part).__name__ for part in nested_components(component) if isinstance(part, UsesTruth)]
 
 

@@ -45,13 +45,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import islice, zip_longest
-from typing import Annotated, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
-from mstfilter.fields import Bounds, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
+from mstfilter.fields import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from mstfilter.partition.association import Overlaps, recognised
 from mstfilter.partition.candidates import Choices, largest
 from mstfilter.partition.cells import Cells, PairEvidence, PairOdds, Readings
@@ -122,9 +122,6 @@ class PartitionUpdate(Update):
     temperature : float
         T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
         cells. A higher T makes the probabilities more even.
-    occupied_log_odds : float
-        Added to the log odds of every uncertain voxel. The completion network is calibrated only for its training
-        scenes, so the default was fitted in `experiments/partition_fit`.
     evidence : tuple of Evidence
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
@@ -151,7 +148,6 @@ class PartitionUpdate(Update):
     free_space: Projection = FreeSpace()  # noqa: RUF009 (frozen)
     pairs: PairOdds = PairEvidence()  # noqa: RUF009 (frozen)
     temperature: PositiveFloat = 1.0
-    occupied_log_odds: Annotated[float, Bounds()] = 0.6
     evidence: tuple[Evidence, ...] = ()
     quality_exponent: NonNegativeFloat = 3.0
     n_candidates: NonNegativeInt = 0
@@ -315,7 +311,7 @@ class PartitionUpdate(Update):
         streams = [key.child(k).generator() for k in seen]
         masks = [readings.mask(objects[k].readings) for k in seen]
         found = completer.complete_each(streams, clip.after, masks, clip.grid, [views[k] for k in seen])
-        completed = {k: one.shifted(self.occupied_log_odds) for k, one in zip(seen, found, strict=True)}
+        completed = dict(zip(seen, found, strict=True))
         completed |= {k: one.remains for k, one in enumerate(objects) if k not in completed and one.remains}
         return [completed[k] for k in range(len(objects))]
 

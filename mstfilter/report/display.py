@@ -1,4 +1,4 @@
-"""Display of the package's objects in a notebook: text, pictures, plots, and a scene that can be rotated.
+"""Shows the package's objects in a notebook: text, pictures, plots, and scenes that can be rotated.
 
 >>> recording.plot()                        # images, depth and the time line of the pauses
 >>> hypothesis.show()                       # voxels that can be rotated with the mouse, also outside a notebook
@@ -50,7 +50,7 @@ class Drawing(Figure):
 
 
 def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
-    """Colour of each label, in ascending order of labels."""
+    """Mapping from labels to colours of the palette, in the order of the objects."""
     return {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
 
 
@@ -83,7 +83,7 @@ def plot_recording(recording: Recording) -> Drawing:
 
 @matplotlib.style.context("mstfilter.report.figures")
 def plot_population(population: Population) -> Drawing:
-    """Draw the six most probable hypotheses, or for numbers, weighted histograms of the first six coordinates."""
+    """The six most probable hypotheses; for numeric particles, weighted histograms of the first six coordinates."""
     population = population.realised()
     if isinstance(population.best, Hypothesis):
         return _plot_hypotheses(population)

@@ -30,10 +30,10 @@ _CORNERS = {
 
 
 def voxel_faces(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the faces that separate the voxels of a mask (X, Y, Z) bool, not empty, from all other voxels.
+    """Triangles of the faces between the voxels of a mask (X, Y, Z) bool, which must not be empty, and other voxels.
 
-    Returns corners (v, 3) int, in voxels from the lower corner of the grid, and triangles (f, 3) int. Seen from
-    outside, the corners of a triangle are in counter-clockwise order.
+    Returns corners (v, 3) int, in voxels from the lower corner of the grid, and the indices (f, 3) int of the corners
+    of each triangle. Seen from outside, the corners of a triangle are in counter-clockwise order.
     """
     padded = np.pad(mask, 1)
     quads = []
@@ -57,7 +57,7 @@ def object_mesh(hypothesis: Hypothesis, label: int) -> tuple[np.ndarray, np.ndar
 
 
 def export_mesh(hypothesis: Hypothesis, path: str | Path, colours: Mapping[int, Colour] | None = None) -> Path:
-    """Write the mesh of a hypothesis with at least one object, in world metres, to a ply or obj file.
+    """Write the mesh of a hypothesis to a ply or obj file, in world metres. The hypothesis must have an object.
 
     The triangles are the outer faces of the objects. The mesh of an object encloses exactly the volume of its voxels.
     `colours` is ``{label: (r, g, b)}``. By default, the colours of the palette are used in order of labels. Raises

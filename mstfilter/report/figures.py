@@ -3,8 +3,8 @@
 >>> svg = quality_figure(times, qualities, weights, {"without past": [...]}, {"one blob": [...]})
 >>> svg = time_figure({"s1": {"mst": {0: [0.5, 0.6], 1: [0.7]}}}, arms=["mst"])
 
-Each function returns the text of an ``<svg>`` element. The figure uses the colours and fonts of its page, also in a
-dark theme. The same values give the same text.
+Each function returns the text of an ``<svg>`` element. The figure uses the colours and fonts of the page that
+contains it, also in a dark theme. The same values give the same text.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _WIDEST = 10.0  # inches
 
 @contextmanager
 def _style(name: str) -> Iterator[None]:
-    """The style of the project. `name` makes the ids of the elements of a figure unique in a page."""
+    """The style of all figures. `name` makes the ids of the elements of a figure unique in a page."""
     import matplotlib.style
 
     style = matplotlib.style.context("mstfilter.report.figures", after_reset=True)  # without the user's matplotlibrc
@@ -93,7 +93,7 @@ def _svg_text(figure: Figure, title: str) -> str:
 
 
 def _merge_styles(match: re.Match[str]) -> str:
-    """Write the common style of a group of marks once, and the positions of the marks to a tenth of a point."""
+    """Write the common style of a group of marks only once, and round the marks' positions to a tenth of a point."""
     styles = set(re.findall(r'style="([^"]*)"', match[2]))
     marks = re.sub(r'([xy]="-?\d+\.\d)\d+"', r'\1"', match[2])
     if len(styles) > 1 or "style=" in match[1]:
@@ -121,7 +121,7 @@ def quality_figure(
     compared: Mapping[str, Sequence[float]],
     baselines: Mapping[str, Sequence[float]],
 ) -> str:
-    """Quality of hypotheses (points, area by weight), mean and compared runs (lines) and baselines (dashed lines).
+    """Quality over time: hypotheses (points with area by weight), mean and compared runs (lines), baselines (dashed).
 
     `times` are the indices of the pauses with ground truth. `qualities` and `weights` have one value per hypothesis
     for each pause. `compared` and `baselines` have one value per pause for each name. NaN means no value.
@@ -168,13 +168,13 @@ def time_figure(
     measure: str = "quality",
     every_arm: Sequence[str] = (),
 ) -> str:
-    """Quality of all hypotheses, or another measure of the runs, over time, with one panel per family.
+    """Quality of all hypotheses over time, or another measure of the runs, with one panel per family.
 
-    `values` is family -> arm -> pause -> values. A pause has one value for each scene and seed, or for each
-    hypothesis. `arms` names the compared methods in the order of their boxes (`figure_groups` splits long lists).
-    Methods without values are not drawn. A method has the same colour in all figures with the same `every_arm` of at
-    most twelve names. A box contains the middle half of the values, the bar is the median, and whiskers reach the 5th
-    and 95th percentile. Points are values, and lines join the means.
+    `values` is a nested mapping family -> arm -> pause -> values. A pause has one value for each scene and seed, or
+    for each hypothesis. `arms` names the compared methods in the order of their boxes (`figure_groups` splits long
+    lists). Methods without values are not drawn. If `every_arm` lists up to twelve methods, each has the same colour
+    in all figures with this list. A box contains the middle half of the values, the bar is the median, and whiskers
+    reach the 5th and 95th percentile. Points are values, and lines join the means.
     """
     values = {family: {a: v for a, v in of_arms.items() if a in arms} for family, of_arms in values.items()}
     colours, n = _arm_colours(every_arm if 0 < len(every_arm) <= len(SERIES) else arms), len(values)
@@ -211,7 +211,7 @@ def time_figure(
 
 
 def _columns(names: Iterable[str]) -> int:
-    """Number of columns of a legend that fit the narrowest figure."""
+    """Number of columns of a legend that fit into the narrowest figure."""
     return max(1, min(4, 84 // (8 + max(len(name) for name in names))))
 
 
@@ -296,7 +296,7 @@ def forest_height(rows: Sequence[ForestRow]) -> float:
 
 
 def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
-    """Draw each difference with its interval on a line, below the name of its group if the group has a name."""
+    """Draw each row as a point with its interval. The name of a group, if not empty, is above its rows."""
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x")
     axes.axvline(0, color=_MUTED, lw=1.0)

@@ -1,4 +1,4 @@
-"""Identities of objects over hypotheses and pauses, so that an object keeps its colour.
+"""Identities of objects across hypotheses and pauses, by which an object has the same colour everywhere.
 
 >>> identities = assign_identities(run)
 >>> identities.of(t, k)                             # {label: identity 0, 1, 2, ...} of hypothesis k at pause t
@@ -49,7 +49,7 @@ class Identities:
 
 
 def assign_identities(run: RunFolder) -> Identities:
-    """Identities of all objects of a run, pause by pause."""
+    """Identities of all objects of a run, assigned pause by pause."""
     assignment = _Assignment()
     for t in range(run.n_pauses):
         info = run.info(t)
@@ -66,7 +66,7 @@ def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) ->
 
 
 class _Assignment:
-    """Identities of the objects of the pauses so far."""
+    """Identities of the objects of all pauses that were added so far."""
 
     def __init__(self) -> None:
         self.table: dict[tuple[int, int], dict[int, int]] = {}
@@ -142,7 +142,7 @@ class _Assignment:
 
 
 def _overlaps(labels: np.ndarray, image: np.ndarray, objects: list[int], n: int) -> np.ndarray:
-    """Jaccard indices (len(objects), n) of the voxels of `objects` and of n identities."""
+    """Jaccard indices (len(objects), n) of each object in `labels` with each of n identities in `image`."""
     table = overlap(labels, image)
     jaccard = table.jaccard()
     out = np.zeros((len(objects), n))

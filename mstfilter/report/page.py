@@ -22,7 +22,7 @@ _LONGEST = 6  # lists up to this length are written in full
 
 
 def fill_template(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
-    """Text of a filled template of this package, with the reports' style sheet. Missing variables raise an error."""
+    """The text of a page from a template of this package and `content`. Missing values raise an error."""
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     folder = files("mstfilter.report") / "templates"
@@ -96,7 +96,7 @@ def _list_text(values: Sequence[Any]) -> str:
 
 
 def note_rows(notes: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
-    """A table of the values that a component stored: one row per key, one column per pause, empty text if missing."""
+    """A table of the values that a component stored: a row per key, a column per pause, empty texts if missing."""
     flat = [flatten(n) if n else {} for n in notes]
     keys = list(dict.fromkeys(key for rows in flat for key in rows))
     return [(key, [short_text(rows[key]) if key in rows else "" for rows in flat]) for key in keys]

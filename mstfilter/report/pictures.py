@@ -6,9 +6,9 @@
 >>> colour(0), colour(1)                                                            # of identities
 ((51, 111, 185), (238, 145, 56))
 
-The first six colours of the palette were chosen by hand. Each further colour is the farthest from all earlier
-colours. The distance of two colours is their smallest Oklab distance in three kinds of vision: normal, protanopia and
-deuteranopia (Machado, Oliveira, Fernandes 2009, severity 1).
+The first six colours of the palette were chosen by hand. Each further colour is as distant as possible from all
+earlier colours. The distance of two colours is their smallest Oklab distance in three kinds of vision: normal,
+protanopia and deuteranopia (Machado, Oliveira, Fernandes 2009, severity 1).
 
 Voxels are rendered by ray casting. The brightness of a face depends on its normal. Lines are drawn along the borders
 of objects and of faces.
@@ -115,7 +115,7 @@ def overlay(
 ) -> np.ndarray:
     """An image (H, W, 3) with a label image (H, W) drawn over it: translucent fill and contours.
 
-    Inside objects the image is grey (luma of ITU-R BT.601), so that an object has the hue of its colour.
+    Inside objects the image is grey (luma of ITU-R BT.601), so that an object has the hue of its label's colour.
     """
     above = overlay_layer(labels, colours, fill=fill, line=line).astype(float)
     alpha = above[..., 3:] / 255
@@ -157,7 +157,7 @@ def viewpoint(
     width: int = 600,
     height: int = 450,
 ) -> Camera:
-    """A camera that looks down obliquely at the occupied voxels of all volumes and shows all of them.
+    """A camera that looks down obliquely and shows the occupied voxels of all volumes.
 
     A volume is a hypothesis or a pair (labels, grid). If no voxel is occupied, the view shows the middle of the
     workspace. If `camera` is given, the view has the azimuth of `camera`, turned by 35 degrees.
@@ -248,7 +248,7 @@ def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.nd
 
 
 def _table(view: Camera) -> np.ndarray:
-    """Picture (H, W, 4) float of the plane z = 0: translucent grey, a line every 10 cm, transparent at the border."""
+    """Picture (H, W, 4) float of the plane z = 0: grey, translucent, with lines every 10 cm, fading at the border."""
     rays = view.rays() @ view.pose.rotation.as_matrix().T
     below = rays[..., 2] < -1e-6
     along = np.where(below, -view.position[2] / np.where(below, rays[..., 2], -1), 0)
@@ -273,7 +273,7 @@ def _over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def _reduced(colour: np.ndarray, alpha: np.ndarray, factor: int) -> np.ndarray:
-    """Mean over blocks of factor x factor pixels, with colour weighted by opacity."""
+    """Mean over blocks of `factor` x `factor` pixels, with colour weighted by opacity."""
     h, w = alpha.shape[0] // factor, alpha.shape[1] // factor
     blocks = (h, factor, w, factor)
     opacity = alpha.reshape(blocks).mean(axis=(1, 3))

@@ -49,7 +49,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Bars for a study. Yields a function that takes a `StudyProgress`. Failed jobs are printed above the bars."""
+    """Progress bars for a study. Yields a function of a `StudyProgress`. Failed jobs are printed above the bars."""
     tasks: dict[str, Any] = {}
     with _bars() as bars:
 

@@ -1,4 +1,4 @@
-"""Numbers of a run, for the report and the command line.
+"""Numerical results of a run, for the report and the command line.
 
 >>> numbers = read_numbers(RunFolder.open("runs/demo"))
 >>> numbers.value_of_the_past, numbers.steps[-1].mean
@@ -44,18 +44,18 @@ _BASELINES = {"one blob": "quality_one_blob", "connected components": "quality_c
 
 @dataclass(frozen=True)
 class PauseNumbers:
-    """Numbers of one pause."""
+    """Numerical results at one pause."""
 
     info: Mapping[str, Any]  #: contents of info.json
     seconds: Mapping[str, float]  #: contents of seconds.json
     objects: Sequence[int]  #: number of objects of each hypothesis
     n_distinct: int  #: number of distinct hypotheses
     metrics: Mapping[str, float] | None  #: of `mstfilter.scoring.pause_metrics`; None without ground truth
-    in_image: float | None  #: mean quality of the outlines in the image; None without ground truth
-    image_score: PauseScore | None  #: scores in the image; None with true volumes or without true image
+    in_image: float | None  #: mean quality of the projected hypotheses; None without ground truth
+    image_score: PauseScore | None  #: scores in the image, if only a true label image is known
     compared: Mapping[str, float]  #: mean quality of the compared runs, where it is known
     compared_losses: Mapping[str, float]  #: log loss of the compared runs in nats, where it is known
-    belief: BeliefScore | None  #: scores of the weighted set; None without ground truth
+    belief: BeliefScore | None  #: scores of the weighted hypotheses; None without ground truth
     time: float  #: time of the pause in the recording
     clip_seconds: float | None  #: time since the last pause; None for the first pause
 
@@ -110,7 +110,7 @@ class PauseNumbers:
         return self.info["parents"].get(kind)
 
     def notes(self, slot: str) -> Mapping[str, Any]:
-        """Extra values that a component stored, without identical values that an earlier component stored."""
+        """Extra values that the component of `slot` stored, except values that an earlier component also stored."""
         notes: Mapping[str, Mapping[str, Any]] = self.info["notes"]
         earlier = [notes[name] for name in itertools.takewhile(lambda name: name != slot, notes)]
         return {k: v for k, v in notes.get(slot, {}).items() if not any(k in e and e[k] == v for e in earlier)}
@@ -118,7 +118,7 @@ class PauseNumbers:
 
 @dataclass(frozen=True)
 class RunNumbers:
-    """Numbers of a run."""
+    """Numerical results of a run."""
 
     description: Mapping[str, Any]
     steps: Sequence[PauseNumbers] = field(default_factory=tuple)
@@ -130,12 +130,12 @@ class RunNumbers:
 
     @cached_property
     def slots(self) -> list[str]:
-        """Names of the components of the step that have times or extra values, in the order of the step."""
+        """Names of the slots of the filter that have times or extra values, in the order of a step."""
         used = {s for step in self.steps for s in (*step.seconds, *step.info["notes"])}
         return [s for s in SLOT_TITLES if s in used] + sorted(used - set(SLOT_TITLES))
 
     def component(self, slot: str) -> str:
-        """Name of the class that the run used for a component of the step; empty if unknown."""
+        """Name of the component in a slot of the filter; empty if unknown."""
         part = self.description["config"].get(slot)
         name = part.get("component", "") if isinstance(part, Mapping) else part
         return str(name).rsplit(":", 1)[-1] if name else ""
@@ -147,7 +147,7 @@ class RunNumbers:
 
     @property
     def with_images(self) -> list[int]:
-        """Indices of the pauses for which only the quality in the image is known."""
+        """Indices of the pauses at which only the quality in the image is known."""
         return [t for t, step in enumerate(self.steps) if step.image_score is not None]
 
     @property
@@ -157,7 +157,7 @@ class RunNumbers:
 
     @property
     def value_of_the_past(self) -> list[str]:
-        """Whether the filter is better than the latest image alone, in a sentence; empty if a score is unknown."""
+        """One sentence that states whether earlier images help, in a list; an empty list if a score is unknown."""
         name = "single frame"
         known = [step for step in self.steps[1:] if step.belief is not None and name in step.compared_losses]
         if not known:

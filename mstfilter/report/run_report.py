@@ -44,8 +44,8 @@ def write_report(
 ) -> Path:
     """Write the report of a run, finished or not, as HTML, by default to ``report.html`` in the run folder.
 
-    `numbers` is the result of `read_numbers`, if known. Returns the path of the file. Raises InputError if the
-    folder is not a run folder, or the file cannot be written.
+    `numbers` is the result of `read_numbers`, if it was computed before. Returns the path of the file. Raises
+    InputError if the folder is not a run folder, or the file cannot be written.
     """
     from markupsafe import Markup
 
@@ -113,7 +113,7 @@ def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:
 
 
 def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
-    """Overlay of the disagreement of the hypotheses of a pause, for the template. None if all hypotheses agree."""
+    """Overlay that shows where the hypotheses of a pause disagree, for the template. None if all hypotheses agree."""
     disagreement = belief.disagreement(camera)
     if not disagreement.any():
         return None
@@ -127,7 +127,7 @@ def _doubt(belief: Belief, camera: Camera) -> dict[str, Any] | None:
 
 
 def _place_tags(image: np.ndarray, identity: Mapping[int, int]) -> list[dict[str, Any]]:
-    """Number, and pixel at the widest part, of each object that is large enough in the image; large objects first."""
+    """Number and position (at the widest part) of each object that is large enough in the image, largest first."""
     from scipy.ndimage import distance_transform_edt, find_objects
 
     min_radius, min_distance = 0.009 * image.shape[1], 0.03 * image.shape[1]
@@ -165,12 +165,12 @@ def _figures(numbers: RunNumbers) -> dict[str, Any]:
 
 
 def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
-    """Values of all rows by name; NaN if a row lacks the name."""
+    """Lists of the values of all rows, by name; NaN if a row lacks the name."""
     return {name: [row.get(name, np.nan) for row in rows] for name in dict.fromkeys(n for row in rows for n in row)}
 
 
 def _part(numbers: RunNumbers, slot: str) -> dict[str, Any]:
-    """Extra values and times of a component of the step, over all pauses."""
+    """Extra values and times of the component in a slot, over all pauses."""
     return {
         "slot": slot,
         "title": SLOT_TITLES.get(slot, slot),

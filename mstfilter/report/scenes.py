@@ -1,10 +1,10 @@
-"""Content of the pauses of a run or a recording, for the report and for pages that can be rotated.
+"""Content of the pauses of a run or a recording, for the report and for pages with rotatable scenes.
 
 >>> scenes = scenes_of_run(RunFolder.open("runs/demo"))
 >>> view = scenes[-1].views[0]                        # the most probable hypothesis of the last pause
 >>> view.name, view.weight, view.overlay(scenes[-1].camera, 1, 2)
 
-Each hypothesis has its name, its weight and quality, and the colours of its objects (`report.identities`).
+Each hypothesis has a name, weight, quality and the colours of its objects (`mstfilter.report.identities`).
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ class ShownHypothesis:
         return self.hypothesis.volumes()
 
     def overlay(self, camera: Camera, scale: int, line: int) -> str:
-        """The objects in the image of a camera as a data URI, with the arguments of `overlay_layer`."""
+        """The layer with the objects in a camera's image, as a data URI. `scale` and `line`: see `overlay_layer`."""
         colours = {label: self.colour(label) for label in self.volumes}
         image = project(self.hypothesis, camera)
         return data_uri(png_bytes(overlay_layer(image, colours, scale=scale, line=line)))
 
     def voxels(self, view: Camera) -> str:
-        """The voxels from a viewpoint as a data URI."""
+        """A picture of the voxels from a viewpoint, as a data URI."""
         colours = {label: self.colour(label) for label in self.volumes}
         return data_uri(png_bytes(voxel_picture(self.hypothesis.labels, self.hypothesis.grid, view, colours)))
 
@@ -70,7 +70,7 @@ class ShownPause:
 
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
-    """The pauses of a run: at most twelve distinct hypotheses, the most probable first, then the truth."""
+    """The pauses of a run, each with at most twelve distinct hypotheses, the most probable first, and the truth."""
     identities, times = assign_identities(run), run.description["recording"]["times"]
     scenes: list[ShownPause] = []
     view_of: dict[int, int] = {}
@@ -98,7 +98,7 @@ def scenes_of_run(run: RunFolder) -> list[ShownPause]:
 
 
 def scenes_of_recording(recording: Recording) -> list[ShownPause]:
-    """The pauses of a recording, with the truth or, without truth, with the surface that the camera sees."""
+    """The pauses of a recording, each with the truth or, if it is unknown, the surface that the camera sees."""
     scenes = []
     for t, clip in enumerate(recording.clips()):
         truth, frame = recording.truth(t), clip.after

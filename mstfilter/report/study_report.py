@@ -112,7 +112,7 @@ def _page(study: StudyFolder) -> str:
 
 
 def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
-    """A reliability diagram of each family, with all arms that take part in comparisons."""
+    """Reliability diagrams of each family, for all arms that are part of the comparisons."""
     from markupsafe import Markup
 
     figures = []
@@ -189,7 +189,7 @@ def _costs(summary: Summary) -> dict[str, Any]:
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Each arm, and the fields in which the arm's configuration differs from the reference."""
+    """Each arm, with the fields in which its configuration differs from that of the reference."""
     flat = {arm["name"]: flatten(arm["config"]) for arm in description["arms"]}
     base = flat[description["reference"]]
     found = []

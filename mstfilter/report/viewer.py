@@ -1,9 +1,9 @@
-"""Pages with scenes in three dimensions, for any browser.
+"""HTML pages with three-dimensional scenes, for any browser.
 
 >>> run_page("runs/demo").save("run.html")             # one file: time line, image, voxels, weights, genealogy, truth
 >>> recording_page(recording).save("recording.html")   # images and truth, or the surface that the camera sees
 
-`Hypothesis.show`, the report of a run and ``mstfilter view`` use the same page. A page loads nothing from a network.
+`Hypothesis.show`, the report of a run and ``mstfilter view`` use these pages. A page loads nothing from a network.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ScenePage:
         return self.frame(460)
 
     def frame(self, height: int) -> str:
-        """The page as a frame in another page, `height` pixels high, without access to the other page."""
+        """The page as a frame of `height` pixels for another page. The frame cannot access the other page."""
         style = f'width="100%" height="{height}" style="border:0" sandbox="allow-scripts"'
         return f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.text)}" {style}></iframe>'
 
@@ -135,7 +135,7 @@ def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:
 
 
 def encode_runs(labels: np.ndarray) -> np.ndarray:
-    """Run-length encoding of labels in C order: rows (label, length) with 16 bits each. Long runs are split."""
+    """Run-length encoding of labels in C order: rows (label, length) of 16-bit numbers. Long runs are split."""
     flat = labels.ravel()
     if not len(flat):
         return np.zeros((0, 2), "<u2")

@@ -1,4 +1,4 @@
-"""One run: a recording is opened, filtered, and stored in a folder.
+"""Runs: `filter_recording` filters a recording and stores the results in a run folder.
 
 >>> from mstfilter.presets import load_config
 >>> from mstfilter.runs import filter_recording
@@ -8,8 +8,8 @@
 >>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
 >>> rows = score_pauses(run.estimates(), read_truth(recording))
 
-The same call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
-an uninterrupted run have the same result. The module `run` has the loop, the module `run_folder` has the files.
+A repeated call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
+an uninterrupted run have the same result. The module `run` filters, and `run_folder` reads and writes files.
 """
 
 from mstfilter.lazy import attach

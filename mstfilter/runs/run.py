@@ -35,7 +35,7 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Configurations of the filters with which a run is compared. Compared filters keep the completer of the run."""
+    """Configurations of the filters with which a run is compared, by name. They have the completer of the run."""
     parts = (config.get(slot) or {} for slot in ("proposal", "update"))
     proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
     proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
@@ -130,7 +130,7 @@ def filter_recording(
 
 
 def first_pause(path: Path, description: dict[str, Any], replace: bool, *step: Any) -> RunFolder:
-    """Make a run folder with its first pause. `step` are the arguments of `RunFolder.write_pause`."""
+    """Make a run folder and write its first pause. `step` has the arguments of `RunFolder.write_pause`."""
     with atomic_folder(path, "replace" if replace else "refuse") as work:
         RunFolder.create(work, description).write_pause(*step)
     return RunFolder(path)
@@ -175,9 +175,9 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
 
 
 def check_run_folder(path: Path, replace: bool = False) -> None:
-    """Raise InputError unless a path is a run folder or an empty folder, or a new folder can be made at the path.
+    """Raise InputError unless `path` is a run folder or an empty folder, or a new folder can be made there.
 
-    With `replace`, a run folder must not contain files that are not part of a run.
+    With `replace`, all files in a run folder must be part of a run.
     """
     if not os.path.isfile(path / "run.json"):  # False for a name that is too long, where Path.is_file raises
         check_output(path, folder=True)
@@ -197,7 +197,7 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 
 def component_files(component: Any) -> dict[str, str]:
-    """Hashes of files that a component and its parts read: source files of the user, weights, other files."""
+    """Hashes of the files that a component and its parts use: source files of the user, weights, other files."""
     found: defaultdict[str, str] = defaultdict(str)
     for part in nested_components(component):
         name, source = type(part).__name__, type(part).__dict__

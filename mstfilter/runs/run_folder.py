@@ -17,7 +17,7 @@ metrics.csv, SHA256SUMS  table with one row per pause and hypothesis, and the ha
 compare/without-past     run folders of other filters on the same recording, if requested
 =======================  =============================================================================================
 
-A pause is written under a temporary name and renamed when it is complete, so a stopped run has only complete pauses.
+The folder of a pause has a temporary name until it is complete, so a stopped run has only complete pauses.
 `filter_recording` resumes from state.npz of the last complete pause. `mstfilter.scene.encode_hypotheses` makes the
 arrays ``particles/...`` in state.npz. The same seed gives the same bytes in all files except seconds.json.
 """
@@ -175,7 +175,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, description: Mapping[str, Any]) -> RunFolder:
-        """Make a run folder that contains only its description."""
+        """Make a run folder that contains only run.json."""
         write_json(path / "run.json", {"format": _FORMAT, "status": "running", **description})
         return cls(path)
 
@@ -188,7 +188,7 @@ class RunFolder:
         return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
 
     def check(self) -> RunFolder:
-        """Read every file of the run and of its comparison runs, before the files are used.
+        """Read every file of the run and of its comparison runs, to find errors before the files are used.
 
         Raises InputError if a file is missing or damaged, or if files of a pause are inconsistent.
         """
@@ -202,7 +202,7 @@ class RunFolder:
         return self
 
     def _check_pause(self, t: int, n_before: int) -> int:
-        """Check the files of a pause after a pause with `n_before` hypotheses. Returns the number of hypotheses."""
+        """Check the files of pause `t` after a pause with `n_before` hypotheses. Returns the number of hypotheses."""
         folder, info, hypotheses = self.pause(t), self.info(t), self.hypotheses(t)
         grid, camera, image, labels = hypotheses[0].grid, self.camera(t), self.rgb(t), self.truth(t)
         _ = self.seconds(t), self.questions(t)
@@ -255,9 +255,9 @@ class RunFolder:
         questions: Questions | None = None,
         instance: np.ndarray | None = None,
     ) -> None:
-        """Write the results of a step, and, if known, true labels, questions and true label image of the pause.
+        """Write the results of a step, and the true labels, questions and true label image of the pause, if known.
 
-        An interrupted call writes nothing.
+        `questions` are the pairs of voxels for the log loss. An interrupted call writes nothing.
         """
         assert state.population is not None
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
@@ -333,12 +333,12 @@ class RunFolder:
         return self._truth(t).get("labels")
 
     def questions(self, t: int) -> Questions | None:
-        """The questions of a pause with ground truth; None if the truth is unknown."""
+        """The pairs of voxels that score the hypotheses at pause `t`; None if the truth is unknown."""
         pairs = self._truth(t).get("questions")
         return Questions(self._truth(t)["labels"].shape, *pairs) if pairs is not None and pairs.size else None
 
     def _truth(self, t: int) -> dict[str, np.ndarray]:
-        """True labels and questions of a pause, if they are known."""
+        """True labels (key "labels") and questions (key "questions") of a pause; empty if the truth is unknown."""
         path = self.pause(t) / "truth.npz"
         if not path.exists():
             return {}
@@ -358,7 +358,7 @@ class RunFolder:
     def state(self, t: int) -> State:
         """The state after pause `t`, from which the run is resumed.
 
-        The state is kept in `scene_cache`, because a report reads the state many times.
+        The state is kept in the cache `scene_cache`, because a report reads it many times.
         """
         path = self.pause(t) / "state.npz"
         with reading(path, "a pause of a run"):
@@ -367,7 +367,7 @@ class RunFolder:
         return memo("state of a run", version, lambda: load_state(path, HypothesisCodec(), limit=MAX_FILE))
 
     def estimates(self) -> list[PauseEstimate]:
-        """The weighted hypotheses of all pauses, the input of `mstfilter.scoring.score_pauses`."""
+        """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""
         run, found = self.check(), []
         if run.n_pauses == 0:
             raise InputError(f"{self.path}: the run has no complete pause yet")

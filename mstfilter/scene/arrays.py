@@ -24,7 +24,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """A read-only array. Writeable memory is copied, so that no write to another array changes the result."""
+    """A read-only array. Writeable memory is copied, so that later writes to other arrays do not change it."""
     owner: object = array
     while isinstance(owner, np.ndarray):
         if owner.flags.writeable:
@@ -36,7 +36,7 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def component_key(component: object) -> bytes:
-    """Hash of the class and the fields of a component, and of the source of a class that a user defines.
+    """Hash of the class and the fields of a component, and of the source code of a user-defined class.
 
     The hash includes the attribute ``bound_key``, which identifies the ground truth of an oracle. A torch module is
     hashed by its weights. A field of any other class is hashed by its pickled content.
@@ -61,7 +61,7 @@ def component_key(component: object) -> bytes:
 
 
 def _code(cls: type) -> str:
-    """The code of the methods of a class of the user, as text."""
+    """The code of the methods of a user-defined class, as text."""
     own = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")]
     values = [value for base in own for value in vars(base).values()]
     inner = [getattr(v, "fget", None) or getattr(v, "func", None) or getattr(v, "__func__", v) for v in values]
@@ -77,7 +77,7 @@ def _text(constant: Any) -> str:
 
 
 def content_key(*parts: object) -> bytes:
-    """A 16-byte hash of the content of arrays, bytes, strings and numbers, in order."""
+    """A 16-byte hash of arrays, bytes, strings and numbers. The hash depends on their order."""
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, np.ndarray):

@@ -1,8 +1,8 @@
 """Cache of intermediate results. The key of a result is computed from the content of the inputs.
 
 Some results depend only on the images and not on the hypothesis, for example the boundary map of a frame. `memo`
-computes a result once for all hypotheses of a step. A second run on the same data in the same process also uses the
-stored results.
+computes such a result once for all hypotheses of a step. A second run on the same data in the same process also uses
+the stored results.
 
 >>> from mstfilter.scene import memo, scene_cache
 >>> memo("square", (3,), lambda: 9)
@@ -35,8 +35,8 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    If the total size exceeds `limit_bytes`, the least recently used values are dropped. The counter `hits` has the
-    number of values found in memory or on disk, by name.
+    If the total size exceeds `limit_bytes`, the least recently used values are dropped. For each name, `hits` counts
+    the values found in memory or on disk.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
@@ -147,7 +147,7 @@ class Cache:
         return self._n_bytes
 
     def forget(self) -> None:
-        """Drop the values that have not been used since the second last call of `forget`.
+        """Drop the values that were last used before the two previous calls of `forget`.
 
         A loop over pauses that calls `forget` after each step keeps the values of the last two steps.
         """
@@ -166,9 +166,9 @@ class Cache:
 
     @contextlib.contextmanager
     def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
-        """Also store values on disk if `stored_as` is given. Several processes can share the folder (`DiskCache`).
+        """Also store values with `stored_as` (see `get`) on disk. Several processes can share the folder.
 
-        `limit_bytes` is the largest size of the folder. Values stored by another `version` of the code are not used.
+        `limit_bytes` is the maximum size of the folder. Values stored by another `version` of the code are not used.
         """
         from mstfilter.scene.disk_cache import DiskCache
 

@@ -3,7 +3,7 @@
 >>> with scene_cache.on_disk(folder, limit_bytes=10**9, version="1"):  # doctest: +SKIP
 ...     run()                                    # values with `stored_as` are stored, and found again
 
-Only values with the argument `stored_as` of `memo` are stored on disk. The library diskcache stores the entries and
+Only values for which `memo` gets `stored_as` are stored on disk. The library diskcache stores the entries and
 removes the least recently used entries beyond the limit. Entries are .npz files without pickled objects.
 """
 
@@ -120,7 +120,7 @@ class DiskCache:
         warnings.warn(InputWarning(message, "this process continues without it"), stacklevel=4)
 
     def find(self, name: str, key: Hashable, stored_as: Any) -> Any:
-        """The value of an entry with read-only arrays, or None if no readable entry exists."""
+        """The value of an entry, or None if no readable entry exists. Arrays in the value are read-only."""
         if self._entries is None:
             return None
         try:
@@ -137,7 +137,7 @@ class DiskCache:
             return None
 
     def store(self, name: str, key: Hashable, value: Any) -> None:
-        """Write an entry. Errors of the folder or the disk are not raised."""
+        """Write an entry. An entry that cannot be written causes no error."""
         if self._entries is None:
             return
         data = io.BytesIO()

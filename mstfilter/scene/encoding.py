@@ -25,9 +25,9 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
 
     If a hypothesis has probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
     ``source_probability`` concatenates the probabilities of all `Crop` objects. Each `ObjectView` has a row in
-    ``view_of`` (row of the viewed object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4),
-    ``view_key``, ``view_colours`` (n,). ``view_bits`` and ``view_signed`` concatenate the arrays
-    of all `ObjectView` objects.
+    ``view_of`` (row of the object), ``view_offset``, ``view_shape`` (3,), ``view_motion`` (4, 4),
+    ``view_key``, ``view_colours`` (n,). ``view_bits`` and ``view_signed`` concatenate the arrays of all `ObjectView`
+    objects.
     """
     grid = hypotheses[0].grid
     if any(h.grid != grid for h in hypotheses):

@@ -62,7 +62,7 @@ class Projection(Checked, ABC):
 
     @returns(_check_refined)
     def refine(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
-        """Project hypotheses for the last frame of a clip. Returns hypotheses, and shares (n,) of kept voxels."""
+        """Apply `project` to the last frame of a clip. Returns n hypotheses, and their shares (n,) of kept voxels."""
         pairs = [self.project(hypothesis, clip.after) for hypothesis in hypotheses]
         return tuple(h for h, _ in pairs), np.array([q for _, q in pairs])
 
@@ -142,21 +142,21 @@ _LEAST_PIXELS = 30  # in an image of 640 x 480 pixels: an object with fewer of t
 
 
 def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray, float]:
-    """Shares of the visible surface that a frame confirms, for each object and for all objects together.
+    """Fraction of the visible surface that a frame confirms, for each object and for the whole hypothesis.
 
-    The test renders the hypothesis and uses the pixels inside the outlines of objects. Pixels without a depth reading
+    The test renders the hypothesis and uses the pixels inside the rendered outlines. Pixels without a depth reading
     are not used. A pixel with a reading in front of the surface is not used, because another object may hide the
-    surface. At each remaining pixel, the surface is confirmed if the pixel is a `foreground` pixel and the reading is
-    not far behind the surface. The tolerance is the edge of a voxel plus three standard deviations of the depth
-    noise.
+    surface. At each remaining pixel, the surface is confirmed if the pixel can belong to an object (`foreground`)
+    and the reading is not far behind the surface. The tolerance, in front and behind, is the edge of a voxel plus
+    three standard deviations of the depth noise.
 
     Returns
     -------
     of_objects : (k,) ndarray
-        Share of confirmed pixels for each label. The share is NaN for label 0, for objects with few used pixels, and
+        Fraction of confirmed pixels for each label. It is NaN for label 0, for objects with few used pixels, and
         for objects with fewer used pixels than pixels without a reading.
     of_scene : float
-        Share of confirmed pixels for all objects. The share is 1 if no pixel can be used.
+        Fraction of confirmed pixels among the used pixels of the whole image, or 1 if no pixel is used.
     """
     rendered, shown = render_hypothesis(hypothesis, frame.camera), foreground(frame, hypothesis.grid).pixels
     would_show = _interior(rendered, hypothesis.grid.voxel_size * frame.camera.K[0, 0])

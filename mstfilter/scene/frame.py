@@ -5,8 +5,8 @@
 >>> clip = Clip([frame, frame_2], grid, 1)     # the frames from pause 0 to pause 1
 >>> clip.before, clip.after                    # its first and its last frame
 
-If several cameras observe the scene, the images of a main camera are segmented and tracked. A frame of the main
-camera has the simultaneous frames of the other cameras as `views`. Free space is computed from all cameras:
+If several cameras observe the scene, only the images of a main camera are segmented and tracked. A frame of
+the main camera has the simultaneous frames of the other cameras as `views`. Free space is computed from all cameras:
 
 >>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """
@@ -62,7 +62,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
 
 
 def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarray:
-    """The image in the bytes of a PNG, JPEG or TIFF file, decoded with the `flags` of ``cv2.imdecode``.
+    """Decode the bytes of a PNG, JPEG or TIFF file. `flags` are those of ``cv2.imdecode``.
 
     Raises InputError with the message `problem` if the bytes are not an image. An image of more than `MAX_PIXELS`
     pixels is not decoded and also raises InputError.
@@ -269,7 +269,7 @@ class Frame:
         return content_key("views", key, *(view.key for view in self.views)) if self.views else key
 
     def resized(self, camera: Camera) -> Frame:
-        """The frame in the image size of a camera, without views. Depth is that of the nearest pixel."""
+        """The frame in the image size of a camera, without views. Depth is taken from the nearest pixel."""
         if camera is self.camera:
             return self
         import cv2

@@ -7,7 +7,7 @@
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
 The noise of disparity does not depend on depth, so the support plane is found by a least-squares fit of an affine
-function to disparity. Disparity is in 1/8 pixels of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
+function to disparity. Its unit is 1/8 pixel of a Kinect (f = 525 pixels, b = 0.075 m) for every image size.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
 
 
 def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel of every voxel centre in the images of a camera, and z-depth in single and in double precision."""
+    """Pixel of every voxel centre in the images of a camera, and its z-depth in single and in double precision."""
     u, v, z, inside = camera.pixels_of(grid.centres())
     pixel = np.where(inside & (z > 1e-6), v * camera.width + u, -1).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
@@ -147,7 +147,7 @@ def _fit(frame: Frame) -> SupportPlane:
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
-    """Camera pose in world axes with z up and the plane at z = 0. On the plane, disparity is a u + b v + c."""
+    """Camera pose in world axes with z up and the plane at z = 0. `plane` is (a, b, c) of disparity a u + b v + c."""
     scale = 8.0 * _FOCAL * BASELINE
     # D = p . (u, v, 1) and (u, v, 1) = K X / z  =>  scale = p K X: the plane in camera axes.
     normal = plane @ camera.K
@@ -196,7 +196,7 @@ _LEAST_SIDE, _LARGEST_SIDE = 1.0, 2.0  # metres
 def workspace(frame: Frame) -> VoxelGrid:
     """A grid with voxels of 1 cm around the visible part of the table. The table is at z = 0.
 
-    The grid is .5 m high, and each side is 1 to 2 m long. The grid covers as much of the table as possible. If the
+    The grid is .5 m high and 1 to 2 m long and wide. The grid covers as much of the table as possible. If the
     table is shorter or longer than the grid along an axis, the grid is shifted towards the depth readings that are
     more than 1 cm above the table. Readings outside the visible table, for example on a wall, are ignored.
     """

@@ -233,7 +233,7 @@ def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
 
 
 def _support(first: Look) -> Iterator[Finding]:
-    """Findings if the pose, intrinsics or support plane do not agree with the depth readings at the first pause."""
+    """Findings if the depth readings at the first pause contradict the pose, intrinsics or support plane."""
     free, camera, table = first.plane(np.ones(len(first.points), bool)), first.frame.camera, first.table
     hints = (
         f"{_CHECK_POSE}; without a pose it is found from the table",
@@ -327,7 +327,7 @@ class _Corners:
         self.points, self.camera = points[row, column], frame.camera
 
     def moved(self, other: _Corners) -> tuple[int, int, float]:
-        """Number of corners at rest, number of corners that moved together, and median shift (m) of these corners."""
+        """Number of corners at rest, number of corners that moved together, and median shift (m) of the latter."""
         import cv2
 
         if self.features is None or other.features is None:
@@ -412,12 +412,12 @@ _BOX = np.ones((3, 3), np.uint8)
 
 
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
-    """Agreement of depth edges and colour edges at all pauses.
+    """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
 
     The first value is the best agreement minus the median over all shifts. The second value is the relative loss of
-    agreement if colour is not shifted. The third value is the best shift (rows, columns) of colour, in pixels of an
-    image with 320 columns. The fourth value is the increase of the agreement if the depth images of pauses are
-    exchanged.
+    agreement without a shift. The third value is the best shift (rows, columns) in pixels of an image with 320
+    columns. The fourth value is the increase of the agreement if the depth images of different pauses are exchanged
+    and no image is shifted.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -441,7 +441,7 @@ def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int]
 
 
 def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A finding if depth edges do not agree with colour edges at the same pixels and the same pause."""
+    """A finding if the edges of the depth image and of the colour image of a pause are not at the same pixels."""
     peak, lost, shift, rise = edge_agreement(looks)
     if peak < _PEAK:
         return
@@ -465,7 +465,7 @@ def _repeated(looks: Sequence[Look]) -> Iterator[Finding]:
 
 
 def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Finding]:
-    """A finding if the scene changes in a video with only one pause, because the other frames are not used."""
+    """A finding if the scene changes in a video with only one pause: frames that are not at a pause are not used."""
     if len(pauses) > 1 or len(frames) == 1:
         return
     change = np.abs(grey_blocks(frames[0].rgb) - grey_blocks(frames[len(frames) - 1].rgb))

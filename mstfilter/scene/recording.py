@@ -168,7 +168,7 @@ class Recording:
             are given for more than two frames, else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
             Pose of the camera, or one pose per frame if the camera moves. The table must be at z = 0. The default
-            pose is computed from the support plane of the first pause.
+            pose is computed from the support plane at the first pause.
         grid : VoxelGrid, optional
             Workspace. The default grid covers the visible table: sides of 1 to 2 m, height 0.5 m, voxels of 1 cm.
         robot_masks : (T, H, W) bool, optional
@@ -303,9 +303,9 @@ class Recording:
 
 
 class UsesFiles(ABC):
-    """A component that reads files of the user. The component inherits `UsesFiles` in addition to its interface."""
+    """Additional base class of components that read files of the user."""
 
-    #: Fields with paths of files or folders. A changed file gives another run.
+    #: Fields with paths of files or folders, whose hashes a run records.
     path_fields: ClassVar[tuple[str, ...]] = ("folder", "weights", "checkpoint")
 
     @abstractmethod

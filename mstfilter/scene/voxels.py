@@ -184,7 +184,7 @@ class Crop:
 
 
 class Seen(IntFlag):
-    """Flags that say how one frame observes a voxel, relative to one object (`ObjectView.bits`)."""
+    """Flags for how one frame observes a voxel, relative to one object (`ObjectView.bits`)."""
 
     SURFACE = 1  #: visible surface of the object
     OTHER_SURFACE = 2  #: visible surface of another object or of the background
@@ -199,7 +199,7 @@ class Seen(IntFlag):
 
 @dataclass(frozen=True, eq=False)
 class ObjectView:
-    """Observation of an object in one frame, for the voxels of a box, and motion of the object since the frame."""
+    """One frame's observation of the voxels of a box around an object, and the object's motion since the frame."""
 
     offset: np.ndarray  #: (3,) int, index of the box's first voxel in the grid
     bits: np.ndarray  #: (a, b, c) uint8, flags of `Seen`
@@ -231,7 +231,7 @@ class ObjectRecord:
     source: Crop | None = None
     #: Rigid motion in world metres since `source`; the identity if `source` is None.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
-    completion_key: str | None = None  #: key of the segment that was completed to the object
+    completion_key: str | None = None  #: key of the image segment from which the object was made
     views: tuple[ObjectView, ...] = ()  #: observations of the object in frames, oldest first
 
     def __repr__(self) -> str:
@@ -299,7 +299,7 @@ class Occupancy:
         return content_key("occupancy", self.owner, self.probability)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
-        """The occupancy for new labels. Changed voxels get probability 0 or 1. Only objects in `known` are kept."""
+        """The occupancy for new labels. Changed voxels get probability 0 or 1. Owners outside `known` are removed."""
         changed = before != after
         owner = np.where(changed | (after > 0), after, self.owner)
         p = np.where(changed, after > 0, self.probability)
@@ -394,7 +394,7 @@ class Hypothesis:
 
     @property
     def shares(self) -> Occupancy:
-        """The occupancy. In a hypothesis without probabilities, every occupied voxel has probability 1."""
+        """The field `occupancy`. If it is None, every occupied voxel gets probability 1."""
         return self.occupancy or Occupancy(self.labels, (self.labels > 0).astype(np.float16))
 
     def crop(self, label: int) -> Crop:
@@ -442,7 +442,7 @@ class Hypothesis:
     mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
-        """Rigid motion of an object in world metres since its first observation or last change (`ObjectRecord`)."""
+        """Rigid motion of an object in world metres since its first observation or its last change of shape."""
         return self.record(label).motion
 
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:

@@ -1,7 +1,7 @@
 """Scores of a weighted set of hypotheses against the ground truth.
 
-*Quality* measures how good one hypothesis is (`quality`, `metrics`). The *recalibrated log loss* measures the
-probabilities of the weighted set (`questions`, `log_loss`).
+*Quality* measures how good one hypothesis is (`quality`, `metrics`). The *recalibrated log loss* measures how
+good the probabilities of the weighted set are (`questions`, `log_loss`).
 
 >>> from mstfilter.scoring import ask, object_status, pause_metrics, score_belief
 >>> truth, status = recording.truth(2), object_status(recording, 2)

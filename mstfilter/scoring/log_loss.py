@@ -1,4 +1,4 @@
-"""Scores the forecasts of a weighted set of hypotheses, which are its answers to `questions`.
+"""Scores of forecasts: the answers of a weighted set of hypotheses to `questions`.
 
 >>> belief = score_belief(ask(recording, t), hypotheses, weights, recording.truth(t))
 >>> belief.row["brier"], belief.row["log_loss"]                # as the hypotheses come
@@ -40,7 +40,7 @@ class BeliefScore(NamedTuple):
     Parameters
     ----------
     row : dict
-        ``brier``: mean squared error of the forecasts. ``log_loss``: mean log loss of softened forecasts, in nats.
+        ``brier``: mean squared error of the forecasts p. ``log_loss``: mean log loss of .98 p + .01, in nats.
         ``calibration_error``: calibration error on ten bins of equal numbers of questions.
     counts : (r, 1001, 2) int32
         Number of questions for each rate of noise, each forecast in thousandths, and each outcome.
@@ -95,7 +95,7 @@ def score_belief(
 
 
 def forecast_table(counts: np.ndarray) -> ForecastTable:
-    """The table of forecasts and outcomes from counts (1001, 2)."""
+    """The table of forecasts 0, .001, ... 1 from the number (1001, 2) of "no" and "yes" answers to each."""
     kept = counts.any(axis=1)
     no, yes = counts[kept].T.astype(float)
     return ForecastTable(np.flatnonzero(kept) / (N_LEVELS - 1), no, yes)
@@ -117,14 +117,14 @@ class FittedForecasts:
 
     @classmethod
     def fit(cls, counts: np.ndarray) -> FittedForecasts:
-        """Fit the noise rate and the recalibration to counts (r, 1001, 2), by least log loss."""
+        """Fit the noise rate and the recalibration to counts (r, 1001, 2), by minimising the log loss."""
         tables = [forecast_table(one) for one in counts]
         fits = [Recalibration.fit(table) for table in tables]
         best = int(np.argmin([fit.log_loss(table) for fit, table in zip(fits, tables, strict=True)]))
         return cls(NOISE_RATES[best], fits[best])
 
     def log_loss(self, counts: np.ndarray) -> float:
-        """Mean log loss in nats of counts (r, 1001, 2); NaN without questions."""
+        """Mean log loss in nats of the transformed forecasts of counts (r, 1001, 2); NaN without questions."""
         return self.recalibration.log_loss(forecast_table(counts[NOISE_RATES.index(self.rate)]))
 
 

@@ -3,10 +3,10 @@
 >>> row, qualities = pause_metrics(labels, weights, recording.truth(2), object_status(recording, 2))
 >>> row["quality"], row["quality_hidden"], row["split"], row["volume_invented"]
 
-Unless stated otherwise, a metric is the unweighted mean over the hypotheses, measured in volume.
+Unless stated otherwise, a metric is the unweighted mean over the hypotheses, and sizes are volumes.
 
 ``quality``: weighted coverage in the form ``objects``. Missed, invented, split and merged objects reduce the quality.
-``quality_paper``, ``quality_authors``: the other forms (see `mstfilter.scoring`). ``quality_top``,
+``quality_paper``, ``quality_authors``: the other forms (see `scoring.quality`). ``quality_top``,
 ``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean, and maximum.
 Maxima are comparable only for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least
 expected loss (`least_loss`). ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true
@@ -120,7 +120,7 @@ def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
 
 
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
-    """Mean, weighted by size, of the largest intersection over union of some true objects with an object, or NaN."""
+    """Largest IoU of each true object in `labels` with an object, averaged by size; NaN without such objects."""
     _, _, sizes, jaccard = _objects(table)
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():
@@ -135,10 +135,9 @@ def object_metrics(table: Overlap) -> dict[str, float]:
     - *split*: true objects that contain more than half of each of two or more objects of the hypothesis. Only
       hypothesis objects with at least a tenth of the true object's size count.
     - *merged*: objects of the hypothesis that contain more than half of each of two or more true objects.
-    - *missed*: true objects of which no hypothesis object contains more than half, and that contain more than half of
-      no hypothesis object.
-    - *invented*: hypothesis objects of which no true object contains more than half, and that contain more than half
-      of no true object (as in Hoover et al. 1996).
+    - *missed*: true objects without a partner. A true object and a hypothesis object are partners if one of them
+      contains more than half of the other (as in Hoover et al. 1996).
+    - *invented*: hypothesis objects without a partner.
 
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
     (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if neither the truth nor the hypothesis has objects.
@@ -183,8 +182,8 @@ def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
 def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
     """Index of the hypothesis of least expected loss, with the largest weighted mean quality against all hypotheses.
 
-    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. The hypothesis is the best
-    single answer among the hypotheses if the truth has their distribution.
+    ``argmax_i sum_j w_j q(h_i, h_j)``, where q is the quality in the form ``objects``. This hypothesis is
+    the best single answer among the hypotheses if the truth is distributed as the weighted hypotheses.
     """
     return int(np.argmax(pairwise_quality(labels) @ np.asarray(weights, dtype=np.float64)))
 
@@ -196,7 +195,7 @@ def diversity(quality: np.ndarray) -> float:
 
 
 def _patterns(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct columns of (k, m) small integers, and the number of times that each column occurs."""
+    """Distinct columns of an array (k, m) of small integers, and the number of times that each column occurs."""
     code = np.zeros(columns.shape[1], np.int64)
     for row in columns:  # renumbered after each row to keep the code small
         code = code * (int(row.max(initial=0)) + 1) + row

@@ -187,7 +187,7 @@ def object_status(recording: Recording, t: int, min_pixels: float = MIN_PIXELS) 
 
 
 def status_of(labels: np.ndarray, visible: Set[int], earlier: Set[int]) -> dict[int, Status]:
-    """Status of objects of true `labels`, given the objects `visible` in the image, and in `earlier` images."""
+    """Status of the objects of true `labels`, given objects `visible` in the image, and those in `earlier` images."""
     present = np.unique(labels[labels > 0]).tolist()
     return {k: "visible" if k in visible else "hidden" if k in earlier else "unseen" for k in present}
 

@@ -1,7 +1,7 @@
 """Questions about a recording, and the answers of a weighted set of hypotheses.
 
-A question asks whether two voxels belong to one object. The recording alone determines the questions of a pause. The
-questions depend neither on the ground truth nor on a hypothesis. So all methods answer the same questions, and no
+A question asks whether two voxels belong to the same object. The recording alone determines the questions of a pause.
+The questions depend neither on the ground truth nor on a hypothesis. So all methods answer the same questions, and no
 answer has a better expected score than the true probabilities.
 
 >>> questions = ask(recording, t=2)                            # 20,000 pairs of voxels
@@ -9,11 +9,10 @@ answer has a better expected score than the true probabilities.
 >>> y = questions.outcomes(recording.truth(2))                 # bool
 >>> float(np.mean((p - y) ** 2))                               # Brier score
 
-**Questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above
-the table. The depth images of pause t do not observe the voxel as free. The voxel contains a depth reading above the
-table, or up to 10 cm behind a reading along the camera's z axis, at pause t or earlier. The first voxel u of a
-question is uniform among the voxels in question. The second voxel v is uniform among the other voxels within 8 voxels
-of u.
+**Questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above the table. The depth
+images of pause t do not observe the voxel as free. The voxel contains a depth reading above the table at pause t or
+earlier, or is up to 10 cm behind one along the camera's z axis. The first voxel u of a question is uniform among the
+voxels in question. The second voxel v is uniform among the other voxels in question within 8 voxels of u.
 
 **Noise.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns forecasts for labels
 with noise. With probability e, each voxel independently takes the label of one of its six neighbours. Only
@@ -21,11 +20,12 @@ voxels at a border change. The expectation over the noise is computed exactly:
 
     ``p = sum_i w_i E[sum_{k > 0} min(o_i,u'(k), o_i,v'(k))]``
 
-The voxel u' is u with probability 1 - e, and otherwise one of the six neighbours of u (u itself beyond the grid). The
-voxel v' is defined in the same way. The number o_i,v(k) is the probability that object k fills voxel v according to
-hypothesis i. The probability comes from the occupancy, or is 1 for the label of a hypothesis without probabilities.
-The minimum in the formula is the probability of both voxels if the object is a level set {v | o(v) >= U} with one
-uniform U. On six tuning scenes, the log loss with level sets is .004 nats lower than with independent voxels.
+The voxel u' is u with probability 1 - e, and otherwise one of the six neighbours of u (u replaces neighbours beyond
+the grid). The voxel v' is defined in the same way. The number o_i,v(k) is the probability that object k fills voxel v
+according to hypothesis i. The probability comes from the occupancy, or is 1 for the label of a hypothesis without
+probabilities. The minimum in the formula is the probability that the object contains both voxels, if the object is a
+level set {v | o(v) >= U} with one uniform U. On six tuning scenes, the log loss with level sets is .004 nats lower
+than with independent voxels.
 """
 
 from __future__ import annotations
@@ -128,9 +128,9 @@ class Questions:
 
     @cached_property
     def _voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The k distinct voxels (k,) of the m pairs, and their six neighbours (6, k).
+        """The k distinct voxels (k,) of the m pairs, an index (2 m,), and the neighbours (6, k) of the k voxels.
 
-        The second array has the index (2 m,) among them of all first voxels, then of all second voxels.
+        The index has the positions of all first voxels, then of all second voxels, among the k voxels.
         """
         voxels, place = np.unique(np.concatenate([self.first, self.second]), return_inverse=True)
         return voxels, place, _neighbours(voxels, self.shape)

@@ -5,10 +5,10 @@
 >>> seen.border[row, column], seen.foreground[row, column], seen.centre[row, column]
 
 A frame is reduced to 320 pixels per row (`encode_image`), and the output maps are interpolated to the size of the
-frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. At the input and
-the output, 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's border,
-and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre (Neven
-et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. In the input and
+the output, blocks of 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's
+border, and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre
+(Neven et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def encode_image(frame: Frame) -> np.ndarray:
 
 
 def _normals(disparity: np.ndarray, camera: Camera, up: np.ndarray) -> np.ndarray:
-    """Normals (3, H, W) of a smoothed disparity image. The components are along image rows, `up` and a third axis."""
+    """Normals (3, H, W) of a smoothed disparity image, along the image rows, `up` and a third axis."""
     smooth = cv2.GaussianBlur(disparity, (0, 0), 1.5)
     a = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8
     b = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
@@ -144,7 +144,7 @@ class BorderNetwork:
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:
-        """The output maps for a frame of any size. A missing pose is fitted to the plane of the table."""
+        """The output maps for a frame of any size. A missing pose is computed from the support plane."""
         h, w = frame.depth.shape
         small = reduced(frame)
         x = encode_image(small)

@@ -49,7 +49,7 @@ class ClipBoundary(BoundaryModel):
     @returns(lambda self, found, clip: check_type(found, BoundaryModel, "a BoundaryModel"))
     @abstractmethod
     def at(self, clip: Clip) -> BoundaryModel:
-        """The model for the clip's last frame. The `component_key` of the model includes the content of the files."""
+        """The model for the last frame of a clip. Its `component_key` includes the content of its files."""
 
 
 @dataclass(frozen=True)

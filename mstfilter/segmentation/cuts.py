@@ -60,7 +60,7 @@ class SceneCutObjectness(CutValue):
     background_weight : float
         Area of each pixel that is not above the table. With area 1, as in SceneCut, the table contributes most of the
         optimal value v*. The width of the sampled distribution is relative to v*, so a larger table gives more random
-        cuts. With area 0, splits of the table do not change the value, and chains spend steps on splits.
+        cuts. With area 0, splits of the table do not change the value, and Markov chains waste steps on them.
     """
 
     background_weight: float = 0.003
@@ -87,7 +87,7 @@ class MergeLogOdds(CutValue):
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. The probability that exactly the merges above the
     cut join different objects is proportional to exp(v(c)). The values are log probabilities, so the sampler needs a
     `temperature` but no scale `sigma2`. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
-    `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
+    `odds`, the probability of a border is `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:
@@ -147,7 +147,7 @@ def check_values(tree: Tree, w: np.ndarray) -> np.ndarray:
 def optimal_cut(tree: Tree, w: np.ndarray) -> np.ndarray:
     """The cut of largest value, as nodes (n,) in ascending order, for node values `w` (N,).
 
-    If a node has the same value as the best cut below the node, the node is kept.
+    If a node has the same value as the best cut of its subtree, the node is preferred to this cut.
     """
     best = check_values(tree, w).tolist()
     keep = [True] * tree.n_nodes
@@ -177,7 +177,7 @@ class OptimalCut(CutSampler):
 
 @dataclass(frozen=True, eq=False)
 class Gibbs:
-    """A Gibbs distribution over the cuts of a tree and of its subtrees. A list has one entry per node of the tree."""
+    """A Gibbs distribution over the cuts of a tree and of its subtrees. Each list has one entry per node."""
 
     tree: Tree
     b: float  #: inverse temperature, per unit of value

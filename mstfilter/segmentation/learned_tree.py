@@ -2,7 +2,7 @@
 
 Watershed regions of a boundary map are merged in pairs. The pair with the lowest log odds is merged first. The log
 odds are linear in `FEATURES` of the border and of the union of two regions. The features are recomputed when a region
-grows. A model file has the weights of the features, which were fitted on simulated scenes only.
+grows. A model file has the weights of the features. The weights were fitted on simulated scenes only.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
@@ -120,7 +120,7 @@ class _PairMeasures:
         self.centre_gap = np.minimum(self.centre_gap / np.sqrt(small), _MOST_GAP)
 
     def texture(self) -> np.ndarray:
-        """Bhattacharyya distance of normal distributions of Lab colour, summed over the channels, at most 4."""
+        """Bhattacharyya distances between normal distributions of Lab colour: sum over the channels, limited to 4."""
         a, b = self.front, self.back
         total = a.lab_variance + b.lab_variance
         distance = (a.lab - b.lab) ** 2 / (4 * total)
@@ -291,7 +291,7 @@ class MergedTree(TreeBuilder):
 
     @property
     def bound_key(self) -> bytes:
-        """Hash of the model, which is part of the keys of cached values."""
+        """Hash of the model. The hash is part of the keys of cached values."""
         return self.weights_key.encode()
 
     def regions(self, boundary: np.ndarray, frame: Frame, pixels: np.ndarray) -> Regions:
@@ -302,7 +302,7 @@ class MergedTree(TreeBuilder):
     def build(self, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None) -> Tree:
         """Build the tree of merged regions.
 
-        `odds` has the log odds of each merge, and `start` the largest P(boundary) inside a node.
+        The tree's `odds` are the log odds of each merge, and `start` is the largest P(boundary) inside a node.
         """
         if frame is None:
             raise InputError(

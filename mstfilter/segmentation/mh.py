@@ -4,9 +4,9 @@ The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(
 sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The target with a
 `temperature` is for values that are log odds (`MergeLogOdds`), which need no scale.
 
-- ``mst``: ``MetropolisHastingsCuts(temperature=1)``: one chain with MoveNode and subtree redraws.
-- ``paper``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
-- ``authors``: ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", restart=True,
+- ``mst`` uses ``MetropolisHastingsCuts(temperature=1)``, one chain with MoveNode and subtree redraws.
+- ``paper`` uses ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
+- ``authors`` uses ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", restart=True,
   include_optimal=True, redraw_repeated=True)``.
 
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
@@ -16,7 +16,7 @@ A `MoveRule` proposes the next cut. MoveNode (`NodeMoves`) draws one of the n no
 *down* with equal probability. A move up replaces the node and all its siblings, which must be in the cut, by their
 parent. A move down replaces the node by its children. Each of the m siblings proposes the same move up, so the
 probability of this move is ``g(up) = m / (2 n)``. The reverse move has probability ``1 / (2 n')``, where n' is the
-number of nodes after the move up. A rule draws a choice, which determines the move:
+number of nodes after the move up. A rule first draws a choice at random, which determines the move:
 
 >>> state = CutState(tree, cut)
 >>> rule = NodeMoves()
@@ -49,7 +49,7 @@ class Move(NamedTuple):
 
 
 class CutState:
-    """A mutable cut with insertion, removal and uniform draws in constant time."""
+    """A mutable cut. Nodes are inserted, removed or drawn uniformly in constant time."""
 
     def __init__(self, tree: Tree, cut: list[int]) -> None:
         self.children = tree.children
@@ -205,7 +205,7 @@ class AuthorsMoves(MoveRule):
 
 @dataclass(frozen=True, eq=False)
 class SubtreeRedraw(MoveRule):
-    """Redraw the cut inside a random subtree from the Gibbs distribution `law`, the target of the chain.
+    """Redraws the cut of a random subtree from the Gibbs distribution `law`, which is the target of the chain.
 
     The root of the subtree is uniform over the inner nodes. If an ancestor of this root is in the cut, the cut does
     not change. A choice is (inner node, new nodes).
@@ -254,7 +254,7 @@ class CutChain:
         self.value = sum(self.w[x] for x in self.state.nodes)
 
     def judge(self, rule: MoveRule, choice: Any) -> tuple[Move | None, float, float]:
-        """Move of a choice (None: no change), value of the cut after the move, and log of the acceptance ratio."""
+        """The move of a choice (None: no change), the value of the cut after it, and the log acceptance ratio."""
         move = rule.outcome(self.state, choice)
         if move is None or move.log_ratio == -inf:
             return None, self.value, -inf

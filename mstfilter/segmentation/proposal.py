@@ -72,7 +72,7 @@ class ObjectRule:
     Parameters
     ----------
     min_points : int
-        Number of depth readings of the smallest object.
+        Smallest number of depth readings of an object.
     mend : bool
         Whether noise is removed and missing readings of objects are estimated (`mstfilter.scene.foreground`). If
         False, every reading above the table can belong to an object, as published.
@@ -82,7 +82,7 @@ class ObjectRule:
     mend: bool = True
 
     def foreground(self, frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
-        """The pixels that can belong to an object, and the frame with known or estimated depth."""
+        """The pixels that can belong to an object, and the frame with measured or estimated depth."""
         return foreground(frame, grid) if self.mend else Foreground(readings_above_table(frame, grid), frame)
 
     def segments(self, tree: Tree, frame: Frame, grid: VoxelGrid | None = None) -> Segments:
@@ -141,7 +141,7 @@ class TreeCutProposal(Proposal):
         With "equal", all weights are equal, which is correct for cuts drawn from p. With "p", the log weight is ``log
         p(c) - log p(c*)`` as in the paper and the authors' program. With "p", the probability of a cut counts twice.
     threshold : float
-        Smallest probability of an occupied voxel.
+        Voxels with at least this probability are occupied.
     """
 
     boundary: BoundaryModel = field(default_factory=ColourDepthBoundary)
@@ -214,9 +214,9 @@ def complete_segments(
     """Hypotheses from sampled segmentations of the last frame of a clip, and counts of objects and segments.
 
     Each sample is an int64 array of segments. ``mask_of(segment)`` returns the mask (H, W) bool. Each distinct
-    segment is completed once, with the random stream ``"completion", segment``. The result for a segment does not
-    depend on the other segments. A stochastic completer completes a segment again for its k-th further sample, with
-    the random stream ``"completion", segment, k``.
+    segment is completed to a 3-D shape once, with the random stream ``"completion", segment``. The shape does not
+    depend on the other segments. If the completer is stochastic, each further sample k of a segment gets a new shape,
+    with the random stream ``"completion", segment, k``.
     """
     completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     times: Counter[int] = Counter()
@@ -245,11 +245,11 @@ def complete_segments(
 def hypothesis_of(
     completions: Sequence[Completion], grid: VoxelGrid, birth: int = 0, threshold: float = 0.5
 ) -> Hypothesis:
-    """One hypothesis from completed segments of a frame, at the pause `birth`.
+    """One hypothesis from the 3-D shapes of the segments of a frame, at the pause `birth`.
 
-    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. `threshold` is the
-    smallest probability of an occupied voxel. `mstfilter.completion.arbitrate` assigns voxels that several segments
-    contain.
+    Segments get the labels 1, 2, ... in order. A segment without voxels gets no `ObjectRecord`. Voxels with
+    probability `threshold` or more are occupied. `mstfilter.completion.arbitrate` assigns voxels that several
+    shapes contain.
     """
     labels = arbitrate(completions, grid, threshold)
     present = np.bincount(labels.ravel(), minlength=len(completions) + 1)

@@ -87,7 +87,7 @@ class Regions:
 
 
 def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Split leaves (H, W) int at the outline of the object `pixels` (H, W) bool. Pixels outside objects become 0.
+    """Split leaves (H, W) int at the outline of `pixels` (H, W) bool. Other pixels become 0.
 
     Each connected part of a leaf becomes a leaf. Parts of a few pixels join the nearest larger part.
     """
@@ -108,7 +108,7 @@ def object_leaves(leaves: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 def connected_pixels(right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Index (H, W) of the connected component of each pixel of an image.
 
-    `right` and `down` are the parameters of `pixel_graph`.
+    `right` (H, W - 1) and `down` (H - 1, W) bool say whether a pixel is joined to its right or its lower neighbour.
     """
     parts = connected_components(pixel_graph(right, down), directed=False)[1]
     return np.asarray(parts.reshape(len(right), down.shape[1]))

@@ -14,7 +14,7 @@ array([[1, 1],
        [1, 0]])
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
-in order of the mean strength of their common border, which is the height of a merge. A logistic curve maps the height
+in order of the mean strength of their common border, the *height* of the merge. A logistic curve maps the height
 to P(boundary), the probability that the merge joins different objects. The field `start` of a node is P(boundary) of
 the merge that makes the node. `start` is near 0 for a node inside one object, and near 1 for a node with several
 objects.
@@ -292,10 +292,10 @@ def linkage_tree(
 def prune(
     parent: np.ndarray, altitude: np.ndarray, leaves: np.ndarray, max_leaves: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Keep the `max_leaves - 1` highest merges of a binary tree. Subtrees without a kept merge become leaves.
+    """Keep the `max_leaves - 1` inner nodes of largest altitude in a binary tree. Other subtrees become leaves.
 
-    Heights do not decrease towards the root, and parents come after children, so the kept merges contain the root and
-    are connected.
+    A parent has at least the altitude of its children and comes after its children. So the root is kept, and the
+    parent of each kept node is kept.
     """
     n = len(parent)
     n_leaves = (n + 1) // 2

@@ -13,7 +13,7 @@ A scene can also be simulated step by step:
 >>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
 >>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
 
-With a `PushLoop`, a program chooses each push by the belief of a filter.
+With a `PushLoop`, a program chooses each push from the belief of a filter.
 
 The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
 (MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),

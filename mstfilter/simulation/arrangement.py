@@ -38,7 +38,7 @@ class SceneObjects:
 
 
 def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
-    """Draw shapes and textures of a scene from shuffled lists of all families, with cartons and cans repeated."""
+    """Draw the shapes and textures of a scene, from all families of objects. Most frequent are cartons and cans."""
     count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
     names = list(family.shape_families())
     shapes: list[Shape] = []
@@ -172,7 +172,7 @@ def _visible_pixels(world: PhysicsWorld, camera: Camera) -> np.ndarray:
 
 
 def _put_behind(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int], camera: Camera) -> bool:
-    """Put object k behind one of the tallest objects. Of the tried positions, the least visible position is used."""
+    """Put object k behind one of the tallest objects, at the tried position with the fewest visible pixels."""
     start, best = world.positions()[k], None
     tallest = sorted(placed, key=lambda j: -_top(world, j))[:5]
     for _ in range(_HIDING_PLACES):

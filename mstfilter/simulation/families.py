@@ -96,7 +96,7 @@ class SceneFamily(Bounded):
         return 1 + self.n_actions * (self.frames_per_clip - 1)
 
     def pool(self, seed: int) -> Pool:
-        """The set of sizes and textures from which the scenes of a seed are drawn."""
+        """The set of sizes and textures from which the scene of a seed is drawn."""
         if self.catalogue == "by seed":
             return TUNING if seed < FIRST_REPORTED_SEED else REPORTED
         return _POOLS[self.catalogue]

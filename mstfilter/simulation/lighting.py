@@ -84,9 +84,9 @@ def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal
 
 
 class LightMap:
-    """Raster of the light on the table. A value is the mean of cosine times visibility over light sources (k, 3).
+    """Raster of the light on the table, with points `spacing` metres apart.
 
-    The raster has a `spacing` in metres.
+    A value is the mean, over the sources `lights` (k, 3), of the cosine of the angle of incidence (0 in shadow).
     """
 
     def __init__(self, spacing: float, lights: np.ndarray) -> None:
@@ -193,7 +193,7 @@ def _rotate(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Smooth normals of a solid of revolution made of flat facets. A point gives the azimuth of its normal."""
+    """Smooth normals of a solid of revolution made of flat facets. Each normal gets the azimuth of its point."""
     if shape.print_as != "lathe" or len(shape.pieces) == 1:
         return normal
     radius = np.hypot(points[:, 0], points[:, 1])

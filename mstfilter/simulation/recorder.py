@@ -109,7 +109,7 @@ class SimulatedScene:
         return push_effect(world, before, finish_push(world), family)
 
     def frame_images(self, frame: int) -> dict[str, np.ndarray]:
-        """Images of the current state as frame number `frame`: rgb, depth, instance, robot_mask."""
+        """Images rgb, depth, instance and robot_mask of the current state. `frame` seeds the sensor noise."""
         view = self._renderer.render()
         return {
             "rgb": colour_reading(stream(self.seed, "colour", frame), view.colour * self.room.exposure),
@@ -235,7 +235,7 @@ def cached_path(family: SceneFamily, seed: int, folder: Path) -> Path:
 def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None = None, **overrides: Any) -> Path:
     """The folder of a simulated recording. The recording is simulated if it does not exist or has changed on disk.
 
-    `overrides` are changed fields of the family. Recordings are stored in `folder`, by default `recordings` in
+    `overrides` replace fields of the family. Recordings are stored in `folder`, by default `recordings` in
     `cache_folder()`. Raises InputError if the family, a field or the seed is invalid, or the folder cannot be
     written.
     """

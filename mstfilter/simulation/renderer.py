@@ -1,7 +1,7 @@
 """Colour, depth and instance images by ray casting. The renderer needs no display, GPU or OpenGL.
 
-One ray per pixel gives depth and instance. Colours are computed from textures and from shadow rays to a lamp and the
-ceiling.
+One ray per pixel gives the depth and the instance label. Colours are computed from textures and from shadow rays to a
+lamp and the ceiling.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Renderer:
         return colour
 
     def _unshadowed_light(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Light (n, 3) on floor, wall and rim of the table, without shadows. The light decreases with distance."""
+        """Light (n, 3) on floor, wall and table rim, without shadows. Light from the lamp decreases with distance."""
         lamp = self.room.lamp.mean(axis=0)
         reach = np.linalg.norm(points - lamp, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -89,8 +89,8 @@ class DepthSensor(Bounded):
     def _unlit(self, depth: np.ndarray) -> np.ndarray:
         """Pixels (H, W) bool that the projector does not illuminate. The projector is to the right of the camera.
 
-        A pixel in column u with depth z is in column u - f b / z of the projector's image. A surface is in shadow if
-        a surface farther right in the camera's image is farther left in the projector's image.
+        A pixel in column u with depth z is in column u - f b / z of the projector's image. A pixel is in shadow if
+        a pixel to its right in the camera's image is to its left in the projector's image.
         """
         w = depth.shape[1]
         disparity = _FOCAL * w / 640.0 * _BASELINE / np.where(np.isfinite(depth), depth, np.inf)

@@ -117,7 +117,7 @@ def capsule(start: ArrayLike, end: ArrayLike, radius: float, plain: bool = False
 
 
 def hull(vertices: ArrayLike) -> Piece:
-    """The convex hull of points (n, 3) of the body's frame."""
+    """The convex hull of points (n, 3) in the body's frame."""
     vertices = np.asarray(vertices, dtype=np.float64)
     # A frame near the centre keeps MuJoCo's re-centring of meshes well conditioned.
     centre = vertices.mean(axis=0)

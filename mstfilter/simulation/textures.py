@@ -1,8 +1,8 @@
 """Textures of objects, and the room around the objects.
 
-The texture (`Skin`) of an object consists of a few flat images, called charts. The coordinates and the normal of a
-surface point determine a chart, and coordinates in the chart (`texture_coordinates`). An `Atlas` holds the texture
-images of all objects in one array. A chart shows the surface from outside with the upper edge up.
+The texture (`Skin`) of an object consists of a few flat images, called charts. From the position and the normal
+of a surface point, `texture_coordinates` computes a chart and the coordinates in the chart. An `Atlas` holds the
+texture images of all objects in one array. A chart shows the surface from outside with the upper edge up.
 
 >>> import numpy as np
 >>> from mstfilter.simulation.shapes import draw_shape

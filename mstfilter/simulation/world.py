@@ -245,10 +245,10 @@ class PhysicsWorld:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Cast rays from one point (3,), in metres, along directions (n, 3) of any length.
 
-        `groups` are the geoms that rays can hit: 0 for the room, 1 for objects, 2 for finger and arm. `data` is
-        another state of the same model. The default is the state of the world after `forward`. Returns the first geom
-        (n,) int32 that each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the surface. The
-        distance is in units of the length of the direction.
+        `groups` has the numbers of the geom groups that rays can hit: 0 for the room, 1 for objects, 2 for finger and
+        arm. `data` is another state of the same model. The default is the state of the world after `forward`. Returns
+        the first geom (n,) int32 that each ray hits (-1 for none), the distance (n,), and the normal (n, 3) of the
+        surface. The distance is in units of the length of the direction.
         """
         n = len(directions)
         geom, distance = np.full(n, -1, np.int32), np.full(n, -1.0)
@@ -336,7 +336,7 @@ def play_push(world: PhysicsWorld, push: FingerPush, family: SceneFamily) -> Pus
 
 
 def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: SceneFamily) -> PushEffect:
-    """The effect of a push, computed from the poses `before` (n, 4, 4)."""
+    """The effect of a push, computed from the present poses and the poses `before` the push (n, 4, 4)."""
     after = world.positions()
     trace = np.einsum("nij,nij->n", before[:, :3, :3], world.rotations())
     kept = bool(family.contains_points(after).all())
@@ -346,7 +346,7 @@ def push_effect(world: PhysicsWorld, before: np.ndarray, settled: bool, family: 
 
 
 def is_clear(world: PhysicsWorld, at: tuple[float, float]) -> bool:
-    """Whether the finger can come down at a place without touching an object."""
+    """Whether the finger can come down at the position `at` without touching an object."""
     saved = world.save()
     for height in np.linspace(_HIGH, _LOW, 5):
         world.move_finger((*at, height))
@@ -380,7 +380,7 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. If every candidate fails, the
+    The first candidate that moves `family.min_moved` objects and topples none is taken. If no candidate does so, the
     candidate with the best balance of moved and toppled objects is taken. Candidates that drop an object or leave an
     object in motion are discarded. Raises InputError if no candidate moves any object.
     """

@@ -12,11 +12,11 @@
 `interfaces`            base classes of components (`Transition`, `Proposal`, `Update`, `Resampler`, ...),
                         `State` and `Info`
 `inputs`                time and inputs of models: `WithInput`, an observation with an input
-`population`            `Population`: particles, log weights, parents; `Candidates`, built when accessed
+`population`            `Population`: particles, log weights, parents; `Candidates`, particles built on access
 `resampling`            schemes that need only weights, with equal output weights
-`diverse_resampling`    schemes that keep different particles, with unequal weights
+`diverse_resampling`    schemes that keep more distinct particles, with unequal weights
 `wrapped_resampling`    wrappers of schemes: sorted, shuffled, merged, tempered
-`components`            updates by a likelihood or a projection, branching, triggers, sizes, equality
+`components`            update by a likelihood, branching, triggers, sizes, equality of particles
 `streams`               random streams named by seed, step, slot and index; generators of many runs
 `history`               collectors: quantities of a run, recorded at every step
 `running`               `run_many`: several filters, seeds and data sets

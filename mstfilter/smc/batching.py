@@ -1,10 +1,10 @@
-"""Many runs of one filter together, as arrays (run, particle, ...).
+"""Processes many runs of one filter together, as arrays (run, particle, ...).
 
 `mstfilter.smc.run_many` uses this module if all components can process the particles of several runs in one call.
 
-Each component is called once per step with the particles of all runs, as one population of R n particles. Runs are
-batched if the attribute `batched` of each component is True or None. Programs and models of `StateSpaceModel.of` have
-``batched=None``: batching is tried. The arrays of a call have no axis of runs. A component must treat each row
+Each component is called once per step with the n particles of all R runs, as one population of R n particles. Runs
+are batched if the attribute `batched` of each component is True or None. Programs and models of `StateSpaceModel.of`
+have ``batched=None``: batching is tried. The arrays of a call have no axis of runs. A component must treat each row
 independently, and draw arrays in the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``.
 `RunGenerators` draws the rows of a run from the random stream of the run.
 
@@ -51,15 +51,15 @@ class RunFilters:
     """The filters of some runs. The components of two runs may have different parameters."""
 
     one: Callable[[int], ParticleFilter]  #: the filter of a run
-    rows: Callable[[np.ndarray], ParticleFilter]  #: one filter of the rows of some runs, in their order
+    rows: Callable[[np.ndarray], ParticleFilter]  #: one filter for the particles of the given runs, in this order
 
 
 @dataclass(frozen=True)
 class Collected:
     """The collected values of one run."""
 
-    rows: dict[str, np.ndarray]  #: name -> (t, ...), up to the last step, or to the one at which the run is lost
-    lost: str = ""  #: why the run is lost, "" if it is not
+    rows: dict[str, np.ndarray]  #: name -> (t, ...), up to the last step or the step at which the run is lost
+    lost: str = ""  #: why the run is lost (all weights are zero); "" if it is not
 
 
 def check_together(filter: ParticleFilter) -> None:
@@ -85,10 +85,10 @@ def run_together(
 ) -> list[Collected]:
     """Results of the runs with the given seeds and the observations `ys`.
 
-    If `check` is True, some runs are compared with single runs. With `rounding`, results may differ by rounding.
+    If `check` is True, some runs are compared with single runs. With `rounding`, they may differ by rounding.
 
-    Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component states ``batched=True``
-    but mixes runs.
+    Raises `NotTogether` if the runs must be made one by one. Raises InputError if a component that states
+    ``batched=True`` lets runs affect each other.
     """
     keep_freed_memory()
     check_together(filters.one(0))
@@ -105,7 +105,7 @@ class _RunInfo(Info):
 
 
 class _Sweep:
-    """The steps of R runs. Particles are (R, n, ...) and log weights (R, n); row r is a run of positive weight."""
+    """The steps of R runs, with particles (R, n, ...) and log weights (R, n). Runs of zero weight are removed."""
 
     def __init__(
         self,
@@ -230,7 +230,7 @@ class _Sweep:
             raise NotTogether(slot, f"step {t}: a run raises {type(error).__name__}") from error
 
     def lose(self, t: int, slot: str, rows: np.ndarray) -> None:
-        """Record the reason why all weights of the given runs are zero after a component."""
+        """Record the reason why all weights of the given runs are zero after the call of a component."""
         for row in rows.tolist():
             try:
                 self.alone(t, slot, row)
@@ -394,7 +394,7 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 
 def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
-    """Whether the first difference of two arrays (or mappings) is rounding, and both values; None if identical."""
+    """Whether the first difference of two arrays (or mappings) is rounding, and the two values; None if identical."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

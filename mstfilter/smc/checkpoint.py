@@ -6,7 +6,7 @@
 >>> state, infos = filter.run(observations[state.t:], state)
 
 The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
-then renamed. If the process is killed, the file holds the state of a complete step. All draws depend on the seed and
+then renamed, so it holds the state of a complete step even if the process is killed. All draws depend on the seed and
 the step only, so a continued run has the results of an uninterrupted run. The file stores no filter and no
 observations: pass both to the continued run.
 
@@ -36,7 +36,7 @@ _FORMAT = 1
 
 
 def save_state(path: Path, state: State, codec: Codec | None = None, *, compress: bool = False) -> None:
-    """Write a state after at least one step to an .npz file, atomically. The folder must exist.
+    """Write a state to an .npz file, atomically. The run must have made a step, and the folder must exist.
 
     `codec` encodes particles that `ArrayCodec` cannot store. `compress` makes the file smaller and writing slower.
     Raises InputError if the particles cannot be stored or the file cannot be written.
@@ -64,7 +64,7 @@ def save_state(path: Path, state: State, codec: Codec | None = None, *, compress
 def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) -> State:
     """The state stored in a file.
 
-    Raises InputError if the file is missing, damaged or no checkpoint, or if arrays need more than `limit` bytes.
+    Raises InputError if the file is missing, damaged or no checkpoint, or if its arrays need more than `limit` bytes.
     """
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")

@@ -1,4 +1,4 @@
-"""Components that need no model: updates, branching, triggers, sizes, and equality of particles.
+"""Components that need no model: an update, branching, triggers, a size, and equality of particles.
 
 >>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
 >>> transition = Branching(Dynamics(model), branches=4)
@@ -186,10 +186,10 @@ class Bins(Equivalence):
 class Kld(Size):
     """KLD-sampling: the least n that bounds the error of the distribution over bins by `epsilon`.
 
-    With k occupied bins, the bound is n = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
+    k occupied bins require n >= bound(k) = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
     size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` uses the weight
     W_b of each bin. It chooses the least n with n >= bound(k), where k = sum_b (1 - (1 - W_b)^n) is the expected
-    number of bins that n draws occupy. The bound applies to any resampling scheme, and slightly exceeds Fox's n.
+    number of bins that n draws occupy. This n applies to any resampling scheme, and slightly exceeds Fox's n.
 
     Parameters
     ----------

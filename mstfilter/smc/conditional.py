@@ -37,8 +37,8 @@ def conditional_path(
 
     One particle follows `path`, and the filter draws the other particles. The result is the path of one final
     particle, drawn by weight. Ancestors are drawn multinomially at every step; `resampler` and `trigger` of the
-    filter are not used. If the density of the transition is known, the particle that follows the path also draws its
-    ancestors (ancestor sampling). A program that returns values is used without ancestor sampling.
+    filter are not used. If the density of the transition is known, the ancestors of the particle that follows the
+    path are also drawn (ancestor sampling). A program that returns values is used without ancestor sampling.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _with_first(particles: Particles, first: Particles) -> Particles:
 
 
 def _joined(rows: list[Particles]) -> Particles:
-    """Join one particle of each time to a path. Variables that do not exist at a time are NaN, or 0 for integers."""
+    """Join one particle per time to a path. Variables that do not exist at a time are NaN, or 0 for integers."""
     if isinstance(rows[0], np.ndarray):
         return np.concatenate(rows)
     if not isinstance(rows[0], Mapping):

@@ -93,13 +93,13 @@ def run_variance(
 
     The variance of a weighted mean is estimated by ``f sum_e B_e^2``, where B_e is the sum of w (x - mean) over the
     particles with ancestor e (Lee and Whiteley 2018). For independent selections (`Multinomial`), f_s = N / (N - 1)
-    makes V unbiased. For other schemes, which make fewer duplicates, f_s is computed from the weights:
+    makes V unbiased. Other schemes make fewer duplicates, so f_s is computed from the weights for all schemes:
 
         f_s = (1 - sum_e W_e^2) / (1 - sum_e V_e^2)
 
     W_e and V_e are the total weights of the descendants of e before and after the selection. The numerator and the
-    denominator are the probabilities that two draws have different ancestors. For independent selections, the mean of
-    1 / f_s is (N - 1) / N. For schemes other than `Multinomial`, f_s is an approximation. The approximation assumes
+    denominator are the probabilities that two draws by weight have different ancestors. For independent selections,
+    the mean of 1 / f_s is (N - 1) / N. For schemes other than `Multinomial`, f_s is an approximation, which assumes
     that pairs of particles with different ancestors are selected in proportion to their weights.
 
     With a lag L (Olsson and Douc 2019), the estimate for the mean uses ancestors L steps earlier instead of ancestors
@@ -107,10 +107,10 @@ def run_variance(
     parts are added. The lag reduces the noise of the estimates. With a lag, the variances can be estimated even if
     all particles share one ancestor at time 0. The bias from the lag is small if x_t hardly depends on x_{t-L}.
 
-    The estimated variances are of first order in 1 / n, and too low for small n. With 300 particles the estimates are
-    within 15 % of the variance over seeds. If 30 particles give the log evidence a variance of 2, the estimated
-    variances of means are 90 % too low (`experiments/run_variance/sizes.csv`). Use more particles if the log evidence
-    has a variance above 0.3.
+    The estimated variances are of first order in 1 / n, and too low for small n. In `experiments/run_variance`, 300
+    particles give estimates within 15 % of the variance over seeds. With 30 particles, the log evidence of AR(1) has
+    a variance of 2, and the variances of means are estimated 90 % too low (`sizes.csv`). Use more particles if the
+    log evidence has a variance above 0.3.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ def run_variance(
     lag : int, optional
         Number of steps L, at least 1. By default, L covers all steps. Time and memory grow with n times the lag.
     function : callable, optional
-        ``(particles) -> (n, ...)``: the values that are averaged. By default, array particles are averaged. For
-        particles of another type, means then have the shape (T, 0).
+        ``(particles) -> (n, ...)``: the values that are averaged. By default, array particles are averaged, and
+        particles of another type give means of shape (T, 0).
 
     Returns
     -------
@@ -197,7 +197,7 @@ class _Watched(ResamplerWrapper):
 
 
 class _Ancestry:
-    """Ancestors of the particles at the times t - lag .. t, and the factor f of the selections after each time."""
+    """For each of the times t - lag .. t: the ancestors of the present particles, and f of the selections since."""
 
     def __init__(self, lag: int | None) -> None:
         self.lag = lag
@@ -207,7 +207,7 @@ class _Ancestry:
         self.weights = np.zeros(0)
 
     def begin(self, n: int) -> None:
-        """Start with the n present particles as ancestors. The particles must be independent draws."""
+        """Add the present time, with the n particles as ancestors. The particles must be independent draws."""
         self.window.append((np.arange(n), n / (n - 1) if n > 1 else 1.0))
 
     def descend(self, selections: list[_Selection], parents: np.ndarray, weights: np.ndarray) -> None:

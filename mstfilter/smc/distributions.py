@@ -16,8 +16,8 @@ distribution of another library, write a `Distribution` whose `sample` draws fro
 
 A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
 and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
-range is NaN. MCMC moves may propose values that the model excludes. Inside `hypothetical`, rows with excluded values
-have the log density NaN and are rejected.
+range is NaN. MCMC moves may propose values that make a parameter invalid. Inside `hypothetical`, such rows do not
+raise InputError, but have the log density NaN, so that the moves are rejected.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Range(NamedTuple):
         return (value > self.low) & (value < self.high) if self.open else (value >= self.low) & (value <= self.high)
 
     def surely_contains(self, value: Any) -> bool:
-        """Whether the sum and the minimum of a float or a float64 array show that all entries are in the range."""
+        """Whether a fast test (sum, minimum) shows that all entries of a float or float64 array are in the range."""
         if type(value) is float:
             return self.low < value < self.high
         if self.high < math.inf or not _is_finite(value):
@@ -99,7 +99,7 @@ class _Checked(Distribution):
             self._check(name, parameters)
 
     def _check(self, name: str, allowed: Range) -> None:
-        """Raise InputError at the first entry of a parameter out of range. In `hypothetical`, rows become NaN."""
+        """Raise InputError if an entry of a parameter is out of range. In `hypothetical`, such rows become NaN."""
         value = getattr(self, name)
         if allowed.surely_contains(value):  # a third of the time of the rest
             return
@@ -140,7 +140,7 @@ class _Independent(_Checked):
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether all entries of a float or a float64 array, and the sum of the entries, are finite."""
+    """Whether the sum of a float or a float64 array is finite, which implies that all entries are finite."""
     if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
         return math.isfinite(np.add.reduce(value, axis=None))
     return type(value) is float and math.isfinite(value)
@@ -285,7 +285,7 @@ class Uniform(_Independent):
 
 
 def _cholesky(cov: np.ndarray) -> np.ndarray:
-    """Lower triangular root of each covariance; in `hypothetical`, NaN for a row that is not positive definite."""
+    """Lower triangular root of each covariance; in `hypothetical`, NaN for one that is not positive definite."""
     if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
         raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
     size = abs(cov).max(axis=(-1, -2), initial=0.0)

@@ -1,4 +1,4 @@
-"""Resampling schemes that keep different particles. The output weights are unequal.
+"""Resampling schemes that keep more distinct particles. The output weights are unequal.
 
 `FearnheadClifford` and `Chopthin` need only the weights. `ClusterStratified` compares particles by a `Similarity`.
 `FearnheadClifford` needs more candidates than particles to select.
@@ -8,9 +8,9 @@
 >>> rng = np.random.default_rng(0)
 >>> population = Population(np.array([0.0, 0.1, 0.2, 9.0]), np.log([3.0, 3.0, 3.0, 1.0]))
 
-`ClusterStratified` divides the n particles among groups of similar particles by weight, and gives each group at least
-one particle if possible. `ClusterStratified` then selects inside each group. A group of small weight keeps a
-particle; schemes that use only weights usually drop light groups. The schemes of this module are unbiased.
+`ClusterStratified` forms groups of similar particles, and divides the n particles to select among the groups by
+weight: at least one per group if possible. It then selects inside each group. A light group thus keeps a particle,
+while schemes that use only weights usually drop it. The schemes of this module are unbiased.
 
 >>> chosen = ClusterStratified(Gaussian(1.0)).resample(rng, population, 2)
 >>> float(chosen.particles[1]), chosen.weights
@@ -105,8 +105,8 @@ class Chopthin(WeightResampler):
     Parameters
     ----------
     ratio : float
-        Upper bound of the ratio of the largest to the smallest output weight, at least 4. The effective sample size
-        is then at least 4 ratio / (1 + ratio)^2 times n: n / 2 for the default ratio, 3 + sqrt(8).
+        Largest allowed ratio of two output weights. It must be at least 4. The effective sample size is then at
+        least 4 ratio / (1 + ratio)^2 times n, which is n / 2 for the default ratio of 3 + sqrt(8).
 
     Reference: Gandy and Lau (2016), "The chopthin algorithm for resampling", IEEE Transactions on Signal Processing
     64.
@@ -131,7 +131,7 @@ class Chopthin(WeightResampler):
 
 
 def chopthin_threshold(weights: np.ndarray, n: int, ratio: float) -> float:
-    """The threshold a with sum h(w_i) = n (see `Chopthin`) for positive weights (m,), or one of several solutions."""
+    """A threshold a with sum h(w_i) = n for positive weights (m,) (see `Chopthin`). There may be several."""
     w = np.sort(weights)
     # For a between neighbours among all w and 2 w / ratio, sum h = share / a + middle: particles below the index
     # `thinned` have w < a, those from `unchopped` on have w > ratio a / 2.
@@ -186,9 +186,9 @@ class ClusterStratified(Resampler):
 
     If n is below the number of clusters, Fearnhead-Clifford selects clusters and their weights. Otherwise cluster g
     of weight W_g gets max(1, W_g / c) particles on average, and c is the solution of sum max(1, W_g / c) = n. The
-    numbers are rounded by systematic resampling. The particles of a cluster share the weight of the cluster, so any
-    numbers are unbiased. A cluster below `least_mass` gets W_g / c particles on average and may lose all particles.
-    If W_g / c < 1, a particle kept from the cluster has weight c. ``notes["clusters"]`` is the number of clusters.
+    numbers are rounded by systematic resampling. The particles of a cluster share its weight, so the scheme is
+    unbiased for any numbers. A cluster below `least_mass` gets W_g / c particles on average and may lose all of them.
+    If W_g / c < 1, its kept particle has weight c. ``notes["clusters"]`` is the number of clusters.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def leader_clusters(weights: np.ndarray, similarity: np.ndarray, at_least: float
 
 
 def _shares(mass: np.ndarray, sure: np.ndarray, n: int) -> np.ndarray:
-    """Mean number of particles of each cluster, sum n: mass / c, but at least 1 if `sure` (at most n clusters)."""
+    """Mean numbers of particles of clusters, with sum n: mass / c, but at least 1 if `sure` (at most n are sure)."""
     ordered = np.sort(mass[sure])[::-1]
     heavy = np.append(0.0, np.cumsum(ordered)) + mass[~sure].sum()
     # If the A heaviest of S sure clusters exceed 1, they and the unsure ones share n - (S - A) particles by mass.

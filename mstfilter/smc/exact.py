@@ -69,7 +69,7 @@ def _matrices(
 
 
 def _varies(array: np.ndarray) -> dict[str, bool]:
-    """The parameters that `step_parameters` returns: the time ``t`` if the matrix changes with time, else none."""
+    """Step parameters of a function that uses a matrix: ``t`` if the matrix changes with time, else none."""
     return {"t": True} if array.ndim == 3 else {}
 
 
@@ -147,7 +147,7 @@ def _observed(t: int, y: Any, k: int) -> np.ndarray:
 
 
 def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
-    """(T, d) sum of the effects of all inputs so far on the state."""
+    """(T, d) effect of all inputs up to each step on the state."""
     found = np.zeros(F.shape[:2])
     for t in range(1, len(F)):
         if inputs[t] is None:

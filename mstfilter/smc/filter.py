@@ -12,12 +12,12 @@ A step for an observation y makes these calls::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-With ``resample="before"``, a step that ends with more than n particles also resamples after the update.
+With ``resample="before"``, a step also resamples after the update if there are more than n particles.
 
 `ParticleFilter.step` has one line for each stage, and `_Step` has one method for each stage. Textbook filters have no
 `proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided filters have a transition
-that weights its moves, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step` is a
-pure function of a `State`, so a run can be stopped, stored and resumed at any step.
+that also weights particles, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step`
+is a pure function of a `State`, so a run can be stopped, stored and resumed at any step.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class ParticleFilter(AtStep):
         Number of particles that `proposal` draws at each step. If 0, `proposal` draws `n` particles.
     resample : {"after", "before"}
         With "after", particles are resampled after the update, as in MST. With "before", particles are resampled
-        before the next prediction, as in textbooks, and a step returns the weights of its update.
+        before the next prediction, as in textbooks, and the result of a step has the weights of its update.
     """
 
     initial: Proposal | None = None
@@ -179,7 +179,7 @@ class ParticleFilter(AtStep):
         *,
         progress: bool | Callable[[int, int | None], None] = False,
     ) -> tuple[State, Infos]:
-        """Run all steps, and return the last `State` and the `Infos`. Takes the parameters of `iterate`.
+        """Run all steps, and return the last `State` and the `Infos`. `seed` may be a state to continue from.
 
         ``progress=True`` shows a progress bar. A function `progress` is called as ``progress(done, total)``.
 
@@ -373,7 +373,7 @@ class _Step:
 
 
 class _Slot:
-    """Wraps the calls of components, measures wall time, and adds step and slot (component) to error messages.
+    """Wraps a call of a component: measures wall time, and adds the step and the component to error messages.
 
     >>> with slot("transition"):
     ...     moved = transition.predict(rng, population, observation)
@@ -432,10 +432,10 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Free one large block of memory, once per process.
+    """Make glibc keep freed memory, by freeing one large block once per process.
 
     After the call, glibc keeps freed arrays of up to 32 MB and does not return them to the system after every step.
-    Returning the memory takes a fifth of the time of a filter of 10,000 particles, and a third of the time of
+    Returning the memory would take a fifth of the time of a filter of 10,000 particles, and a third of the time of
     resampling a million weights. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

@@ -169,7 +169,7 @@ class ConditionallyLinear(AtStep):
 
     ``sample_initial(rng, n)`` draws u_0 (n, ...), ``sample_transition(rng, u)`` draws u_t given u_{t-1}, and
     ``linear(u)`` returns the matrices. `mean` (d,) and `cov` (d, d) are the mean and covariance of z_0 for any u_0.
-    The functions may also have a parameter ``t``, the index of the step. A further parameter ``u`` gets the input.
+    The functions may also have a parameter ``t``, the index of the step. A further parameter ``u`` gets its input.
     """
 
     sample_initial: Callable[[np.random.Generator, int], np.ndarray]
@@ -251,9 +251,9 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> 
 def ukf_proposal(
     f: _Map, Q: Any, h: _Map, R: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
 ) -> Callable[[np.ndarray, Any], MultivariateNormal]:
-    """A proposal for `guided`: draws from the update of an unscented Kalman filter for each particle.
+    """A proposal for `guided`: for each particle, the posterior of x_t by an unscented Kalman filter.
 
-    Given x_{t-1}, the predicted state is N(f(x_{t-1}), Q). The proposal needs no derivatives (van der Merwe, Doucet,
+    Given x_{t-1}, the predicted x_t is N(f(x_{t-1}), Q). The proposal needs no derivatives (van der Merwe, Doucet,
     de Freitas, Wan 2000). `alpha` (spread of the sigma points), `beta` (weight of the central point) and `kappa`
     (secondary spread) are the parameters of filterpy's MerweScaledSigmaPoints. The other arguments are as in
     `nonlinear_gaussian`.

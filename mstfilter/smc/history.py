@@ -1,6 +1,6 @@
 """Collectors, which record quantities of a run at every step.
 
-A collector is a function ``(state, info) -> number or array``. The run calls each collector after every step. `ess`,
+A collector is a function ``(state, info) -> number or array``. Each collector is called after every step. `ess`,
 `unique_ancestors`, `log_evidence`, `mean` and `resampled` are collectors.
 
 >>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
@@ -67,7 +67,7 @@ class History(Mapping[str, np.ndarray]):
     dims: tuple[str, ...] = ("time",)  #: ("time",) for one run, ("seed", "time") or ("arm", "seed", "time") for many
     coords: Mapping[str, Any] = field(default_factory=dict)  #: labels along the axes
     state: State | None = None  #: the last state of a single run
-    #: Seed, or (arm, seed), -> reason, of runs that are lost.
+    #: Seed or (arm, seed) -> why the run ended early: all weights became zero.
     lost: Mapping[Any, str] = field(default_factory=dict)
     #: Arm -> why `run_many` made its runs one by one; the arm of a single filter is "filter".
     single: Mapping[str, str] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class History(Mapping[str, np.ndarray]):
         return "\n  ".join(lines if len(lines) <= 5 else [*lines[:4], "also " + ", ".join(list(self.values_)[3:])])
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Columns of a table: the labels of the axes and the collected values, one row per step."""
+        """Columns of a table with one row per step of a run: the labels of the axes and the collected values."""
         labels = np.meshgrid(*(np.asarray(self.coords[name]) for name in self.dims), indexing="ij")
         named = dict(zip(self.dims, labels, strict=True))
         return flat_columns({**named, **self.values_}, axes=len(self._shape))

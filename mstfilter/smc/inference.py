@@ -9,12 +9,12 @@ A model with parameters is a function that returns a filter:
 >>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
 
 - `pmmh` is a Metropolis chain that uses the filter's unbiased estimate of the likelihood. The estimate for the
-  current parameters is kept until a proposal is accepted. The chain then converges to the exact posterior for any
+  current parameters is kept until a proposal is accepted, so the chain converges to the exact posterior for any
   number of particles (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` moves the walkers of emcee by estimates of the likelihood. The user sets no scale of the steps.
+- `ensemble` runs the ensemble sampler emcee with such estimates of the likelihood. It needs no scale of the steps.
 - `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
   `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, the particle on the path also draws its ancestors (Lindsten, Jordan, Schön 2014).
+  the transition has a density, the ancestors of this particle are also drawn (Lindsten, Jordan, Schön 2014).
   Without ancestor sampling the early states of the path hardly change.
 """
 
@@ -79,7 +79,7 @@ class Chains:
         return n_iterations * n_chains / self.autocorrelation_times(discard)
 
 
-#: Estimates of the evidence of the start of a chain before `pmmh` gives up.
+#: Number of estimates of the evidence at the start of a chain before `pmmh` raises an error.
 _N_STARTS = 20
 
 
@@ -173,11 +173,11 @@ def pmmh(
     scale : (d,) or (d, d) array_like
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
-        Whether ``filter_of`` also accepts parameters (d, m), one column for each of m particles of several chains.
+        Whether ``filter_of`` also accepts parameters (d, m), one column for each of the m particles of all chains.
         The filters of all chains then run as one batch, see `mstfilter.smc.batching`. To combine a parameter with
         particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs. If estimates
-        differ by more than rounding, the runs are made one by one with a warning; if the component states
-        ``batched=True``, InputError is raised.
+        differ by more than rounding, a warning is issued and the filters run one by one. If they differ and a
+        component of the filter states ``batched=True``, InputError is raised.
 
     Raises
     ------
@@ -247,7 +247,7 @@ def ensemble(
     *,
     batched: bool = False,
 ) -> Chains:
-    """Ensemble MCMC by emcee over the estimated evidence (Goodman and Weare 2010).
+    """Ensemble MCMC (Goodman and Weare 2010) by emcee, with the estimated evidence as the likelihood.
 
     emcee keeps the log density and the estimated evidence (as a blob) of a walker until the walker moves. No estimate
     is drawn again for unchanged parameters, so the chain converges to the exact posterior.

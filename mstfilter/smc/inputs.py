@@ -7,10 +7,10 @@
 ... )
 >>> filter.run([WithInput(y, u) for y, u in zip(observations, odometry)])
 
-A function of a model with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
+A model function with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
 observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
 
-`Component.at_step` returns a component for step t with input u. `step_functions` names the fields of a component or
+`Component.at_step` returns the component for step t with input u. `step_functions` names the fields of a component or
 model that are functions. Components without such fields override `at_step`, or ignore time and inputs.
 """
 
@@ -53,7 +53,7 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
 
     Raises InputError for a table, a mapping or a string, and for an observation whose entries are all NaN.
 
-    Iteration over a data frame or a mapping would yield names of columns. `where` is the start of the error message.
+    Iteration over a data frame or a mapping would yield names, not rows. `where` is the start of the error message.
     """
     if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
         raise InputError(

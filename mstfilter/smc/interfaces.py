@@ -16,11 +16,11 @@ first argument. All methods work on whole populations, so a component can share 
 ...         return Population(population.particles + step, population.log_weights)
 
 A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
-to the log weights. `mstfilter.smc.Dynamics` can guide any model that has densities.
+to the log weights. `mstfilter.smc.Dynamics` makes a guided transition for any model that has densities.
 
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
 `Transition` and an `Update`. Optional components are `Size` (number of particles), `Lookahead` (auxiliary filter),
-`Rejuvenation` (resample-move) and `Codec` (checkpoints of other particle types). `DensityTransition` extends
+`Rejuvenation` (resample-move) and `Codec` (checkpoints of object particles). `DensityTransition` extends
 `Transition`, and `WeightResampler` extends `Resampler`. Models and programs use `Distribution` objects.
 """
 
@@ -57,8 +57,8 @@ class Component(AtStep, ABC):
     def properly_weighted(self) -> bool:
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author declares if the component is properly weighted. The default is True; write ``properly_weighted =
-        False`` in the class to change the default. `mstfilter check` tests the property of resamplers. A filter
+        The author of a component declares whether this holds. The default is True; write ``properly_weighted =
+        False`` in the class to change the default. `mstfilter check` tests it for resamplers. A filter
         reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
@@ -72,9 +72,9 @@ class Component(AtStep, ABC):
     def batched(self) -> bool | None:
         """Whether the component treats each particle independently, so that it can process several runs together.
 
-        True states that the component treats each particle independently. With None, `run_many` tries a batch, and
-        makes the runs one by one if results differ (see `mstfilter.smc.batching`). With False, the default,
-        `run_many` makes the runs one by one.
+        True states that the component treats each particle independently. With None, `run_many` compares a batch with
+        single runs, and makes the runs one by one if the results differ (see `mstfilter.smc.batching`). With False,
+        the default, `run_many` makes the runs one by one.
         """
         return False
 
@@ -107,7 +107,7 @@ class DensityTransition(Transition):
 
 
 class Update(Component):
-    """Uses the observation: reweights, projects, or combines predicted and proposed particles."""
+    """Uses the observation: reweights, projects or combines the predicted and the proposed particles."""
 
     @abstractmethod
     def update(
@@ -119,7 +119,7 @@ class Update(Component):
 
         `predicted` are the moved particles, None at the first step of a filter that starts from its proposal.
         `proposed` are new particles; None if the filter has no proposal. Each particle of the result keeps the
-        ``parents`` of the particles from which the particle was made (see `union`).
+        ``parents`` of the particles from which it was made (see `union`).
         """
 
 
@@ -160,7 +160,7 @@ class WeightResampler(Resampler):
         ancestors : (n,) int
             Indices into the m particles.
         log_weights : (n,) float or None
-            Log weights of the selected particles. If None, every particle gets the log mean of the old weights, so
+            Log weights of the selected particles. If None, each of them gets the log of the mean input weight, so
             the estimate of the evidence does not change.
         """
 
@@ -175,7 +175,7 @@ class WeightResampler(Resampler):
 class Trigger(Bounded, ABC):
     """Decides whether a step resamples."""
 
-    #: Whether `wants` also takes the populations of R runs, whose `ess` is (R,), and returns (R,) bool or one.
+    #: Whether `wants` also takes the populations of R runs together, with `ess` (R,), and returns (R,) or one bool.
     batched: ClassVar[bool] = False
 
     @abstractmethod
@@ -214,10 +214,10 @@ class Equivalence(Bounded, ABC):
 
 
 class Lookahead(Component):
-    """Evaluates the next observation before particles are selected (auxiliary filter).
+    """Gives each particle a priority by the next observation, before the selection (auxiliary filter).
 
-    The filter selects by log weight + priority and subtracts the priority from the selected log weights. The filter
-    is exact for any priority. A good priority is close to log p(y_t | x_{t-1}).
+    The filter selects by log weight + log priority, and subtracts the log priority from the log weights of the
+    selected particles. The filter is exact for any priority. A good priority is close to log p(y_t | x_{t-1}).
     """
 
     @abstractmethod
@@ -257,7 +257,7 @@ class Distribution(ABC):
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
-        """``(n, *event_shape)``; ``(1, *event_shape)`` or () if all particles share the parameters."""
+        """Shape ``(n, *event_shape)``; ``(1, *event_shape)`` or () if all particles share the parameters."""
         return np.shape(self.mean)
 
     @property
@@ -266,7 +266,7 @@ class Distribution(ABC):
         return self.parameter_shape[1:]
 
     def value_shape(self, size: int) -> tuple[int, ...]:
-        """Shape ``(size, *event_shape)`` of the values of `size` particles; InputError if the rows do not fit."""
+        """Shape ``(size, *event_shape)`` of `size` values; InputError if the parameters are for another size."""
         shape = self.parameter_shape
         if shape and shape[0] not in (1, size):
             raise InputError(
@@ -281,7 +281,7 @@ class Distribution(ABC):
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Values ``(size, *event_shape)`` of `size` particles."""
+        """Draw values ``(size, *event_shape)`` for `size` particles."""
 
     @abstractmethod
     def log_prob(self, value: Any) -> np.ndarray:
@@ -312,7 +312,7 @@ class State:
     t: int  #: number of observations so far
     population: Population | None  #: the particles after the last observation; None before the first
     key: Key  #: names the random streams of the run
-    properly_weighted: bool = True  #: whether the weights are those of an exact filter
+    properly_weighted: bool = True  #: whether the filter is properly weighted
 
     def __repr__(self) -> str:
         evidence = "" if self.log_evidence is None else f", log evidence {self.log_evidence:.4g}"
@@ -323,7 +323,7 @@ class State:
 
     @property
     def log_evidence(self) -> float | None:
-        """Log of the unbiased estimate of p(y_0 .. y_{t-1}); None if a component is not properly weighted."""
+        """Log of the unbiased estimate of p(y_0 .. y_{t-1}); None if the filter is not properly weighted."""
         if not self.properly_weighted:
             return None
         return 0.0 if self.population is None else self.population.log_mean_weight
@@ -331,7 +331,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Info:
-    """Summary of a step; its size does not depend on n. The weights and parents are in the `State`."""
+    """Summary of a step; its size in memory does not depend on n. The weights and parents are in the `State`."""
 
     t: int  #: index of the observation, from 0
     n: int  #: particles after the step

@@ -84,7 +84,7 @@ class Candidates(Sequence[_T], Generic[_T]):
         return self._built[index]
 
     def built(self) -> tuple[_T, ...]:
-        """All candidates in order. Inside a block `parallel`, two candidates are built at the same time."""
+        """All candidates in order, built one by one, or two at a time in a block `mstfilter.processes.parallel`."""
         _, first = np.unique(self._indices, return_index=True)
         each(self.__getitem__, np.sort(first))
         return tuple(self)
@@ -205,10 +205,10 @@ class Population:
     log_weights : (n,) float
         Unnormalised natural log weights, by default 0. NaN and +inf raise InputError; -inf means a weight of 0.
     parents : mapping
-        ``"previous"`` and ``"proposed"``: (n,) integer index of the parent in the previous population or among the
-        proposed particles, -1 if there is no parent. The filter sets the indices, and an update keeps the indices. A
-        resampler adds ``"ancestor"``, the index before the resampling. A population after a step has ``"ancestor"``
-        if the step resampled after its update.
+        ``"previous"``: (n,) indices of the parents in the previous population. ``"proposed"``: (n,) indices of the
+        parents among the proposed particles. -1 means no parent. The filter sets the indices, and an update keeps
+        them. A resampler adds ``"ancestor"``: the indices before the resampling. A population after a step has
+        ``"ancestor"`` if the step resampled after its update.
     notes : mapping
         Values that a component records: numbers, strings and lists.
     """
@@ -320,7 +320,7 @@ class Population:
         return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
 
     def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
-        """The same particles and weights with the given `parents`, (n,) int64 arrays, and `notes` (default empty)."""
+        """The same particles and weights with other `parents` (each an (n,) int64 array) and other `notes`."""
         new = object.__new__(Population)  # checked already
         new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
         return new
@@ -328,8 +328,8 @@ class Population:
     def traced_through(self, resampled: Population | None) -> Population:
         """The same particles, with parents in the population from which `resampled` was selected.
 
-        ``parents["previous"]`` are indices into `resampled`. If the ancestors are known, each index is replaced by
-        the index of the ancestor before this resampling. The field `notes` of the result is empty.
+        Before the call, ``parents["previous"]`` are indices into `resampled`. If `resampled` has ancestors, each
+        index is replaced by the index of the ancestor. The field `notes` of the result is empty.
         """
         ancestors = None if resampled is None else resampled.parents.get("ancestor")
         index = self.parents.get("previous")
@@ -340,7 +340,7 @@ class Population:
         return self.labelled({**self.parents, "previous": traced})
 
     def moved(self, particles: Particles) -> Population:
-        """Replace the particles by the same number of others, with the same weights and parents and empty `notes`."""
+        """Replace the particles by as many new ones. Weights and parents stay the same, and `notes` becomes empty."""
         particles = _freeze(particles)
         if count_particles(particles) != len(self):
             raise InputError(f"{len(self)} particles became {count_particles(particles)}, expected as many")
@@ -366,7 +366,7 @@ class Population:
 
 
 def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
-    """Table columns from arrays. The first `axes` axes are the rows; entries of a row become ``x_0``, ``x_1``, ..."""
+    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
     columns = {}
     for name, a in arrays.items():
         a = np.asarray(a)

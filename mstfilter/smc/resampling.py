@@ -68,7 +68,7 @@ class Stratified(WeightResampler):
 
 @dataclass(frozen=True)
 class Systematic(WeightResampler):
-    """Makes floor or ceil of n W_i copies, by one uniform number for all (Carpenter, Clifford, Fearnhead 1999)."""
+    """Makes floor or ceil of n W_i copies, by one uniform number (Carpenter, Clifford, Fearnhead 1999)."""
 
     batched: ClassVar[bool] = True
 
@@ -89,7 +89,7 @@ def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def systematic_copies(rng: np.random.Generator, expected: np.ndarray, n: int) -> np.ndarray:
-    """(m,) numbers of copies. Rounds `expected`, scaled to sum n, to floor or ceil by systematic draws."""
+    """(m,) numbers of copies: `expected`, scaled to sum n, rounded up or down by systematic draws."""
     copies, fractions, rest = certain_copies(expected, n)
     if rest > 0:
         copies += np.bincount(inverse_cdf(fractions, rng.random(1), rest), minlength=len(copies))
@@ -112,13 +112,13 @@ _SETTLED = 1e-12  # a fraction this close to 0 or 1 is 0 or 1 up to rounding
 
 @dataclass(frozen=True)
 class Ssp(WeightResampler):
-    """Srinivasan sampling process: makes floor or ceil of n W_i copies, for any order of the particles.
+    """Srinivasan sampling process: makes floor or ceil of n W_i copies; converges for any order of the particles.
 
-    Two fractions a and b form a pair, with up = min(1 - a, b) and down = min(a, 1 - b). With probability down / (up +
-    down), a increases and b decreases by `up`. With the remaining probability, a decreases and b increases by `down`.
-    One of the fractions is then 0 or 1 and final; the other fraction is paired again. All pairs of a round are
-    processed together, so log2(n) rounds replace n steps (Gerber, Chopin, Whiteley 2019, "Negative association,
-    ordering and convergence of resampling methods").
+    The fractions frac(n W_i) form pairs (a, b), with up = min(1 - a, b) and down = min(a, 1 - b). With probability
+    down / (up + down), a increases and b decreases by `up`. Otherwise, a decreases and b increases by `down`. One of
+    the fractions is then 0 or 1 and final; the other fraction is paired again. All pairs of a round are processed
+    together, so m particles need log2(m) rounds instead of m steps (Gerber, Chopin, Whiteley 2019, "Negative
+    association, ordering and convergence of resampling methods").
     """
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
@@ -161,7 +161,7 @@ def _settle_pairs(
 
 
 def _one_particle_per_position(rng: np.random.Generator, m: int, n: int) -> np.ndarray:
-    """(n,) particle of each position. Each particle gets floor(n / m) positions, or one more position at random."""
+    """(n,) particle at each position. A particle has floor(n / m) positions; n % m random ones have one more."""
     particles = np.arange(m) if n == m else np.tile(np.arange(m), n // m)
     if n % m:
         particles = np.concatenate([particles, np.sort(rng.choice(m, n % m, replace=False, shuffle=False))])
@@ -229,7 +229,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """The result of `checked_weights` for one run. Weights (R, m) of a batch of runs are not checked."""
+    """(m,) weights by `checked_weights` for one run; (R, m) weights with maximum 1, unchecked, for R runs."""
     if log_weights.ndim != 2:
         return checked_weights(log_weights, n)
     weights = log_weights - log_weights.max(axis=1, keepdims=True)
@@ -237,9 +237,9 @@ def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) ascending indices at the points (k + shift_k) / n of the cumulative weights (..., m), k = 0 .. n - 1.
+    """(..., n) ascending indices at which the cumulative weights reach the points (k + shift_k) / n, k = 0 .. n - 1.
 
-    The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same shift.
+    The weights are (..., m). The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same shift.
     """
     ends = weights.cumsum(axis=-1)
     total = ends[..., -1:]
@@ -288,7 +288,7 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices drawn independently by weights (..., m).
 
-    If n < 2000, the indices are sorted. Otherwise the time is O(m + n), and the order of the indices is not random.
+    The order of the indices is not random. If n < 2000, the indices are sorted; otherwise the time is O(m + n).
     """
     if n < 2000:
         points = ordered_uniforms(rng, n, weights.shape[:-1])
@@ -299,7 +299,7 @@ def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
 
 
 def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = ()) -> np.ndarray:
-    """``(*rows, n)`` uniforms on [0, 1], ascending in each row, in O(n): normalised exponential spacings."""
+    """``(*rows, n)`` uniforms on [0, 1], ascending in each row, in O(n) by normalised exponential spacings."""
     points = rng.standard_exponential((*rows, n + 1))
     np.cumsum(points, axis=-1, out=points)
     points /= points[..., -1:]
@@ -307,7 +307,7 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
 
 
 def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) indices of the intervals of the cumulative weights (m,), scaled to [0, 1), that contain the points."""
+    """(n,) index of the interval that contains each point. Interval i of [0, 1) has length weight i / total."""
     cumulative = weights.cumsum()
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
@@ -315,12 +315,12 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight. The points are first distributed among strata of equal weight.
+    """(n,) indices drawn independently by weight. Uniform points are first distributed among equal strata of [0, 1).
 
     For 10^6 points, the function is four times as fast as a binary search.
 
-    The index of a point is at least the number of cumulative weights in bins below the bin of the point. Bounds below
-    the index are increased.
+    Each stratum is divided into bins. The number of cumulative weights in the bins below that of a point is a lower
+    bound of the index, which is then increased if necessary.
     """
     # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
     bits = 62 - max(n.bit_length() - 14, 0)

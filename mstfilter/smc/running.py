@@ -57,11 +57,11 @@ def run_many(
     seeds : iterable of int
         Different non-negative integers.
     workers : int
-        Number of processes. With 1, all runs are made in the calling process. joblib's loky starts workers as new
-        interpreters. The workers get the filters by cloudpickle and limit the numerical libraries to one thread. If a
-        worker dies, InputError names the runs that may have ended the process.
+        Number of processes. With 1, all runs are made in the calling process. Otherwise joblib's loky starts workers
+        as new interpreters. Workers get the filters by cloudpickle, and limit numerical libraries to one thread. If a
+        worker dies, InputError names the runs that may have caused it.
     progress : bool or callable
-        True shows a progress bar. When runs finish, a function is called as ``progress(done, total)``.
+        True shows a progress bar. A function is called as ``progress(done, total)`` whenever runs finish.
     **collectors
         Collectors by name, as in `collect`. The default is `log_evidence`.
 
@@ -69,9 +69,9 @@ def run_many(
     -------
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. Axis "arm" has one entry per filter.
-        A run ends if all weights are zero (`LostRunError`). From the step of the error, the log evidence is -inf, and
-        other results are NaN. `History.lost` gives the reasons, and `History.single` gives the reasons for runs made
-        one by one.
+        A run ends if all weights are zero (`LostRunError`). From this step on, the log evidence is -inf, and other
+        results are NaN. `History.lost` gives the reason for each such run. `History.single` states why runs were
+        made one by one.
 
     Warns
     -----
@@ -112,7 +112,7 @@ _Chunk = tuple[str, list[int]]  # an arm and some seeds
 
 @dataclass(frozen=True)
 class _Part:
-    """Some finished runs, and the reason if they were made one by one."""
+    """Some finished runs, and why they were not processed together, if so."""
 
     runs: dict[_Task, Collected]
     single: dict[str, str]
@@ -132,7 +132,7 @@ class _Job:
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
     def chunks(self, workers: int) -> list[_Chunk]:
-        """Divide the runs into tasks for workers. A task has many seeds if runs can be processed together."""
+        """Divide the runs into chunks for workers. A chunk has several seeds if runs can be processed together."""
         chunks = []
         for arm, filter in self.arms.items():
             share = -(-len(self.seeds) // (4 * workers if workers > 1 else 1))
@@ -151,7 +151,7 @@ class _Job:
         return _Part(found, {arm: why} if why else {})
 
     def made(self, arm: str, seeds: list[int]) -> tuple[list[Collected], str]:
-        """Runs of a filter, and the reason if several runs were made one by one, or else ""."""
+        """Runs of a filter, and why they cannot be processed together ("" if they can)."""
         filter, why = self.arms[arm], ""
         try:
             check_together(filter)
@@ -171,7 +171,7 @@ class _Job:
             return Collected(dict(collect(steps, **self.collectors)), "".join(lost))
 
     def history(self, found: Mapping[_Task, Collected], single: Mapping[str, str], has_arms: bool) -> History:
-        """The results of all runs. The axis "arm" has an entry for each filter. A single filter has no such axis."""
+        """The results of all runs. The axis "arm" has an entry for each filter; it is absent for a single filter."""
         sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys)}
         coords = {"arm": list(self.arms), "seed": np.asarray(self.seeds), "time": np.arange(sizes["time"])}
         runs = [found[task] for task in product(self.arms, self.seeds)]
@@ -208,7 +208,7 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
 def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
     """Results of chunks of runs, in the order in which the chunks finish.
 
-    Workers are new processes, because a fork of a process with threads can deadlock.
+    Workers are new processes and not forks, because a fork of a process with threads can deadlock.
     """
     if workers == 1:
         yield from (job.run(*chunk) for chunk in chunks)
@@ -236,7 +236,7 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
 
 
 def _in_worker(job: _Job, arm: str, seeds: list[int]) -> _Part:
-    """Run a chunk of runs, with one thread in libraries that ignore the environment variables."""
+    """Make the runs of a chunk, with one thread in libraries that ignore the environment variables."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "cv2" in sys.modules:

@@ -35,7 +35,7 @@ from mstfilter.smc.resampling import draw_rows, independent_draws
 from mstfilter.smc.state_space import moved
 
 BackwardMethod = Literal["exact", "mcmc"]
-#: Pairs of particles per call of `log_prob`.
+#: Largest number of pairs of particles in a call of `log_prob`.
 _PAIRS = 1_000_000
 
 
@@ -43,9 +43,9 @@ _PAIRS = 1_000_000
 class Record:
     """The populations of a run, with the observations."""
 
-    #: After each observation; ``parents["previous"]`` are indices into the one before.
+    #: One after each observation; ``parents["previous"]`` are indices into the population before it.
     populations: tuple[Population, ...]
-    observations: tuple[Any, ...]  #: none if missing
+    observations: tuple[Any, ...]  #: None for a missing observation
 
     def __len__(self) -> int:
         return len(self.populations)
@@ -79,12 +79,12 @@ def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State 
 
 
 def genealogy(record: Record) -> tuple[Population, ...]:
-    """Paths of the last particles. Row k of all populations is one path, with the weight of the last particle."""
+    """Paths of the last particles. The rows k of all populations form a path with the weight of its last state."""
     return _traced(record, len(record) - 1, 0)
 
 
 def fixed_lag(record: Record, lag: int) -> tuple[Population, ...]:
-    """For each time t, the ancestors of the particles at t + `lag` (or the end), with the weights of these particles.
+    """For each time t, the ancestors at t of the particles at t + `lag` (or the end), with the weights of the latter.
 
     A lag of 0 returns the populations of the filter.
     """
@@ -114,7 +114,7 @@ def backward_paths(
     *,
     steps: int = 1,
 ) -> tuple[Population, ...]:
-    """Draw `n` equally weighted paths from the smoothing distribution. Row k of all populations is a path.
+    """Draw `n` equally weighted paths from the smoothing distribution. The rows k of all populations form a path.
 
     The predecessor of a state x_{t+1} is particle i at time t with probability proportional to w_i f(x_{t+1} | x_i).
 
@@ -127,10 +127,10 @@ def backward_paths(
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
         leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
-        record must have parents. A small number of steps adds no bias (Dau and Chopin 2023). If a bootstrap filter
-        selects by `Multinomial`, the parent of x_{t+1} already has the distribution of "exact". With other schemes,
-        the error of the distribution is of order 1 / N. More steps reduce the variance. Without accepted steps, the
-        paths equal the paths of `genealogy`.
+        record must have parents. Few steps suffice (Dau and Chopin 2023): if a bootstrap filter selects by
+        `Multinomial`, the parent of x_{t+1} already has the distribution of "exact". With other schemes, its
+        distribution has an error of order 1 / N. More steps reduce the variance. Without accepted steps, the paths
+        are those of `genealogy`.
     steps : int
         Number of Metropolis steps of "mcmc".
     """
@@ -152,7 +152,7 @@ def backward_paths(
 
 @dataclass(frozen=True)
 class _Move:
-    """All moves from a population at time t to n particles at time t + 1."""
+    """The possible moves from a population at time t to n particles at time t + 1."""
 
     population: Population
     later: Particles

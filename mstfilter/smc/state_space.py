@@ -13,8 +13,8 @@
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
 
-All Markov chains of this package use the Metropolis-Hastings kernel `metropolis`: chains of particles
-(`RandomWalkMove`), parameters (`pmmh`) and ancestors (`backward_paths`).
+The function `metropolis` makes the Metropolis-Hastings steps of particles (`RandomWalkMove`), parameters (`pmmh`)
+and ancestors (`backward_paths`).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _Chains = TypeVar("_Chains")  # states of Markov chains
 class StateSpaceModel(AtStep):
     """A hidden Markov model on any state space.
 
-    A further parameter ``t`` of a function gets the index of the step, and a parameter ``u`` gets the input (see
+    The functions may have further parameters: ``t`` gets the index of the step, and ``u`` gets its input (see
     `mstfilter.smc.inputs`).
 
     Parameters
@@ -120,9 +120,9 @@ class StateSpaceModel(AtStep):
         )
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
-        """``log_initial`` or ``log_transition``.
+        """The function ``log_initial`` or ``log_transition``.
 
-        Raises InputError if the model was made without the density.
+        Raises InputError if the model was made without this density.
         """
         found = self.log_initial if which == "log_initial" else self.log_transition
         if found is None:
@@ -152,13 +152,13 @@ class _OfModel(AtStep):
 
     @property
     def batched(self) -> bool | None:
-        """The `batched` of the model. With a proposal, True becomes None, so that `run_many` tests the proposal."""
+        """The field `batched` of the model. With a proposal, True becomes None, so `run_many` tests the proposal."""
         return None if self.model.batched and self.proposal is not None else self.model.batched
 
 
 @dataclass(frozen=True)
 class Prior(_OfModel, Proposal):
-    """First particles from p(x_0), or from a proposal q(x_0 | y_0) with weights p(x_0) / q.
+    """Draws the first particles from p(x_0), or from a proposal q(x_0 | y_0) with weights p(x_0) / q.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ class Prior(_OfModel, Proposal):
 
 @dataclass(frozen=True)
 class Dynamics(_OfModel, DensityTransition):
-    """Moves by f(x_t | x_{t-1}), or by a proposal q(x_t | x_{t-1}, y_t) with weights f / q.
+    """Moves particles by f(x_t | x_{t-1}), or by a proposal q(x_t | x_{t-1}, y_t) with weights f / q.
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ class RandomWalkMove(Rejuvenation):
 
 
 def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
-    """Rows of `new` if `accepted` is True, otherwise rows of `old`. The rows are in arrays or mappings of arrays."""
+    """Row i of `new` if ``accepted[i]``, otherwise row i of `old`. Both are arrays or mappings of arrays."""
     if isinstance(old, Mapping):
         return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
     rows = accepted if old.ndim == 1 else accepted.reshape(-1, *(1,) * (old.ndim - 1))
@@ -311,8 +311,8 @@ def metropolis(
     Parameters
     ----------
     state
-        One row per chain: an array, or a mapping of arrays. The state includes the log densities, so no density of
-        the present state is evaluated again.
+        One row per chain: an array, or a mapping of arrays. The state can hold log densities, so that `propose`
+        need not evaluate those of the present state again.
     propose : callable
         ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
         q(new | old)). A proposal with a log ratio of NaN (both states are impossible) is rejected.

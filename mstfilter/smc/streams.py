@@ -1,14 +1,14 @@
 """Random streams that are named by keys.
 
-All random numbers of a run are drawn from streams with names (seed, slot, step, index). A slot is a component of the
-filter. The streams do not depend on the number of workers, the order of work, or other components.
+All random numbers of a run are drawn from streams with names (seed, slot, step, index). A slot is the name of a
+component of the filter. The streams do not depend on the number of workers, the order of work, or other components.
 
 >>> from mstfilter.smc import Key, child
 >>> rng = Key(seed=1).child("transition", 3).generator()     # of step 3, as `ParticleFilter` makes it
 >>> child(rng, "object", 7).random() == child(rng, "object", 7).random()    # does not consume `rng`
 True
 
-A `Key` consists of an integer and a tuple, and can be stored in a file. The generator of a key is numpy's PCG64. The
+A `Key` consists of a seed and a tuple, and can be stored in a file. The generator of a key is numpy's PCG64. The
 256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys are independent if
 the hash behaves like a random function. Two of a billion streams have equal seeds with probability below 1e-50.
 
@@ -63,7 +63,7 @@ class Key:
 
 
 class _KeySequence(ISpawnableSeedSequence):
-    """The seed of the generator of a key, as a seed sequence of numpy."""
+    """A numpy seed sequence that gives the generator of a key its seed."""
 
     def __init__(self, key: Key) -> None:
         self.key, self._n_spawned = key, 0
@@ -81,7 +81,7 @@ class _KeySequence(ISpawnableSeedSequence):
         return np.random.SeedSequence(words.tolist()).generate_state(n_words, dtype)  # for other bit generators
 
     def spawn(self, n_children: int) -> list[Any]:
-        """Seeds of `numpy.random.Generator.spawn`. Repeated calls return new seeds."""
+        """Seed sequences for `numpy.random.Generator.spawn`. Repeated calls return new ones."""
         first = self._n_spawned
         self._n_spawned += n_children
         return [_KeySequence(self.key.child("spawn", k)) for k in range(first, self._n_spawned)]
@@ -89,7 +89,7 @@ class _KeySequence(ISpawnableSeedSequence):
 
 @lru_cache(maxsize=1 << 13)
 def _seeds(seed: int, path: tuple[int | str, ...], block: int | None) -> np.ndarray:
-    """(16, 4) uint64 seeds of PCG64: one per index of a block of a path, or the seed of the path in row 0."""
+    """(16, 4) uint64 seeds. Row k is for ``(*path, 16 * block + k)``; if block is None, row 0 is for `path`."""
     return np.frombuffer(_digest(seed, path, block), "<u8").reshape(_BLOCK, 4)
 
 
@@ -98,7 +98,7 @@ def _digest(seed: int, path: tuple[int | str, ...], block: int | None) -> bytes:
 
 
 def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
-    """A generator of the child stream `parts` of the stream of `rng`, for example ``"object", 7``.
+    """A generator of the child stream of `rng` with the name `parts`, for example ``"object", 7``.
 
     `rng` must be made from a seed, for example by numpy.random.default_rng or `Key`. `rng` is not advanced.
     """
@@ -106,7 +106,7 @@ def child(rng: np.random.Generator, *parts: int | str) -> np.random.Generator:
 
 
 def key_of(rng: np.random.Generator) -> Key:
-    """The key of the stream of a generator at any position in the stream."""
+    """The key of the stream of a generator. The position in the stream has no effect."""
     sequence = rng.bit_generator.seed_seq
     if isinstance(sequence, _KeySequence):
         return sequence.key
@@ -133,7 +133,7 @@ class Rows(np.ndarray):
     Products with a matrix are computed for each run, since the rounding of BLAS depends on the number of rows.
     """
 
-    n: ClassVar[int] = 0  #: particles of a run
+    n: ClassVar[int] = 0  #: number of particles of a run
 
     def __matmul__(self, other: Any) -> Any:
         if self.ndim != 2 or np.ndim(other) > 2 or isinstance(other, Rows) or len(self) % self.n:

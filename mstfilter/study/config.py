@@ -57,7 +57,7 @@ def _seeds(value: Any) -> Any:
 
 
 def _texts(value: Any) -> Any:
-    """A single text as a tuple of one text."""
+    """A text as a tuple with this text; other values are unchanged."""
     return (value,) if isinstance(value, str) else value
 
 
@@ -93,12 +93,12 @@ class SceneEntry(_Entry):
 
 
 class ArmEntry(_Entry):
-    """A filter to compare: a preset with changes. Comma-separated values give one filter each."""
+    """A filter to compare: a preset with changes. Each combination of comma-separated values is a filter."""
 
     preset: Texts = ("mst",)  #: names, or paths of TOML files
-    set: Texts = ()  #: ``path=value`` each, as `mstfilter run` takes them; ``path=a,b`` is two arms
+    set: Texts = ()  #: changes ``path=value``, as for `mstfilter run`; ``path=a,b`` makes two arms
     name: str = ""  #: name in the tables. Default: the preset and the values that the grid varies
-    #: Reported, but not part of the comparisons whose p values are adjusted together: a lower or an upper bound.
+    #: True for an arm, such as a bound, that is reported but not part of the comparisons with adjusted p values.
     reported_only: bool = False
 
 
@@ -109,13 +109,13 @@ class StudyConfig(_Entry):
     description: str = ""
     arms: tuple[ArmEntry, ...] = ()  #: the arms to run
     scenes: tuple[SceneEntry, ...] = ()
-    #: Seeds of the filter. They are nested in scenes: averaged before arms are compared.
+    #: Seeds of the filter. For each scene, values are averaged over the seeds before arms are compared.
     seeds: Seeds = (0, 1, 2)
     reference: str = ""  #: the arm that the others are compared with. Default: the first
-    #: {"all", "tables"}: what is kept of a run: its folder, from which a report can be made, or its metrics only.
+    #: {"all", "tables"}: keep the folder of each run, from which a report can be made, or only its metrics.
     keep: Annotated[str, Field(pattern="^(all|tables)$")] = "all"
     tries: Annotated[int, Field(ge=1)] = 3  #: how many times a run is started if its worker dies
-    #: Time limit of a run in seconds; it is then started again, up to `tries` times. 0: no limit.
+    #: Time limit of a run in seconds, after which the run is started again, up to `tries` times. 0: no limit.
     timeout_s: Annotated[float, Field(ge=0)] = 0.0
     #: Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
     cache_gb: Annotated[float, Field(ge=0)] = 4.0
@@ -158,7 +158,7 @@ def study_of(data: dict[str, Any], where: str = "study") -> StudyConfig:
 
 @dataclass(frozen=True)
 class ArmRequest:
-    """An arm (configuration of the filter) before the filter is built."""
+    """An arm (configuration of a filter) whose filter is not built yet."""
 
     name: str
     preset: str  #: name or path
@@ -178,7 +178,7 @@ def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
 
 
 def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[ArmRequest]:
-    """The arms of a study. Comma-separated values, also in `overrides`, give one arm each."""
+    """The arms of a study. Each combination of comma-separated values, also in `overrides`, is an arm."""
     for entry in study.arms:
         yield from _expand(entry, study.folder, overrides)
 

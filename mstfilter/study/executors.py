@@ -30,7 +30,7 @@ _ONE_THREAD = dict.fromkeys(
     "1",
 )
 
-#: ``tell(k, outcome)``: job `k` has ended. None: its worker died or exceeded the time limit; tries may be left.
+#: ``tell(k, outcome)``: job `k` has ended. None: its worker died or exceeded the time limit, and may try again.
 Tell = Callable[[int, JobOutcome | None], None]
 
 
@@ -41,14 +41,14 @@ class Executor(Bounded, ABC):
     def run(self, jobs: Sequence[Job], tell: Tell) -> list[JobOutcome]:
         """Run all jobs and return their outcomes, in the order of `jobs`.
 
-        Jobs start in the order of `jobs`, except that jobs with the same ``share`` go to the same worker if possible.
+        Jobs start in the order of `jobs`, except that jobs with equal entries ``share`` go to one worker if possible.
         `tell` is called in the thread that called `run`. An exception in `tell` stops all jobs.
         """
 
 
 @dataclass(frozen=True)
 class Local(Executor):
-    """Runs jobs in processes of this machine, one thread each.
+    """Runs jobs in processes of this machine. Each process uses one thread.
 
     Each worker is a `pebble.ProcessPool` of one process. The process is started with ``spawn`` and runs many jobs. A
     worker that dies or exceeds the time limit of its job is replaced. As with `multiprocessing`, a script that uses
@@ -79,7 +79,7 @@ class Local(Executor):
 
 
 class _LocalRun:
-    """The jobs of one call: waiting jobs, running jobs, and the outcomes of ended jobs."""
+    """The jobs of one call of `Local.run`: waiting jobs, running jobs, and the outcomes of ended jobs."""
 
     def __init__(self, jobs: Sequence[Job], tell: Tell) -> None:
         self._jobs, self._tell = jobs, tell
@@ -98,7 +98,7 @@ class _LocalRun:
         return [self._outcomes[k] for k in range(len(self._jobs))]
 
     def _next_job(self, worker: _Worker) -> int | None:
-        """The next job: of the worker's last ``share``, else of a ``share`` without a worker, else the first."""
+        """The next job: one with the worker's ``share``, else with a ``share`` that no worker has, else the first."""
         other_shares = {share for other, share in self._share_of.items() if other is not worker}
 
         def rank(k: int) -> tuple[bool, bool]:
@@ -178,7 +178,7 @@ class _Worker:
 
 
 def _initialise(log: str) -> None:
-    """Prepare a worker process: output to the log, one thread, and exit when the study ends."""
+    """Prepare a worker process: write output to the log, use one thread, and exit when the study ends."""
     import cv2
 
     target = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)

@@ -1,4 +1,4 @@
-"""The jobs of a study, which simulate a recording or run a filter on a recording.
+"""The jobs of a study. Each job simulates a recording, or runs a filter on a recording.
 
 >>> perform({"kind": "run", "name": "mst on demo-0", ...})
 JobOutcome(status='done')
@@ -70,7 +70,7 @@ def open_scene(source: Mapping[str, Any], recordings: str) -> Recording:
 def _check_code(expected: str) -> None:
     """Raise InputError unless this process runs the code with which the study was planned.
 
-    All packages of the filter are imported, so that later changes of their files have no effect on this process.
+    The function also imports all packages of the filter, so later changes of their files do not affect this process.
     """
     if code_version() != expected:
         raise InputError(
@@ -118,7 +118,7 @@ def _run(job: Job) -> None:
 
 
 def write_measures(run: RunFolder, recording: Recording) -> list[dict[str, Any]]:
-    """Return the metrics of each pause of a run, and write the counts of the forecasts into the folder of the run."""
+    """Return the metrics of each pause of a run, and write the counts of its forecasts into the folder of the run."""
     measured = [
         measure_pause(
             recording, t, run.hypotheses(t), np.array(run.info(t)["weights"], dtype=float), run.questions(t)

@@ -96,8 +96,8 @@ class Plan:
 def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     """The runs of a study.
 
-    `overrides` are applied to every arm after the changes of the arm. Comma-separated values give one arm each.
-    Raises InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
+    `overrides` apply to every arm after its own changes. Each combination of comma-separated values is an arm. Raises
+    InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
     code = code_version()
     versions = library_versions()
@@ -159,7 +159,7 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
 
 
 def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:
-    """Put the group of a scene before the name of the scene if several scenes have the same name."""
+    """Put the group of a scene before its name if another scene has the same name."""
     count = Counter(scene.name for scene in scenes)
     return tuple(replace(s, name=f"{s.group}-{s.name}") if count[s.name] > 1 else s for s in scenes)
 

@@ -3,19 +3,17 @@
 >>> folder = StudyFolder.open("studies/first")
 >>> folder.description["reference"], len(folder.rows())
 
-Layout::
-
-    study.json       description, arms with their configuration, scenes, seeds, the folder of every run
-
-    runs/NAME/       one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz: counts of
-                     its forecasts
-
-    runs.csv         one row per pause and run: metrics first, time and memory last
-    summary.csv      one row per family, arm and metric: mean over scenes and its interval
-
-    differences.csv  every arm minus the reference: paired differences, intervals, p values, conclusions
-    failures.csv     runs that failed, and why
-    logs/            output of the workers
+================  =====================================================================================
+study.json        description, code, libraries, machine, arms with their configuration, scenes, seeds,
+                  the folder of every run
+runs/NAME/        one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz:
+                  numbers of its forecasts, by forecast and outcome
+runs.csv          one row per pause and run: metrics first, time and memory last
+summary.csv       one row per family, arm and metric: mean over scenes and its interval
+differences.csv   every arm minus the reference: paired differences, intervals, p values, conclusions
+failures.csv      runs that failed, and why
+logs/             output of the workers
+================  =====================================================================================
 """
 
 from __future__ import annotations
@@ -172,7 +170,7 @@ class StudyFolder:
         return {arm["name"]: arm["uses_truth"] for arm in self.description["arms"] if arm["uses_truth"]}
 
     def run(self, folder: str) -> Path:
-        """Path of the folder of a run, from its name."""
+        """Path of the folder of a run, from the name of the folder."""
         return self.path / "runs" / folder
 
     def write_failure(self, folder: str, identity: str, outcome: JobOutcome) -> None:
@@ -191,7 +189,7 @@ class StudyFolder:
         return found
 
     def records(self) -> list[dict[str, Any]]:
-        """The same rows as `rows`, with lists added: ``qualities`` has one value per hypothesis."""
+        """The rows of `rows`, with additional lists such as ``qualities``, which has one value per hypothesis."""
         rows = []
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
@@ -206,8 +204,8 @@ class StudyFolder:
     def _add_log_loss(self, rows: Sequence[dict[str, Any]]) -> None:
         """Add the recalibrated log loss to rows, in place.
 
-        The forecasts of a scene are recalibrated on the other scenes of its family and arm. No filter seed of a scene
-        is used to recalibrate this scene.
+        The forecasts of a scene are recalibrated on the other scenes of its family and arm. Runs of the same scene
+        with other seeds are not used.
         """
         groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
@@ -221,7 +219,7 @@ class StudyFolder:
                     row[LOG_LOSS] = fits[scene].log_loss(of_run[row["pause"]])
 
     def _counts(self, family: str, arm: str) -> dict[tuple[str, Any], np.ndarray]:
-        """Counts (T, r, 1001, 2) of the forecasts of an arm by scene and seed, for runs that have forecasts."""
+        """Mapping (scene, seed) -> counts (T, r, 1001, 2) by pause, rate of noise, forecast and outcome."""
         found = {}
         for run in self.description["runs"]:
             path = self.run(run["folder"]) / FORECASTS
@@ -235,7 +233,7 @@ class StudyFolder:
         return found
 
     def forecasts(self, family: str, arm: str) -> ForecastTable:
-        """Forecasts of an arm on a family at pauses t >= 1, without recalibration, pooled over scenes and seeds."""
+        """Forecasts of an arm for a family at pauses t >= 1, pooled over scenes and seeds, without recalibration."""
         counts = sum(
             (one[1:, 0].sum(axis=0, dtype=np.int64) for one in self._counts(family, arm).values()), NO_COUNTS
         )
@@ -246,7 +244,7 @@ class StudyFolder:
         return _without_lists(self.records())
 
     def summary(self, records: Sequence[Mapping[str, Any]] | None = None) -> Summary:
-        """Means and differences of the finished runs. Without `records`, the records are read from the folder."""
+        """Means of the arms and differences from the reference. By default, `records` are read from the folder."""
         rows = _without_lists(self.records() if records is None else records)
         return summarise(rows, self.description["reference"], cost_columns(rows), self.reported_only)
 
@@ -268,7 +266,7 @@ class StudyFolder:
 
 
 def _sum_by_scene(counts: Mapping[tuple[str, Any], np.ndarray]) -> dict[str, np.ndarray]:
-    """Counts (r, 1001, 2) of each scene, summed over seeds and pauses t >= 1."""
+    """Mapping from scenes to counts (r, 1001, 2) of forecasts, summed over seeds and pauses t >= 1."""
     found: dict[str, np.ndarray] = {}
     for (scene, _), one in counts.items():
         found[scene] = found.get(scene, 0) + one[1:].sum(axis=0, dtype=np.int64)
@@ -280,7 +278,7 @@ def _without_lists(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]
 
 
 def cost_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Columns of time and memory. All other columns are identical if the same study runs again."""
+    """Columns of time and memory. All other columns are identical if the same study is run again."""
     return [c for c in _columns(rows) if c == "core_seconds" or c.startswith(("seconds", "peak_mb"))]
 
 

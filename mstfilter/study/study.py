@@ -1,4 +1,4 @@
-"""Running a study: `run_study` checks the study and the folder, makes every missing run, and writes the tables.
+"""Runs a study: `run_study` checks the study and the folder, makes every missing run, and writes the tables.
 
 >>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
 >>> result.done, result.failed
@@ -18,7 +18,7 @@ from typing import Any
 from mstfilter.errors import InputError
 from mstfilter.files import locked, sweep, writing
 from mstfilter.lazy import progress_of
-from mstfilter.processes import check_main_guard
+from mstfilter.processes import check_main_guard, machine
 from mstfilter.reading import check_private
 from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
@@ -34,7 +34,7 @@ class StudyProgress:
     what: str  #: {"recordings", "runs"}
     name: str  #: the job that has ended or lost its worker; empty at the beginning of a part
     outcome: JobOutcome | None  #: how the job ended; None if its worker died
-    done: int  #: jobs of this part; `done` includes those of earlier calls
+    done: int  #: finished jobs of this part, including those of earlier calls
     failed: int
     total: int
 
@@ -58,18 +58,18 @@ def run_study(
     cache: Path | None = None,
     progress: bool | Callable[[StudyProgress], None] = False,
 ) -> StudyResult:
-    """Run a study into a folder.
+    """Run a study and store its results in a folder.
 
     Parameters
     ----------
     path : Path
         The study folder. The folder must be new, empty, or from an earlier call.
     executor : Executor, optional
-        By default, one process for each core of this machine.
+        Runs the jobs. By default, `Local` with one process for each core of this machine.
     overrides : sequence of str
-        Overrides for every arm. Comma-separated values give one arm each.
+        Overrides for every arm. Each combination of comma-separated values is an arm.
     cache : Path, optional
-        Folder of simulated recordings and of intermediate results. By default, the user's cache folder.
+        Folder of simulated recordings and intermediate results. The default is the user's cache folder.
     progress : bool or callable
         True shows progress bars. A function is called with a `StudyProgress` when a job ends or loses its worker.
 
@@ -134,7 +134,7 @@ class _Call:
         return {run.name: why[run.scene.key] for run in failed}
 
     def filter_scenes(self, runs: Sequence[StudyRun], n_failed: int) -> dict[str, JobOutcome]:
-        """Make `runs`. Returns the failed runs with reasons. `n_failed` is the number of runs that failed before."""
+        """Make the given runs, after `n_failed` runs have failed. Returns the newly failed runs, with the reasons."""
         total = len(self.plan.runs)
         jobs = [self._run_job(run) for run in runs]
         count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
@@ -191,7 +191,7 @@ class _Call:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[StudyFolder]:
-    """Lock the study folder, which need not exist, for this process. Files of killed processes are removed."""
+    """Lock the study folder, which need not exist. Temporary files of killed processes are removed."""
     with locked(path):
         try:
             sweep(path)
@@ -215,6 +215,9 @@ def _description(plan: Plan) -> dict[str, Any]:
         "name": study.name,
         "description": study.description,
         "reference": plan.reference,
+        "code": plan.code,
+        "libraries": library_versions(),
+        "machine": machine(),
         "arms": [
             {name: getattr(arm, name) for name in ("name", "reported_only", "uses_truth", "config")}
             for arm in plan.arms

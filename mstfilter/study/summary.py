@@ -1,13 +1,13 @@
-"""The summary of a study: means by family and arm, and paired differences to the reference.
+"""The summary of a study: means by family and arm, and paired differences from the reference.
 
 >>> summary = summarise(folder.rows(), reference="mst")
 >>> summary.metric("s1", "mst", "quality").mean, summary.differences[0].words
 
-The two primary endpoints are means over pauses t >= 1. *Quality* is the unweighted mean ``objects`` quality of the
-hypotheses; higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats, after recalibration
-on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the same pauses.
-Values are averaged over filter seeds first, then over scenes. A difference is the value of an arm minus the value of
-the reference. The p values of both endpoints are adjusted together.
+The two primary endpoints are means over pauses t >= 1. *Quality* is the unweighted mean of the hypotheses' quality
+(form ``objects``); higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats, after
+recalibration on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
+same pauses. Values are averaged over filter seeds first, then over scenes. A difference is the value of an arm minus
+the value of the reference. The p values of both endpoints are adjusted together.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mstfilter.statistics import CLAIM, LEVEL, Difference, compare, conclusion, 
 
 ENDPOINTS = {"quality": 1, LOG_LOSS: -1}  # 1: higher is better
 SLOPES = {name: f"{name}_slope" for name in ENDPOINTS}  # change from pause to pause, t = 0 included
-NOT_WORSE = 0.005  # of the other endpoint, where one filter is claimed to be better
+NOT_WORSE = 0.005  # largest loss in the other endpoint if a filter is claimed to be better
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
 _SHARES = ("quality", "occupancy", "object_f", "diversity", "brier", "calibration_error")
 
@@ -64,7 +64,7 @@ class ArmMetric:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """t interval of the mean over scenes, cut at the least and the largest possible value of the metric."""
+        """t interval of the mean over scenes, clipped to the range of possible values of the metric."""
         low, high = interval(np.array(list(self.by_scene.values())))
         least, most = bounds_of(self.name)
         return max(low, least), min(high, most)
@@ -72,7 +72,7 @@ class ArmMetric:
 
 @dataclass(frozen=True)
 class Compared:
-    """Difference of an arm minus the reference on a family.
+    """Difference (arm minus reference) of a metric on a family.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Compared:
     difference : Difference
         For the primary endpoints, `p_holm` is `p_claim` adjusted over both endpoints, all families and all arms.
     reported_only : bool
-        Whether the arm is left out of the adjustment and of the conclusions.
+        Whether the arm is left out of the conclusions and of the adjustment of p values.
     """
 
     family: str
@@ -136,10 +136,10 @@ class Summary:
         return [one for one in self.differences if one.metric == name]
 
     def is_better(self, family: str, arm: str) -> bool:
-        """Whether the reference is shown to be better than an arm on a family.
+        """Whether the study shows that the reference is better than an arm on a family.
 
-        One endpoint must be better after adjustment, and the intervals of both endpoints must exclude a loss of 0.005
-        or more. Each endpoint needs at least 20 scenes.
+        One endpoint must be better by its adjusted p value, and the intervals of both endpoints must exclude a loss
+        of 0.005 or more. Each endpoint needs at least 20 scenes.
         """
         found = []
         for one in self.differences:
@@ -187,9 +187,9 @@ def summarise(
         The arm with which the other arms are compared.
     cost : sequence of str
         Columns of time and memory. These columns are averaged over all pauses and have no comparisons of arms. A
-        missing stage counts as 0 seconds. The first of several filter seeds is omitted: its run fills the cache.
+        missing stage counts as 0 seconds. Of several filter seeds, the first is omitted, because it fills the cache.
     reported_only : collection of str
-        Arms that are not part of the comparisons.
+        Arms that are not part of the comparisons with adjusted p values.
     """
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
@@ -237,7 +237,7 @@ def summarise(
 
 
 def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
-    """Adjust the p values of both endpoints together. Arms that are only reported get NaN."""
+    """Adjust the p values of both endpoints together. The p values of arms that are only reported become NaN."""
     p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
     return tuple(
         replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one

@@ -4,8 +4,8 @@
 >>> len(population), clip.before.depth.shape
 (4, (96, 128))
 
-To use the scene in a contract, return the scene from the method `example`, or define ``example = scene_example`` in
-the file of a component.
+To use this input in a contract, return it from the contract's method `example`, or define ``example = scene_example``
+in the file of a component.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _labels(shift: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _clip() -> Clip:
-    """Three frames of the push from a camera in front and above, with a texture and without noise."""
+    """Three frames of the push of a box, from a camera in front and above, with a texture and without noise."""
     pose = look_at(np.array([0.0, -0.5, 0.45]), np.array([0.0, 0.0, 0.03]))
     camera = Camera.from_intrinsics(105, 105, 63.5, 47.5, 128, 96, pose)
     texture = np.random.default_rng(1).integers(-35, 36, (4, 64, 64))

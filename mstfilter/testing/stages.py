@@ -1,6 +1,6 @@
-"""Contracts of evidence and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
+"""Contracts of evidence terms and of the stages of MST: boundaries, trees, cuts, completion, motions, updates.
 
-`contract_of` and `run_contract` accept components of every interface, also the interfaces of `mstfilter.smc`.
+`contract_of` and `run_contract` accept components of every interface, including those in `mstfilter.smc`.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class StageContract(Contract):
     example = staticmethod(scene_example)
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> Any:
-        """The result of the filter step that uses the component."""
+        """The result of the proposal, transition or update that uses the component."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
         if isinstance(owner, Proposal):
@@ -131,12 +131,12 @@ class CompleterContract(StageContract):
     """The contract of every `Completer`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> list[np.ndarray]:
-        """The probabilities of the boxes of three objects, computed without a cache."""
+        """The estimated probabilities in the boxes of three objects, computed without a cache."""
         seen = _boxes(component, _correct(inputs), inputs["observation"])
         return [np.array(p) for p in _estimated(component, rng, seen, inputs["observation"])]
 
     def _seen(self, cut: bool = False) -> tuple[list[ObservedBox], Clip]:
-        """Boxes of three objects, and the clip."""
+        """Boxes of the three objects in the example, and the example's clip."""
         inputs = self.inputs(1)
         return _boxes(self.make(), _correct(inputs), inputs["observation"], cut), inputs["observation"]
 
@@ -201,7 +201,7 @@ def _boxes(completer: Completer, hypothesis: Hypothesis, clip: Clip, cut: bool =
 def _estimated(
     completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
 ) -> list[np.ndarray]:
-    """The probabilities of boxes. Box k uses the random stream `first` + k."""
+    """The estimated probabilities in the boxes. Box k uses the random stream `first` + k."""
     bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
     with _quiet():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
@@ -237,7 +237,7 @@ class MotionRuleContract(StageContract):
 
 
 def _tracks(inputs: dict[str, Any]) -> list[tuple[int, Track]]:
-    """The visible objects of a hypothesis in the clip, by label."""
+    """Label and track of each visible object of a hypothesis in the clip."""
     clip = inputs["observation"]
     flow = DenseFlow().track(clip)
     segments = segments_of(_correct(inputs), clip.before)
@@ -274,7 +274,7 @@ def run_contract(
     function ``example`` in the module of the component's class. Without such a function, components that use images
     get a scene, and other components get numbers.
 
-    ``exact(rng, n)`` of a `Transition`, `Proposal`, `Update` or `Rejuvenation` returns exact draws and the
+    For a `Transition`, `Proposal`, `Update` or `Rejuvenation`, ``exact(rng, n)`` returns exact draws and the
     observation, as the contract describes. The default is the function ``exact`` in the module of the class, if any.
     """
     cls = type(component)

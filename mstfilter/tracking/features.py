@@ -27,7 +27,7 @@ _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the g
 
 
 def same_depth(first: Frame, other: Frame) -> np.ndarray:
-    """Whether both frames have readings that agree up to the sensor noise, (H, W) bool; False on the robot."""
+    """(H, W) bool: pixels with readings that agree in both frames up to the sensor noise; False on the robot."""
     limit = _DEPTH_SIGMAS * np.sqrt(2.0) * depth_sigma(first.depth)
     with np.errstate(invalid="ignore"):
         return (np.abs(other.depth - first.depth) <= limit) & first.valid & other.valid
@@ -87,7 +87,7 @@ class Matches:
     q: np.ndarray
 
     def within(self, first: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
-        """Indices of the pairs that start inside mask ``first`` and, if ``last`` is given, end inside it (H, W)."""
+        """Indices of the pairs that start inside the mask ``first`` (H, W) and end inside ``last``, if given."""
         keep = first[self.before[:, 1], self.before[:, 0]]
         if last is not None:
             keep = keep & last[self.after[:, 1], self.after[:, 0]]
@@ -102,8 +102,8 @@ class SiftMatching(Bounded):
     ----------
     mutual : bool
         If True, keep a pair only if each feature is the best match of the other and passes the ratio test (`ratio`).
-        If False, keep every pair within all three radii, as the authors' program does. Clustering rejects wrong
-        pairs.
+        If False, keep every pair within the three radii below, as the authors' program does. A later clustering
+        rejects wrong pairs.
     ratio : float
         Largest ratio of the best to the second best descriptor distance. Used if `mutual`.
     descriptor_radius : float

@@ -3,8 +3,8 @@
 Two results are accumulated over the frames of the clip:
 
 - The first result is a grid of points of the first frame, followed forward (for rigid fits).
-- The second result is a pull map. The pull map has, for every pixel of the last frame, its position in the first
-  frame. The pull map converts label images of ``clip.before`` to label images of ``clip.after`` by one gather each.
+- The second result is a pull map. For every pixel of the last frame, the pull map has its position in the first
+  frame. A label image of ``clip.before`` is indexed by the pull map to give the label image of ``clip.after``.
 
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
@@ -61,7 +61,7 @@ class ClipTracks:
 
     @cached_property
     def coherently_unchanged(self) -> np.ndarray:
-        """As `unchanged`, but isolated changed pixels are treated as noise, (H, W) bool."""
+        """(H, W) bool: `unchanged`, also True at isolated changed pixels, which are treated as noise."""
         changed = (~self.unchanged).astype(np.uint8)
         return cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) == 0
 
@@ -77,7 +77,7 @@ class DenseFlow(Bounded):
     preset: Literal["ultrafast", "fast", "medium"] = "medium"
 
     def track(self, clip: Clip) -> ClipTracks:
-        """Follow points and pixels through the clip. Cached by content; a tracker of this clip (`begin`) is used."""
+        """Follow points and pixels through the clip, with the tracker of `begin` if it exists. Cached by content."""
         frames = list(clip.frames)
         keys = [f.key for f in frames]
 
@@ -92,13 +92,13 @@ class DenseFlow(Bounded):
         return memo("clip tracks", (tuple(keys), astuple(self)), compute, ClipTracks)
 
     def begin(self, first: Frame) -> FlowTracker:
-        """A tracker for frames that arrive one by one. `track` continues it while the caller refers to it."""
+        """A tracker for frames that arrive one by one. `track` uses it as long as the caller keeps a reference."""
         tracker = _begun[first.key, self.preset] = FlowTracker(first, self.preset)
         return tracker
 
 
 class FlowTracker:
-    """The tracks of a clip, advanced when a frame is added.
+    """Computes the tracks of a clip while its frames arrive.
 
     Frames with little motion since the last used frame are skipped, except the last frame.
     """
@@ -117,7 +117,7 @@ class FlowTracker:
         self._known = ~_robot(first).ravel()
 
     def add(self, frame: Frame) -> None:
-        """Add the next frame. The frame before is used if the motion since the last used frame is large."""
+        """Add the next frame. The previously added frame is used if the motion since the last used frame is large."""
         small, dis = _small(frame), cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
         with _one_thread():
             flow = dis.calc(self._small, small, None)
@@ -142,7 +142,7 @@ class FlowTracker:
         return ClipTracks(self._start.astype(np.int32), self._end, self._alive, source, unchanged)
 
     def _use(self, current: Frame) -> None:
-        """Follow points and pixels from the last used frame to another one."""
+        """Follow points and pixels from the last used frame to the frame `current`."""
         previous, grid = self._used, self._grid
         height, width = current.depth.shape
         forward, backward = _flow(previous, current, self._preset)
@@ -189,7 +189,7 @@ _calls_lock = threading.Lock()
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit OpenCV to one thread, since the result of the flow depends on the number of threads."""
+    """Limit OpenCV to one thread, because the flow depends on the number of threads."""
     with _calls_lock:  # the setting is global: the first block changes it, and the last one restores it
         if not _calls["open"]:
             _calls["threads"] = cv2.getNumThreads()
@@ -259,9 +259,9 @@ def _pixel(at: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndar
 def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
     """Whether each pixel has the same content in the first and last frame, (H, W) bool.
 
-    Depth differs by less than four standard deviations of the difference. Slightly blurred colour differs by at most
-    12 grey levels in every channel after exposure matching. Pixels that show the robot or have no depth count as
-    changed.
+    The content is the same if two conditions hold. Depth differs by at most four standard deviations of the
+    difference. After blur and exposure matching, colour differs by at most 12 grey levels in every channel. Pixels
+    that show the robot or have no depth count as changed.
     """
     change = max_of_three(np.abs(smooth_colour(first) - matched_colour(last, first)))
     return same_depth(first, last) & (change <= 12.0)
@@ -270,9 +270,9 @@ def _unchanged_pixels(first: Frame, last: Frame) -> np.ndarray:
 def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
     """Positions in the first frame (D, 2) of pixels without valid flow.
 
-    Each pixel takes the position of one of its five nearest valid pixels: the position closest to the other four. The
-    nearest pixels are those with the smallest combined distance in space and colour (12 mm equals 20 grey levels;
-    without depth 6 pixels).
+    Each pixel takes the position of one of its five nearest valid pixels, the one whose motion is most similar to the
+    other four. The nearest pixels have the smallest combined distance in space and colour. A distance of 12 mm, or of
+    6 pixels in a frame without depth, equals 20 grey levels.
     """
     height, width = frame.depth.shape
     if not len(uncertain) or not known.any():

@@ -51,7 +51,7 @@ class RegistrationResult:
 
 
 def prepare(points: np.ndarray) -> Surface | None:
-    """Prepare points (N, 3), world metres, for registration; None if there are fewer than 12."""
+    """Prepare points (N, 3), world metres, for registration; None for fewer than 12 points."""
     import small_gicp
 
     if len(points) < _MIN_POINTS:

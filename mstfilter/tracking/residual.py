@@ -6,13 +6,13 @@ depth m, the cost of a point is
 - ``min(|z - m| / s, cap)^2 + min(|colour difference| / c, cap)^2``, where s is the sensor noise at this range;
 - a constant if z is behind m by more than a margin (occluded);
 - a larger constant outside the image;
-- not counted without a reading, on the robot, or if it is occluded and the moved surface faces away from the camera.
+- 0, and not counted, without a reading, on the robot, or if the point is occluded and its surface faces away.
 
-The score S is the mean cost of the counted points, plus two terms. The first term is for the fraction of visible
+The score S is the mean cost of the counted points, plus two terms. The first term grows with the fraction of visible
 points on pixels that the flow traces back to another object. It distinguishes two objects that look the same. The
-second term is for the fraction of the surface that the flow traces back to this object and that the moved object does
-not explain. Without this term, a place behind another object fits as well as a place that is seen. A lower score is
-better.
+second term grows with the fraction of the surface that the flow traces back to this object but that is far from the
+moved object. Without this term, a hidden position behind another object has as good a score as a visible position. A
+lower score is better.
 
 `refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
 `refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
@@ -53,8 +53,8 @@ class MotionResidual:
 
     `track_weight` is added to S if all visible points are on pixels that the flow traces back to another object.
     `target_weight` is added to S if the motion explains no point that the flow traces back to this object.
-    S is infinite if a smaller fraction of the points than `min_visible` would be visible, except at rest. An object
-    that rests can become hidden, but nothing in the image supports one of many hidden places.
+    S is infinite if less than `min_visible` of the points would be visible, except for the identity. An object
+    at rest can become hidden, but the image does not support a motion to one of many hidden positions.
     """
 
     track_weight: float = 1.0
@@ -66,7 +66,7 @@ class MotionResidual:
         return float(self.scores(track, T[None])[0])
 
     def scores(self, track: Track, motions: np.ndarray, n_points: int = _N_SCORED) -> np.ndarray:
-        """S (K,) of motions (K, 4, 4), on at most ``n_points`` points."""
+        """S (K,) of motions (K, 4, 4), computed from at most ``n_points`` points."""
         points, colours = track.sample(n_points)
         if not len(points):
             return np.full(len(motions), np.inf)
@@ -108,7 +108,7 @@ def _facing_away(track: Track, motions: np.ndarray, moved: np.ndarray, n: int) -
 
 
 def _unexplained(track: Track, motions: np.ndarray, n: int) -> np.ndarray:
-    """Fraction (K,) of about n points of the target surface that are far from the moved surface; 0 without one."""
+    """Fraction (K,) of about n target points that are far from the moved surface; 0 if a surface is missing."""
     source, target = track.surface, track.target_surface
     if source is None or target is None:
         return np.zeros(len(motions))
@@ -213,7 +213,7 @@ def _grey_slope(camera: Camera, x: np.ndarray, z: np.ndarray, gx: np.ndarray, gy
 
 
 def _gauss_newton(x: np.ndarray, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray | None:
-    """The motion (4, 4) that reduces robust residuals of points x (N, 3); None if it is not finite.
+    """The motion (4, 4) of a step that reduces robust residuals of points x (N, 3); None if it is not finite.
 
     A term consists of residuals (N,) and their derivatives (N, 3) with respect to the positions of the points.
     """

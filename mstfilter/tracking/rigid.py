@@ -1,7 +1,7 @@
 """Rigid motions from corresponding points: least squares, robust fits, and J-Linkage for several motions.
 
 Motions are (..., 4, 4) float64 matrices T: a point p moves to ``q = R p + t`` with R = T[:3, :3] and t = T[:3, 3].
-Components exchange single motions as scipy `RigidTransform`. `rigid_transform` converts a matrix bit for bit.
+Components exchange single motions as scipy `RigidTransform`. `rigid_transform` converts a matrix without rounding.
 
 >>> import numpy as np
 >>> rng = np.random.default_rng(1)
@@ -10,10 +10,10 @@ Components exchange single motions as scipy `RigidTransform`. `rigid_transform` 
 >>> bool(np.allclose(T[:3, 3], [0.1, 0.0, 0.0]))
 True
 
-J-Linkage (Toldo and Fusiello, ECCV 2008) finds all rigid motions among point matches if their number is unknown. The
+J-Linkage (Toldo and Fusiello, ECCV 2008) finds an unknown number of rigid motions among point matches. The
 preference set of a match contains the sampled motions that explain it. Matches are merged bottom-up by the Jaccard
-distance of their sets. A merged cluster keeps the intersection, so at least one motion explains all its members.
-Merging ends when all sets are disjoint.
+distance of their sets. A cluster has the intersection of its members' sets, so at least one motion explains all
+members. Merging ends when all sets are disjoint.
 
 >>> q = np.where(np.arange(40)[:, None] < 20, p + [0.5, 0, 0], p - [0, 0.5, 0])
 >>> [len(m.inliers) for m in jlinkage(rng, p, q)]
@@ -31,7 +31,7 @@ _MAX_CLUSTERED = 300  # J-Linkage clusters a random subset of more matches: its 
 
 
 def rigid_transform(T: np.ndarray) -> RigidTransform:
-    """A motion (4, 4) as RigidTransform with the same bits: the rotation is not normalised."""
+    """A motion (4, 4) as RigidTransform without rounding: the rotation is not normalised."""
     return RigidTransform(T, normalize=False)
 
 
@@ -64,7 +64,7 @@ def displacement(T: np.ndarray, centre: np.ndarray) -> np.ndarray:
 def kabsch(p: np.ndarray, q: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Least-squares rigid motions (..., 4, 4) of points p to points q, both (..., N, 3), with det R = +1.
 
-    `weights` (..., N) must not be negative or all zero (Kabsch 1976; the sign correction excludes reflections).
+    The method is that of Kabsch (1976). `weights` (..., N) must not be negative or all zero.
     """
     p = np.asarray(p, dtype=np.float64)
     q = np.asarray(q, dtype=np.float64)
@@ -126,7 +126,7 @@ class MotionCluster:
 
 
 def ransac(rng: np.random.Generator, p: np.ndarray, q: np.ndarray, eps: float) -> MotionCluster | None:
-    """The motion with most pairs within ``eps`` metres, refitted to these pairs; None if there are fewer than 3."""
+    """The motion with most pairs within ``eps`` metres, refitted to these pairs; None for fewer than 3 pairs."""
     models = minimal_models(rng, p, q, eps, 300)
     if not len(models):
         return None
@@ -149,7 +149,7 @@ def _refit(p: np.ndarray, q: np.ndarray, T: np.ndarray, eps: float) -> MotionClu
 
 
 def refine_robust(T: np.ndarray, p: np.ndarray, q: np.ndarray, scale: float) -> np.ndarray:
-    """Reweighted least squares from ``T``, with Geman-McClure weights (1 + r^2 / scale^2)^-2 (scale in metres)."""
+    """Reweighted least squares started at ``T``, with Geman-McClure weights (1 + r^2 / scale^2)^-2 (`scale` in m)."""
     for _ in range(10):
         squared = ((move_points(T, p) - q) ** 2).sum(axis=-1)
         weights = (1.0 + squared / scale**2) ** -2

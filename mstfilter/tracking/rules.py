@@ -11,8 +11,8 @@ one motion per particle, possibly at random.
 `MstRule`         candidates from flow, registration and SIFT, ranked by one robust residual
 ================  ===========================================================================
 
-`MstRule` combines several estimators because each of them fails on some objects: flow on plain surfaces, registration
-on rotations of symmetric objects, SIFT without texture.
+`MstRule` combines several estimators because each of them fails on some objects. Flow fails on uniform surfaces,
+registration fails for rotations of symmetric objects, and SIFT fails without texture.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _sift_motions(
 
 
 def _registered(track: Track, from_centroid: bool, reach: float, registration: Registration) -> Candidate | None:
-    """The segment registered to the surface of its tracked mask; None if a surface or the result is missing."""
+    """Registration of a segment to the surface of its tracked mask; None if a surface or the result is missing."""
     source, target = track.surface, track.target_surface
     if source is None or target is None:
         return None
@@ -196,8 +196,8 @@ _ALL_PAIRS = SiftMatching(mutual=False, descriptor_radius=200.0, search_share=10
 class AuthorsRule(MotionRule):
     """The rule of the authors' program, a random choice between SIFT and ICP.
 
-    A drawn cluster of n matches is used with probability clip(0.1 n - 0.25, 0.1, 0.9). ICP is accepted up to a mean
-    squared distance of 0.002 m^2 (4.5 cm rms).
+    A SIFT cluster of n matches is drawn, and used with probability clip(0.1 n - 0.25, 0.1, 0.9). Otherwise, ICP is
+    used if its mean squared distance is at most 0.002 m^2 (4.5 cm rms).
 
     Parameters
     ----------
@@ -243,10 +243,10 @@ class MstRule(MotionRule):
     use_flow, use_icp, use_sift : bool
         Estimators to use.
     n_refine : int
-        Number of best candidates that are refined against the whole last frame. These motions are candidates too.
+        Number of best candidates that are refined against the whole last frame. The refined motions are also used.
     search_above : float
-        If every score is larger than this value, the object is searched for around its last position, and topplings
-        are tried. Disabled if negative.
+        If every score is larger than this value, the object is searched for around its last position, upright and
+        toppled. A negative value disables the search.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
@@ -318,7 +318,7 @@ class MstRule(MotionRule):
                     yield kind, result.T, support
 
     def _search(self, track: Track, centre: np.ndarray) -> list[Candidate]:
-        """Search a grid of shifts on the table for several rotations, and refine the two best shifts of each."""
+        """Search a grid of shifts on the table for several rotations. Refine the two best shifts of each rotation."""
         n = round(_SEARCH_RADIUS / _SEARCH_STEP)
         shifts = _SEARCH_STEP * np.stack(np.meshgrid(*[np.arange(-n, n + 1)] * 2), axis=-1).reshape(-1, 2)
         shifts = shifts[np.hypot(*shifts.T) <= _SEARCH_RADIUS]
@@ -338,7 +338,7 @@ class MstRule(MotionRule):
 
 
 def _turn(rotation: ArrayLike, point: np.ndarray) -> np.ndarray:
-    """The motion (4, 4) by a rotation vector (3,), radians, about a point (3,)."""
+    """Rotation (4, 4) about a point (3,) by a rotation vector (3,) in radians."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
     T[:3, 3] = point - T[:3, :3] @ point
@@ -346,7 +346,7 @@ def _turn(rotation: ArrayLike, point: np.ndarray) -> np.ndarray:
 
 
 def _topplings(points: np.ndarray) -> Iterator[np.ndarray]:
-    """Turns (4, 4) by 90 degrees about each lower edge of the box around points (N, 3), outwards."""
+    """Rotations (4, 4) by 90 degrees that topple the box around points (N, 3) over each of its lower edges."""
     middle = points.mean(axis=0)
     corners = cv2.boxPoints(cv2.minAreaRect((points[:, :2] - middle[:2]).astype(np.float32))) + middle[:2]
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):

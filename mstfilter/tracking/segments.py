@@ -48,7 +48,7 @@ class Segment:
 def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     """The segments of a hypothesis in a frame, by label. Hidden objects have no segment.
 
-    The support contains the pixels above the table where measured and rendered depth differ by less than two voxels.
+    `Segment.support` has the pixels above the table where measured and rendered depth differ by less than two voxels.
     """
     labels, depth = render_hypothesis(hypothesis, frame.camera)
     with np.errstate(invalid="ignore"):
@@ -81,7 +81,7 @@ def _indices_by_label(labels: np.ndarray) -> dict[int, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A segment in a clip."""
+    """A segment with the flow and the features of a clip."""
 
     segment: Segment
     clip: Clip
@@ -114,7 +114,7 @@ class Track:
 
     @cached_property
     def near(self) -> cKDTree:
-        """Search tree of the points of `surface`; without points if there is no surface."""
+        """Search tree of the points of `surface`; empty if there is no surface."""
         return cKDTree(np.empty((0, 3)) if self.surface is None else self.surface.points)
 
     @cached_property
@@ -177,7 +177,7 @@ class MaskTracker(Checked, ABC):
     def track(self, clip: Clip, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Masks (H, W) bool of the last frame, one for each of the masks (H, W) bool of the first frame.
 
-        An empty mask states that the object is lost. Masks may overlap. Results for masks should be independent.
+        An empty mask means that the object is lost. Masks may overlap. A result should not depend on other masks.
         """
 
 
@@ -187,7 +187,7 @@ class StaticTest:
 
     Tracking damages objects at rest: labels leak between touching objects that look the same, and the registration of
     symmetric objects drifts. So objects whose pixels are unchanged are not tracked. If `enabled` is False, every
-    object is tracked (the published algorithms).
+    object is tracked, as published.
     """
 
     enabled: bool = True

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.special import expit, logit
 
-from mstfilter.completion import Extrude, NetworkCompleter, arbitrate, observed_box
+from mstfilter.completion import Completion, Extrude, NetworkCompleter, arbitrate, observed_box
 from mstfilter.completion.crops import CHANNELS, channels, crop_box, extruded
 from mstfilter.completion.observed import encode_box, observed_again
 from mstfilter.completion.unet import ARCHITECTURE, CompletionNet
@@ -37,7 +40,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def completer(weights):
-    return NetworkCompleter(weights=weights)
+    return NetworkCompleter(weights=weights, log_odds=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +94,28 @@ def test_free_space_and_order(completer, frame):
         assert np.array_equal(alone.probability, together[k].probability)
         assert not ((placed(alone) > 0) & free).any()
         assert (placed(alone) >= 0.5).any()
+
+
+@pytest.mark.parametrize("log_odds", [-200.0, -20.0, -2.0, 0.0, 0.2, 0.5, 100.0])
+def test_added_log_odds_leave_certain_voxels(log_odds):
+    p = np.array([0, 0.25, 0.5, 1], np.float32).reshape(1, 1, 4)
+    found = Completion(np.zeros(3, int), p, np.zeros(p.shape, np.int32), "key").shifted(log_odds).probability.ravel()
+    assert found.dtype == np.float32 and found[0] == 0 and found[-1] == 1
+    np.testing.assert_allclose(found[1:3], expit(np.log([1 / 3, 1]) + log_odds), rtol=1e-5, atol=1e-30)
+
+
+@pytest.mark.parametrize("size", [0.01, 0.02])
+def test_log_odds_are_added_to_every_completion(completer, frame, size):
+    grid = VoxelGrid.from_bounds((-0.3, -0.3, 0), (0.3, 0.3, 0.3), size)
+    mask = masks_of(STACK, frame)[0]
+    as_is, added = (
+        replace(completer, log_odds=x).complete(np.random.default_rng(0), frame, [mask], grid)[0] for x in (0.0, 1.5)
+    )
+    uncertain = (as_is.probability > 0) & (as_is.probability < 1)
+    expected = expit(logit(as_is.probability[uncertain].astype(float)) + 1.5)
+    assert uncertain.sum() > 20
+    np.testing.assert_allclose(added.probability[uncertain], expected, rtol=1e-4, atol=1e-6)
+    assert np.array_equal(added.probability[~uncertain], as_is.probability[~uncertain])
 
 
 @pytest.mark.parametrize("size", [0.02, 0.008])

@@ -84,7 +84,8 @@ def completed(completer: NetworkCompleter, seed: int = 0) -> np.ndarray:
 
 def test_a_network_in_torch_gives_its_logits(tmp_path):
     net = save(tmp_path / "mine", Convolution())
-    completer = NetworkCompleter(weights=str(tmp_path / "mine"), architecture=Convolution(), least_surface=0)
+    folder = str(tmp_path / "mine")
+    completer = NetworkCompleter(weights=folder, architecture=Convolution(), least_surface=0, log_odds=0)
     np.testing.assert_allclose(completed(completer), expected(net, scale=0.8, shift=0.3), atol=1e-6)
     save(tmp_path / "other", Convolution(), seed=1)
     other = replace(completer, weights=str(tmp_path / "other"))
@@ -123,7 +124,7 @@ def onnx_page(monkeypatch, tmp_path):
 def test_a_network_in_onnx_equals_the_one_in_torch(onnx_page, tmp_path):
     net = save(tmp_path / "mine", Convolution())
     onnx_page(net)
-    completer = NetworkCompleter(weights="mine.onnx", least_surface=0)
+    completer = NetworkCompleter(weights="mine.onnx", least_surface=0, log_odds=0)
     np.testing.assert_allclose(completed(completer), expected(net, scale=1, shift=0), atol=1e-5)
     with pytest.raises(InputError, match="contains its architecture"):
         completed(replace(completer, architecture=Convolution()))

@@ -53,9 +53,9 @@ def test_calibration_of_the_partition_update(tmp_path):
     """The losses that are minimised are those of the table, and a forecast is better than knowing nothing."""
     run_script("partition_fit/calibration.py", "--smoke", "--out", tmp_path)
     rows = {(row["field"], row["value"]): row for row in read_csv(tmp_path / "calibration.csv")}
-    assert float(rows["occupied_log_odds", "0.0"]["loss"]) < math.log(2)
+    assert float(rows["log_odds", "0.0"]["loss"]) < math.log(2)
     losses = [float(row["loss"]) for (_, value), row in rows.items() if value != "held out"]
-    assert float(rows["occupied_log_odds", "held out"]["loss"]) >= min(losses) - 1e-4
+    assert float(rows["log_odds", "held out"]["loss"]) >= min(losses) - 1e-4
 
 
 def test_controls(tmp_path):
@@ -225,9 +225,3 @@ def test_newcomer(tmp_path):
     rows = read_csv(tmp_path / "hour.csv")
     assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer", "notebook"}
     assert [row["step"] for row in rows if row["fault"]] == []
-
-
-def test_correct_components(tmp_path):
-    found = run_script("correct_components/run.py", "--only", "rejuvenations", "--out", tmp_path / "checks.csv")
-    assert "6 checks, 0 rejected" in found
-    assert [row["broken"] for row in read_csv(tmp_path / "checks.csv")] == [""] * 6

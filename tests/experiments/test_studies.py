@@ -15,7 +15,6 @@ from tests.experiments.scripts import EXPERIMENTS, run_script
 from tests.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
-FUSION = EXPERIMENTS / "fusion"
 
 
 def run_small(tmp_path, config, *overrides):
@@ -35,9 +34,7 @@ def write_tables(folder, out, *more):
     return {path.stem: read_csv(path) for path in out.iterdir()}
 
 
-@pytest.mark.parametrize(
-    "name", ["main/paper_best", "fusion/study", "fusion/reported", "ablations/study", "completion/study"]
-)
+@pytest.mark.parametrize("name", ["main/paper_best", "fusion/study", "ablations/study", "completion/study"])
 def test_studies_run_in_their_small_form(tmp_path, name):
     path = EXPERIMENTS / f"{name}.toml"
     make_plan(load_study(path))  # the long form can be planned
@@ -52,7 +49,7 @@ def test_studies_run_in_their_small_form(tmp_path, name):
     beside = [arm for arm in arms if arm.startswith("true masks")]
     assert [row["arm"] for row in found[f"{name}_differences"]] == [a for a in arms[1:] if a not in beside]
     if beside:
-        found = write_tables(folder, tmp_path / "tables", "--reference", "true masks: mst_rules")
+        found = write_tables(folder, tmp_path / "tables", "--reference", "true masks: mst")
         assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
 
 
@@ -91,7 +88,7 @@ def test_main_study_runs_and_resumes(tmp_path, capsys):
     assert {row["arm"] for row in rows} == set(arms) and len(rows) == len(arms) * 2
 
 
-@pytest.mark.parametrize("config, first", [(MAIN, 1000), (FUSION / "reported.toml", 1100)])
+@pytest.mark.parametrize("config, first", [(MAIN, 1000), (EXPERIMENTS / "fusion/study.toml", 1100)])
 def test_reported_seeds_are_no_tuning_seeds(config, first):
     """The long form uses seeds that no rule was tuned on; the small form uses tuning seeds only."""
     reported = [scene.source["seed"] for scene in make_plan(load_study(config)).scenes]
@@ -103,20 +100,13 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
 @pytest.mark.parametrize(
     "name",
     [
-        *("ablations/study", "main/paper_best", "fusion/study", "error_budget/study", "information/number"),
+        *("ablations/study", "main/paper_best", "error_budget/study", "information/number"),
         *("completion/study", "completion/tuning", "information/update"),
     ],
 )
 def test_tuning_studies_use_tuning_seeds(name):
     plan = make_plan(load_study(EXPERIMENTS / f"{name}.toml"))
     assert all(scene.source["seed"] < 100 for scene in plan.scenes)
-
-
-def test_fusion_study_reports_the_arms_that_were_tuned():
-    tuned, reported = (make_plan(load_study(FUSION / f"{name}.toml")) for name in ("study", "reported"))
-    assert [(arm.name, arm.key) for arm in tuned.arms] == [(arm.name, arm.key) for arm in reported.arms]
-    assert not {scene.name for scene in tuned.scenes} & {scene.name for scene in reported.scenes}
-    assert len(tuned.scenes) == len(reported.scenes) == 30
 
 
 def test_error_budget(tmp_path):

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import expit
 
-from mstfilter.completion import Completion, Extrude, SurfaceOnly
+from mstfilter.completion import Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.partition import PairEvidence, PartitionUpdate, Readings
 from mstfilter.scene import Clip, Evidence, Hypothesis, Occupancy, surface_agreement
@@ -173,14 +172,6 @@ def test_a_past_that_the_frame_sees_through_says_nothing_about_pairs():
     wrong = Hypothesis.from_labels(labels, clip.grid)
     assert objects(wrong) == 2
     assert objects(wrong, quality_exponent=0.0) == 1
-
-
-@pytest.mark.parametrize("log_odds", [-200.0, -20.0, -2.0, 0.0, 0.2, 0.5, 100.0])
-def test_added_log_odds_leave_certain_voxels(log_odds):
-    p = np.array([0, 0.25, 0.5, 1], np.float32).reshape(1, 1, 4)
-    found = Completion(np.zeros(3, int), p, np.zeros(p.shape, np.int32), "key").shifted(log_odds).probability.ravel()
-    assert found.dtype == np.float32 and found[0] == 0 and found[-1] == 1
-    np.testing.assert_allclose(found[1:3], expit(np.log([1 / 3, 1]) + log_odds), rtol=1e-5, atol=1e-30)
 
 
 def test_a_merged_object_keeps_the_latest_views_of_both():

@@ -191,7 +191,7 @@ _RAW_ERRORS = {
 
 
 def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
-    """The error of a program with the line of the program and a hint. Errors of other libraries are unchanged."""
+    """The error of a program with the line that raised it and a hint. Errors of other libraries are unchanged."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
     place = run.what if run.inside else f"after {run.what}" if run.what else "before its first site"
     if frames:

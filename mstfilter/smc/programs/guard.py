@@ -3,10 +3,10 @@
 A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
 ``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
 error, but its weights are wrong. Steps of each kind (first, later, without observation) are counted, and the steps 1,
-2, 9, 66, 515, ... are checked. These are the steps 8^k + k. They have all remainders modulo 3, so a fault in every
-third step is detected. A check has three parts:
+2, and 8^k + k (9, 66, 515, ...) are checked. These numbers have all remainders modulo 3, so a fault in every third
+step is detected. A check has three parts:
 
-1. The first two steps are repeated with the same random numbers. Values and log weights must agree up to rounding.
+1. Steps 1 and 2 are repeated with the same random numbers. Values and log weights must agree up to rounding.
 2. A few particles run alone with the same drawn values. Distributions and returned values of a particle must not
    change. Particles with small and with large values are chosen, to detect a maximum or ``any`` over particles. A run
    of few particles also detects an event axis used as the particle axis.
@@ -37,7 +37,7 @@ from mstfilter.smc.streams import child
 
 #: Numbers of the steps of one kind that are checked.
 _CHECKED = frozenset({1, 2, *(8**k + k for k in range(1, 12))})
-#: Differences that count as rounding: networks that compute in single precision give other digits for other sizes.
+#: Differences that count as rounding: single-precision networks give other digits for other numbers of rows.
 _LOG_DENSITY, _VALUE = 1e-3, 1e-5
 _ALONE = (
     "each particle is processed as if it were alone: reduce over entries with axis=1, not over the particles",
@@ -61,7 +61,7 @@ class Guard:
         self.rng, self.past, self.observation, self.model, self.guide = rng, past, observation, model, guide
         self.previous, self.count = None if past is None else past.particles, count
         self.state = rng.bit_generator.state
-        #: Copies that know nothing of this step, of objects that are models and may keep values.
+        #: Copies of the model and the guide, made before the step: objects may keep values between calls.
         self.fresh = {id(f): _copy(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
@@ -121,7 +121,7 @@ class Guard:
 
     # --- the guide --------------------------------------------------------------------------------------------------
     def _check_guide(self, run: Run, gain: np.ndarray) -> None:
-        """Check the guide with draws of the model."""
+        """Check that the guide can draw what the model draws, and compare the two estimates of the evidence."""
         n, old = len(gain), 0.0 if self.past is None else self.past.log_weights
         try:
             drawn = run(self.model, SampleHandler(child(self.rng, "guard")), self.previous, self.observation, n)
@@ -306,7 +306,7 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
 
     Each class is checked once.
 
-    For 1000 sorted draws, the integral of the density must differ from the empirical distribution function by less
+    For 1000 sorted draws, the integral of the density may differ from the empirical distribution function by less
     than .12. The false-alarm rate is 1e-12 (Dvoretzky, Kiefer, Wolfowitz).
     """
     from scipy.integrate import cumulative_trapezoid

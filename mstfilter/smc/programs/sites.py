@@ -22,7 +22,7 @@ _RECORDED: ContextVar[list[ProgramRun] | None] = ContextVar("runs that record th
 
 @contextmanager
 def recorded() -> Iterator[list[ProgramRun]]:
-    """List of the `ProgramRun` of each program that runs inside the block. Each run stores its `calls`."""
+    """Yields a list with a `ProgramRun` for each run of a program in the block. Each run stores its `calls`."""
     runs: list[ProgramRun] = []
     token = _RECORDED.set(runs)
     try:
@@ -71,7 +71,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     branches : sequence of callables
         Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
         `observe` and `switch`. Several branches may sample one name, and their values form one array. The entries of
-        particles that do not reach the call are NaN (0 for integers). A branch without particles is also called.
+        particles that do not reach a call are NaN (0 for integers). A branch without particles is also called.
     *args : array (n, ...), mapping of such, or None
         Arguments whose rows are split among the branches. A branch reads values shared by all particles from its
         closure.
@@ -98,7 +98,7 @@ class Call(NamedTuple):
     """A call of `sample` or `observe`, or a branch of `switch`, in a run."""
 
     what: str  #: description, for messages
-    k: int  #: number among the calls of this description
+    k: int  #: position among the calls of this description
     rows: np.ndarray | None  #: (size,) indices of the particles, ascending; None stands for all
     size: int
     log_prob: Any = 0.0  #: of an observation; (size,), or one for all

@@ -9,7 +9,7 @@ The first line of the docstring of a test states the property, and the message o
 ...     def call(self, component, rng, inputs):
 ...         return component.wants(inputs["population"], 0)
 
-This module does not import pytest; pytest also accepts `SkipTest`.
+This module does not import pytest, because pytest accepts `unittest.SkipTest`.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def copied(component: Any) -> Any:
 
 
 def skip_unless_properly_weighted(component: Any) -> Any:
-    """The component. Skips the test if the component declares ``properly_weighted = False``."""
+    """Return the component, or skip the test if the component declares ``properly_weighted = False``."""
     if not component.properly_weighted:
         raise SkipTest("the component declares properly_weighted = False")
     return component
@@ -201,7 +201,7 @@ def check_properties(
     example: Callable[..., Any] | None = None,
     exact: Callable[..., Any] | None = None,
 ) -> list[CheckResult]:
-    """Test all properties of a component that a contract states.
+    """Test all properties that a contract states for a component.
 
     ``example(rng, n)`` and ``exact(rng, n)`` replace the methods of the contract with these names.
     """
@@ -265,7 +265,7 @@ def reports_errors(what: str | dict[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def skips_errors() -> Iterator[None]:
-    """Skip a general test if the component raises an exception, which the tests of the interface report."""
+    """Skip a general test if the component raises an exception. Other tests report the exception."""
     try:
         yield
     except Exception as error:

@@ -73,10 +73,10 @@ CASES = (
     Case(_mixed(8, 0.4985), 2001, 1700),
     Case(_mixed(2000, 0.49983), 2000, 500),
 )
-#: A case with a deviation of this many standard errors gets more calls, up to so many times as many as at first.
+#: A case with a deviation of this many standard errors gets more calls, up to `MOST_CALLS` times the first number.
 _SUSPICIOUS = 4.0
 MOST_CALLS = 16
-#: Bets of a test, as fractions of the largest stake.
+#: Stakes of a test, as fractions of the largest stake.
 _STAKES = 0.9 * 0.5 ** np.arange(10)
 
 
@@ -84,11 +84,11 @@ class Sample:
     """The weight of the copies of particles and of groups of particles in many resamplings of a case.
 
     Each mean is tested by betting (Waudby-Smith, Ramdas 2024, "Estimating means of bounded random variables by
-    betting"). Let calls x_1, x_2, ... in [0, b] have expectation mu, and let a stake s be any number from -1 / (b -
-    mu) to 1 / mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's inequality, the
-    largest product over any number of calls exceeds 1 / p with probability at most p. The test assumes no normal
-    distribution, so an unbiased scheme passes even if it makes very many copies in rare calls. Calls may therefore be
-    added until the result is clear.
+    betting"). Let the results x_1, x_2, ... of calls in [0, b] have expectation mu, and let a stake s be any number
+    from -1 / (b - mu) to 1 / mu. The product of 1 + s (x_k - mu) over the calls has expectation 1. By Ville's
+    inequality, the largest product over any number of calls exceeds 1 / p with probability at most p. Calls may
+    therefore be added until the result is clear. The test assumes no normal distribution, so an unbiased scheme
+    passes even if it makes very many copies in rare calls.
     """
 
     def __init__(self, case: Case) -> None:
@@ -117,8 +117,8 @@ class Sample:
     def evidence(self) -> np.ndarray:
         """(m + k,) log evidence against the expected weight of each particle and group.
 
-        The evidence exceeds log(2 / p) with probability at most p, and is 0 if the mean is near the expectation. Near
-        means within four standard errors, plus 16 copies over all calls.
+        For an unbiased scheme, the evidence exceeds log(2 / p) with probability at most p. It is 0 if the mean is
+        near the expectation: within four standard errors, plus 16 copies over all calls.
         """
         x = self.carried
         found, sd = x.mean(axis=0), x.std(axis=0)

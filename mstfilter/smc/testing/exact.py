@@ -20,11 +20,11 @@ _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reverse
 class ExactContract(Contract):
     """Properties of components that are tested with exact draws.
 
-    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` in the module of the component. The
-    method returns a population of `n` particles before the call, a population of exact draws (or with exact weights)
-    after the call, and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the
-    weights of both populations, so that the weights f / q of a guided move vary less. The test is skipped if one
-    particle has more than 1 % of the total weight.
+    Define a method ``exact(self, rng, n)``, or a function ``exact(rng, n)`` in the module of the component. It
+    returns three items: `n` particles before the call, the particles after the call (exact draws, or with exact
+    weights), and the observation. An optional fourth item ``log_likelihood(particles) -> (n,)`` multiplies the
+    weights of both compared samples, so that the weights f / q of a guided move vary less. The test is skipped if
+    one particle has more than 1 % of the total weight.
 
     The rows of `exact` must be independent draws, but the states x_{t-1} may lie on a grid. With 200,000 rows, the
     tests detect an error of 3 % in the standard deviation, and a shift by 3 % of the standard deviation. The tests
@@ -32,9 +32,9 @@ class ExactContract(Contract):
     """
 
     returns = Population
-    columns: ClassVar[str] = "x"  #: what the columns of compared rows are
+    columns: ClassVar[str] = "x"  #: name of the columns of compared rows, for messages
     exact: Callable[[np.random.Generator, int], tuple[Any, ...]] | None = None
-    n_draws: ClassVar[int] = 200_000  #: rows of `exact` in a test; fewer for a slow component find larger faults only
+    n_draws: ClassVar[int] = 200_000  #: rows of `exact` in a test. Fewer rows detect only larger faults
 
     def exact_case(self, seed: int, n: int) -> tuple[Any, ...]:
         """The result of `exact`. Skips the test if no `exact` is defined."""
@@ -45,10 +45,10 @@ class ExactContract(Contract):
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
         """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.
 
-        Distribution functions are compared at several quantiles. The sums detect columns that share a random number.
+        Distribution functions are compared at several quantiles. A sum shows if its columns share a random number.
 
-        The bounds assume that the difference of two weighted means is normal. The false-alarm rate is a twentieth of
-        the required rate. A tail is compared only if so probable that no single weight decides the test.
+        The bounds assume that differences of weighted fractions are normal. The false-alarm rate is a twentieth of
+        `FALSE_ALARM`. A tail is compared only if it is so probable that no single weight decides the test.
         """
         samples = []
         for log_weights in (lw, exact_lw):
@@ -135,7 +135,7 @@ def _sd(x: np.ndarray, w: np.ndarray) -> float:
 
 
 def check_uncorrelated(a: np.ndarray, b: np.ndarray, n_tests: int, what: str) -> None:
-    """Check that two samples have no rank correlation. The false-alarm rate is divided by `n_tests`."""
+    """Check that two samples have no rank correlation, at the level `FALSE_ALARM` / `n_tests`."""
     from scipy.stats import spearmanr
 
     if np.ptp(a) > 0 and np.ptp(b) > 0:
@@ -147,7 +147,7 @@ def check_uncorrelated(a: np.ndarray, b: np.ndarray, n_tests: int, what: str) ->
 
 
 def check_same_law(found: np.ndarray, expected: np.ndarray, n_tests: int, fault: str) -> None:
-    """Check that columns of two samples have equal distributions. The false-alarm rate is divided by `n_tests`."""
+    """Check that columns of two samples have equal distributions, at the level `FALSE_ALARM` / `n_tests`."""
     from scipy.stats import ks_2samp
 
     for x, y in zip(found.T, expected.T, strict=True):
@@ -165,7 +165,7 @@ def check_mean_weight(w: np.ndarray, v: np.ndarray) -> None:
 
 
 def compare_factors(found: np.ndarray, exact: np.ndarray) -> None:
-    """Check log weights of the same particles one by one."""
+    """Check that the log weights of the same particles are equal, one by one."""
     wrong = ~np.isclose(found, exact, rtol=1e-6, atol=1e-6)
     i = int(np.argmax(wrong))
     assert not wrong.any(), (

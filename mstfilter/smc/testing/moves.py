@@ -37,7 +37,7 @@ class TransitionContract(ScaleContract, ExactContract):
 
     One test needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1}, draws of x_t from f(x_t | x_{t-1}),
     and the observation. For a guided move, `exact` also returns the function log p(y_t | x_t) of x_t. If the
-    transition weights by the observation, the draws of x_t must have the exact weights.
+    transition weights by the observation, the draws of x_t must carry the exact weights.
     """
 
     columns = "(x_t, x_t - x_{t-1})"
@@ -127,7 +127,7 @@ class TransitionContract(ScaleContract, ExactContract):
 
 
 class DensityTransitionContract(TransitionContract):
-    """The contract of every `DensityTransition` adds properties of `log_prob` to `TransitionContract`."""
+    """The contract of every `DensityTransition`: the properties of `TransitionContract`, and those of `log_prob`."""
 
     def test_log_prob_is_of_each_move(self) -> None:
         """`log_prob` gives one finite number for each move of `predict`, independently of the other moves."""
@@ -147,8 +147,8 @@ class DensityTransitionContract(TransitionContract):
         """The moves of `predict` have the density of `log_prob`, up to a constant factor.
 
         Let x' be a move from particle a or b, with probability 1/2 each. Then p = f(x' | a) / (f(x' | a) + f(x' | b))
-        is the probability that x' was moved from a. If p is the probability of the true origin, (1 - p) log(p / (1 -
-        p)) has mean 0. A pair is 4, 8, ... or 8192 positions apart in the order of the first coordinate.
+        is the probability that x' was moved from a. With p computed for the true origin, (1 - p) log(p / (1 - p)) has
+        mean 0. The particles a and b are 4, 8, ... or 8192 positions apart in the order of the first coordinate.
         """
         component, n = self.make(), 2**14
         if not isinstance(self.inputs(1)["population"].particles, (np.ndarray, dict)):
@@ -200,7 +200,7 @@ class ProposalContract(ExactContract):
 
     @statistical
     def test_draws_have_their_distribution(self) -> None:
-        """Weighted draws have the exact distribution and mean weight, and vary as independent draws."""
+        """Weighted draws have the exact distribution and mean weight, and vary like independent draws."""
         component = self.make()
 
         def sampled(n: int, seed: int = 2) -> Population:
@@ -255,7 +255,7 @@ class UpdateContract(ScaleContract, ExactContract):
                 check_parents(result, name, len(given))
 
     def test_parents_belong_to_their_particles(self) -> None:
-        """A particle that equals a predicted particle has the index of that particle as parent "previous"."""
+        """A particle of the result that equals a predicted particle has its index as parent "previous"."""
         inputs = {**self.inputs(_N), "proposed": None}
         out = self.checked_call(self.make(), inputs).realised()
         index = out.parents.get("previous", np.arange(len(out)))
@@ -267,7 +267,7 @@ class UpdateContract(ScaleContract, ExactContract):
             )
 
     def test_weight_of_a_particle_does_not_depend_on_others(self) -> None:
-        """The factor of a particle's weight does not depend on the other particles."""
+        """The factor by which the weight of a particle changes does not depend on the other particles."""
         component, inputs = skip_unless_properly_weighted(self.make()), {**self.inputs(_N), "proposed": None}
 
         def factors(rows: np.ndarray, seed: int = 3) -> np.ndarray | None:
@@ -316,8 +316,8 @@ class UpdateContract(ScaleContract, ExactContract):
 class RejuvenationContract(ExactContract):
     """The contract of every `Rejuvenation`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    The statistical test needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1} (None at the first step),
-    exact draws of x_t given x_{t-1} and y_t, and y_t.
+    The statistical test needs a method ``exact(self, rng, n)`` that returns three values: n rows x_{t-1}, exact
+    draws of x_t given x_{t-1} and y_t, and the observation y_t. At the first step x_{t-1} is None.
     """
 
     columns = "(x_t, x_t - x_{t-1})"

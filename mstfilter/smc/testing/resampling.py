@@ -30,12 +30,12 @@ _ZEROS = ((0, 0, 1, 2, 3), (1, 2, 3, 0, 0), (1, 0, 2, 0, 3))
 class ResamplerContract(ScaleContract):
     """The contract of every `Resampler`. The statistical tests have a false-alarm rate of at most 1e-6 each.
 
-    The particles of `example` must differ. The tests detect that a mean deviates by about six standard errors over
+    The particles of `example` must differ. The tests detect a mean that deviates by about six standard errors over
     the calls of a `Case`, if the deviation is at least 0.3 % of the particle's weight.
     """
 
     returns = Population
-    #: Fewer and smaller ones than for weights: schemes that compare particles are slower.
+    #: Fewer calls and particles than for a `WeightResampler`: schemes that compare particles are slower.
     cases: tuple[Case, ...] = tuple(
         replace(case, calls=case.calls // max(2, len(case.weights) // 15))
         for case in CASES
@@ -111,9 +111,9 @@ class ResamplerContract(ScaleContract):
             assert self._excess(sample) <= 0, fault_message(sample, int(np.argmax(sample.evidence())))
 
     def _carried(self, component: Resampler, case: Case, seed: int) -> Sample:
-        """The weight of the copies of each particle and each group in many calls.
+        """The weight of the copies of each particle and each group of particles in many calls.
 
-        Calls are added while a mean deviates but the evidence against the mean is below the bound.
+        Calls are added while a mean deviates but the evidence against the scheme is below the bound.
         """
         given = self.population(case.weights)
         population = Population(given.particles, given.log_weights + 3.0)  # faster without parents
@@ -128,7 +128,7 @@ class ResamplerContract(ScaleContract):
             calls *= 2
 
     def _excess(self, sample: Sample) -> float:
-        """Largest log evidence against a mean, minus the bound at level `FALSE_ALARM` for all cases together."""
+        """Largest log evidence against a mean, minus its bound at level `FALSE_ALARM` for all cases together."""
         evidence = sample.evidence()
         return float(evidence.max() - np.log(2 * len(evidence) * len(self.cases) / FALSE_ALARM))
 
@@ -143,7 +143,7 @@ def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
 
 
 class WeightResamplerContract(ResamplerContract):
-    """The contract of every `WeightResampler` adds a property of `select` to `ResamplerContract`."""
+    """The contract of every `WeightResampler`: the properties of `ResamplerContract`, and one of `select`."""
 
     cases = CASES
 

@@ -21,7 +21,7 @@ _SELECTIONS: dict[str, tuple[np.ndarray, ...]] = {
 
 
 class RowsContract(Contract):
-    """Properties of components with a result that depends on the particles, but not on their order."""
+    """Properties of components whose result does not depend on the order of the particles."""
 
     compared: ClassVar[tuple[str, ...]] = ("in another order", "if there are copies")  #: keys of the selections
 
@@ -30,7 +30,7 @@ class RowsContract(Contract):
         return np.asarray(result)
 
     def of_rows(self, relation: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """The entries `rows` of a result for nine particles: one answer (), numbers (9,) or pairs (9, 9)."""
+        """The part of a result that belongs to `rows` of the nine particles. Results are (), (9,) or pairs (9, 9)."""
         return relation[np.ix_(*[rows] * relation.ndim)]
 
     def test_order_of_particles_is_irrelevant(self) -> None:

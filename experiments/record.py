@@ -1,0 +1,179 @@
+"""Which version of the program made the results of each study, and all studies again by one command.
+
+    python experiments/record.py                    # lists the studies: state, commit, date, core hours
+    python experiments/record.py --run              # runs every study that is older than the program; resumable
+    python experiments/record.py --run real main    # runs some studies, if they are older than the program
+    python experiments/record.py --check            # exit status 1 if the front page cites an older study
+    python experiments/record.py --table            # the table of experiments/README.md
+
+`studies.toml` lists the commands of each study, and the files on which its results depend. A study is *current* if
+its results were made with the present state of these files and of its folder. The hash of the state ignores comments,
+docstrings, the format of the code, and the packages that change no result.
+
+After a run, `record.json` in the folder of the study has the hash of the program, the commit, the commands, the
+machine, the libraries, the date and the processor time. A record without the hash is older than the program.
+
+An interrupted study continues with the next call. If the program has changed in between, the study starts again. The
+former results, which git keeps, and the intermediate files are deleted first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import hashlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from mstfilter.processes import machine
+from mstfilter.runs import library_versions, write_json
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PROGRAM = ("mstfilter", "models")
+NO_RESULTS = tuple(f"mstfilter/{name}/" for name in ("cli", "report", "live", "testing", "smc/testing"))
+
+
+@dataclass(frozen=True)
+class Study:
+    """A folder of `experiments` with results, its commands, and the files on which the results depend."""
+
+    name: str
+    commands: list[str]
+    depends: tuple[str, ...] = PROGRAM
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the study."""
+        return REPOSITORY / "experiments" / self.name
+
+    def record(self) -> dict[str, Any]:
+        """The content of record.json; empty if the study has not been recorded."""
+        return _read(self.folder / "record.json")
+
+    def program(self) -> str:
+        """A hash of the files on which the results depend."""
+        digest = hashlib.sha256()
+        for name in sorted({name for place in (*self.depends, f"experiments/{self.name}") for name in _files(place)}):
+            digest.update(name.encode() + b"\0" + _content(REPOSITORY / name))
+        return digest.hexdigest()[:16]
+
+    def is_current(self) -> bool:
+        """Whether the present program made the results."""
+        return self.record().get("program") == self.program()
+
+    def run(self) -> None:
+        """Run the commands that have not run with the present program, and write record.json."""
+        state = self.folder / "started.json"
+        done = _read(state)
+        if done.get("program") != self.program():
+            self._clear()
+            done = {"program": self.program(), "commands": [], "core_hours": 0.0}
+        for command in self.commands[len(done["commands"]) :]:
+            print(f"{self.name}: {command}", flush=True)
+            before = os.times()
+            code = subprocess.call(command, shell=True, cwd=REPOSITORY)
+            used = [getattr(os.times(), f) - getattr(before, f) for f in ("children_user", "children_system")]
+            done["core_hours"] = round(done["core_hours"] + sum(used) / 3600, 2)
+            done["commands"] += [command] * (code == 0)
+            write_json(state, done)
+            if code:
+                sys.exit(f"error: a command of the study {self.name} ended with exit status {code}: {command}")
+        if self.program() != done["program"]:
+            sys.exit(f"error: the program changed while the study {self.name} ran\nhint: run the study again")
+        commit = subprocess.check_output(["git", "rev-parse", "--short=8", "HEAD"], cwd=REPOSITORY, text=True).strip()
+        about = {"commit": commit, "date": date.today().isoformat(), "machine": machine()}
+        write_json(self.folder / "record.json", {**done, **about, "libraries": library_versions()})
+        state.unlink()
+
+    def _clear(self) -> None:
+        """Delete the results of the study and its intermediate files."""
+        shutil.rmtree(self.folder / "results", ignore_errors=True)
+        for path in (*self.folder.glob("*.csv"), self.folder / "started.json"):
+            path.unlink(missing_ok=True)
+        for folder in re.findall(r"--out (studies/\S+)", " ".join(self.commands)):
+            shutil.rmtree(REPOSITORY / folder, ignore_errors=True)
+
+
+def studies() -> dict[str, Study]:
+    """All studies of studies.toml, by name."""
+    with (REPOSITORY / "experiments/studies.toml").open("rb") as file:
+        found = tomllib.load(file)
+    return {name: Study(name, one["commands"], tuple(one.get("depends", PROGRAM))) for name, one in found.items()}
+
+
+def cited(text: str) -> set[str]:
+    """The studies to which a text links."""
+    return set(re.findall(r"experiments/(\w+)/README", text)) & studies().keys()
+
+
+def table() -> str:
+    """The table of experiments/README.md: version and cost of each study with results."""
+    lines = ["| study | commit | date | core hours |", "|---|---|---|---|"]
+    for name, study in studies().items():
+        if record := study.record():
+            columns = (str(record.get(column, "")) for column in ("commit", "date", "core_hours"))
+            lines.append(f"| [{name}]({name}/README.md) | {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def _files(place: str) -> Iterator[str]:
+    """The files of a place that change results."""
+    path = REPOSITORY / place
+    for file in path.rglob("*") if path.is_dir() else [path]:
+        name = file.relative_to(REPOSITORY).as_posix()
+        is_code = file.suffix in (".py", ".toml", ".safetensors") or file.name == "weights.json"
+        if is_code and not name.startswith(NO_RESULTS):
+            yield name
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a file; of Python code, the syntax tree without docstrings."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree).encode()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", nargs="*", metavar="STUDY", help="run these studies, or all, if they are older")
+    parser.add_argument("--check", action="store_true", help="fail if the front page cites an older study")
+    parser.add_argument("--table", action="store_true", help="print the table of experiments/README.md")
+    options = parser.parse_args()
+    if options.table:
+        sys.exit(print(table()))
+    found = studies()
+    if options.run is not None:
+        for name in options.run or found:
+            if not found[name].is_current():
+                found[name].run()
+    if options.check:
+        page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+        older = sorted(name for name in cited(page) if not found[name].is_current())
+        sys.exit(older and f"error: README.md cites studies that are older than the program: {', '.join(older)}")
+    for name, study in found.items():
+        record = study.record()
+        state = "current" if study.is_current() else "older" if record else "not measured"
+        print(f"{name:18} {state:13}", *(str(record.get(column, "")) for column in ("commit", "date", "core_hours")))
+
+
+if __name__ == "__main__":
+    main()

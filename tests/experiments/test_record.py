@@ -1,0 +1,106 @@
+"""The record of the studies: each result names the version of the program that made it."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+
+import pytest
+
+from tests.experiments.scripts import EXPERIMENTS, import_script
+
+record = import_script("record.py")
+STUDIES = record.studies()
+REPOSITORY = EXPERIMENTS.parent
+
+
+def test_every_folder_with_results_has_a_record():
+    with_results = {path.relative_to(EXPERIMENTS).parts[0] for path in EXPERIMENTS.glob("*/**/*.csv")}
+    recorded = {name for name, study in STUDIES.items() if study.record()}
+    assert with_results <= recorded <= STUDIES.keys()
+    for name in recorded:
+        assert {"commit", "date"} <= STUDIES[name].record().keys(), name
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_commands_name_files_of_the_repository(name):
+    for command in STUDIES[name].commands:
+        files = re.findall(r"experiments/\S+\.(?:py|toml)\b", command)
+        assert all((REPOSITORY / file).is_file() for file in files)
+        assert files or name == "tracking"
+    assert all((REPOSITORY / place).exists() for place in STUDIES[name].depends)
+
+
+def test_the_table_is_up_to_date():
+    assert record.table() in (EXPERIMENTS / "README.md").read_text(encoding="utf-8")
+
+
+def test_figures_of_the_front_page_name_the_version_of_their_study():
+    """Each item of the results that cites a study states the commit of the record of this study."""
+    page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    results = page[page.index("**Results.**") : page.index("## How it works")]
+    for item in re.split(r"\n(?=\d\. )", results)[1:]:
+        for name in record.cited(item):
+            assert f"commit {STUDIES[name].record()['commit']}" in " ".join(item.split()), item
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    """A repository with one study, whose command counts its runs."""
+    monkeypatch.setattr(record, "REPOSITORY", tmp_path)
+    for name, text in {
+        "mstfilter/a.py": '"""A."""\nx = 1\n',
+        "mstfilter/cli/b.py": "y = 1\n",
+        "models/mst.toml": "n = 5\n",
+        "experiments/one/run.py": "print(1)\n",
+        "experiments/one/results/old.csv": "a\n1\n",
+    }.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    for command in ("init -q", "add .", "-c user.name=a -c user.email=a@b.c commit -qm first"):
+        subprocess.run(["git", *command.split()], cwd=tmp_path, check=True)
+    return record.Study("one", ["echo first >> log.txt", "echo second >> log.txt && test ! -e stop.txt"])
+
+
+@pytest.mark.parametrize(
+    "name, text, same",
+    [
+        ("mstfilter/a.py", '"""Another docstring."""\n\n# a comment\nx = 1\n', True),
+        ("mstfilter/a.py", '"""A."""\nx = 2\n', False),
+        ("mstfilter/cli/b.py", "y = 2\n", True),
+        ("models/mst.toml", "n = 6\n", False),
+        ("experiments/one/run.py", "print(2)\n", False),
+        ("experiments/one/record.json", "{}", True),
+    ],
+)
+def test_the_program_of_a_study(study, tmp_path, name, text, same):
+    before = study.program()
+    (tmp_path / name).write_text(text)
+    assert (study.program() == before) is same
+
+
+def test_a_study_is_run_once(study, tmp_path):
+    assert not study.is_current()
+    study.run()
+    assert study.is_current() and not (study.folder / "results/old.csv").exists()
+    found = json.loads((study.folder / "record.json").read_text())
+    assert found["commands"] == study.commands and len(found["commit"]) == 8 and found["machine"]["system"]
+    (tmp_path / "mstfilter/a.py").write_text("x = 2\n")
+    assert not study.is_current()
+
+
+def test_a_stopped_study_resumes_and_starts_again_after_a_change(study, tmp_path):
+    log, stop = tmp_path / "log.txt", tmp_path / "stop.txt"
+    stop.touch()
+    with pytest.raises(SystemExit, match="exit status 1: echo second"):
+        study.run()
+    assert not study.record() and log.read_text().split() == ["first", "second"]
+    with pytest.raises(SystemExit):
+        study.run()  # the first command is not run again
+    assert log.read_text().split() == ["first", "second", "second"]
+    (tmp_path / "mstfilter/a.py").write_text("x = 2\n")
+    stop.unlink()
+    study.run()
+    assert log.read_text().split() == ["first", "second", "second", "first", "second"] and study.is_current()
