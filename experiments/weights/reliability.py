@@ -54,8 +54,8 @@ SHORT = {
 }
 #: Objects with a twin, on others, and hidden. `s3` has more twins than objects here, so it has fewer than in `s3`.
 FAMILIES: dict[str, dict[str, int]] = {"s1": {}, "s2": {}, "s3": {"n_twins": 3, "n_stacked": 2, "n_hidden": 2}}
-TEMPERATURES = (2.0, 1.4, 1.2, 1.0, 0.85, 0.7, 0.5, 0.3)
-N_BINS = {"component": 10, "image": 5, "scene": 5, "first": 5}
+TEMPERATURES = (10.0, 6.0, 4.0, 3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.3)
+PER_BIN = 400  # least number of questions in a bin of a reliability diagram
 FOLDS = 10
 #: Partitions that differ in a smaller share of the pairs of readings are one class. So are hypotheses whose quality
 #: against each other is above 1 - ALIKE.
@@ -284,7 +284,7 @@ def scores(asked: Sequence[Question]) -> dict[str, float]:
         "n": len(asked),
         "forecast": float(table.p @ table.count / table.n),
         "frequency": float(table.yes.sum() / table.n),
-        "calibration_error": table.reliability(bins_of(asked[0].name)).error,
+        "calibration_error": diagram(table).error,
         "log_loss": float(-np.log(softened).mean()),
     }
 
@@ -295,9 +295,9 @@ def forecasts(asked: Sequence[Question]) -> ForecastTable:
     return ForecastTable.of(top, [float(one.right[one.p.argmax()]) for one in asked])
 
 
-def bins_of(name: str) -> int:
-    """Number of bins of a question."""
-    return N_BINS[name.split(",")[0]]
+def diagram(table: ForecastTable) -> Reliability:
+    """The reliability diagram with at least `PER_BIN` forecasts in each bin, if there are so many."""
+    return table.reliability(max(int(table.n) // PER_BIN, 1))
 
 
 def held_out(losses: np.ndarray) -> tuple[float, list[float]]:
@@ -321,7 +321,7 @@ def tables(scenes: Sequence[dict[str, np.ndarray]], out: Path) -> None:
             for fold in range(FOLDS):
                 if of_fold := [one for scene in of[fold::FOLDS] for one in scene]:
                     losses[fold, k] = scores(of_fold)["log_loss"]
-            table = forecasts([one for scene in of for one in scene]).reliability(bins_of(name))
+            table = diagram(forecasts([one for scene in of for one in scene]))
             diagrams[name, t] = table
             columns = zip(table.count, table.forecast, table.frequency, strict=True)
             bins += [
@@ -334,27 +334,33 @@ def tables(scenes: Sequence[dict[str, np.ndarray]], out: Path) -> None:
         )
     write_csv(out / "reliability.csv", rows)
     write_csv(out / "bins.csv", bins)
-    draw({name: diagrams[name, 1.0] for name in names}, out / "reliability.png")
+    draw(diagrams, out / "reliability.png")
 
 
 def _rounded(row: dict[str, float]) -> dict[str, float]:
     return {name: round(float(value), 4) for name, value in row.items()}
 
 
-def draw(diagrams: dict[str, Reliability], path: Path) -> None:
-    """The reliability diagrams at T = 1."""
+def draw(diagrams: dict[tuple[str, float], Reliability], path: Path) -> None:
+    """The reliability diagrams at two temperatures."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     plt.style.use("mstfilter.report.figures")
-    figure, place = plt.subplots(figsize=(4.5, 4.5), layout="constrained")
-    place.plot([0, 1], [0, 1], color=".6", lw=1)
-    for name, found in diagrams.items():
-        place.plot(found.forecast, found.frequency, marker="o", ms=4, label=f"{name}: error {found.error:.3f}")
-    place.set(xlabel="largest probability", ylabel="how often it is right", xlim=(0, 1), ylim=(0, 1), aspect="equal")
-    place.legend(loc="upper left", frameon=False, fontsize=9)
+    figure, places = plt.subplots(1, 2, figsize=(8, 4.1), sharey=True, layout="constrained")
+    for place, temperature in zip(places, (1.0, 4.0), strict=True):
+        place.plot([0, 1], [0, 1], color=".6", lw=1)
+        for name in ("component, merged", "image, merged", "scene, merged", "first"):
+            if found := diagrams.get((name, temperature)):
+                label = f"{name.removesuffix(', merged')}: error {found.error:.3f}"
+                place.plot(found.forecast, found.frequency, marker="o", ms=4, label=label)
+        place.set(
+            title=f"T = {temperature:g}", xlabel="largest probability", xlim=(0, 1), ylim=(0, 1), aspect="equal"
+        )
+        place.legend(loc="upper left", frameon=False, fontsize=9)
+    places[0].set_ylabel("how often it is right")
     figure.savefig(path, dpi=110, metadata={"Software": None})
     plt.close(figure)
 
