@@ -128,7 +128,7 @@ def forecast(seed: int) -> dict[str, object]:
             partitions, weights = cells.samples, samples.weights
         state, _ = filter.step(state, clip)
         if t:
-            cells, _, _, choices = kept[-1]
+            cells, choices = kept[-1].cells, kept[-1].choices
             partitions, weights = choices.partitions, np.exp(choices.log_weights)
         counts = cells.counts(cells.readings.of_image(sides))
         counts = np.pad(counts, ((0, 0), (0, 3 - counts.shape[1])))

@@ -62,7 +62,14 @@ FOLDS = 10
 ALIKE = 0.02
 
 
-Kept = tuple[Cells, np.ndarray, list[np.ndarray], Choices]  # log weights of the predictions, log odds given each
+class Kept(NamedTuple):
+    """What the update chooses from at a pause."""
+
+    cells: Cells
+    log_weights: np.ndarray  #: (n,) log weights of the predictions, normalised
+    p_valid: np.ndarray  #: (n,) probability that each prediction is valid
+    log_odds: list[np.ndarray]  #: log odds (e,) of pairs of cells, given each prediction
+    choices: Choices
 
 
 @dataclass(frozen=True)
@@ -75,8 +82,9 @@ class Recorder(PartitionUpdate):
         self, cells: Cells, predictions: Sequence[Prediction], log_weights: np.ndarray, clip: Clip
     ) -> Choices:
         choices = super()._choices(cells, predictions, log_weights, clip)
-        log_odds = [self.pairs.log_odds(cells, row, clip) for row in np.diag([one.p_valid for one in predictions])]
-        self.kept.append((cells, log_weights - logsumexp(log_weights), log_odds, choices))
+        p_valid = np.array([one.p_valid for one in predictions])
+        log_odds = [self.pairs.log_odds(cells, row, clip) for row in np.diag(p_valid)]
+        self.kept.append(Kept(cells, log_weights - logsumexp(log_weights), p_valid, log_odds, choices))
         return choices
 
 
@@ -126,7 +134,7 @@ def of_pause(kept: Kept, instance: np.ndarray) -> dict[str, np.ndarray]:
     ``prediction`` (n,): log weights. ``candidates`` (m, 2): prediction, log weight without the partition.
     ``chosen`` (m, C): alternative of each component.
     """
-    cells, log_weights, log_odds, choices = kept
+    cells, log_weights, _, log_odds, choices = kept
     counts = cells.counts(cells.readings.of_image(instance).astype(np.int64))
     components, rows = cells.alternatives(), []
     chosen = np.zeros((len(choices), len(components)), np.int64)
