@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from reliability import FAMILIES, SHORT, Question, classes, diagram, disagreements, forecasts, recorded
+from reliability import FAMILIES, SHORT, Question, classes, disagreements, forecasts, recorded
 
 import mstfilter
 from mstfilter.files import write_csv
@@ -32,7 +32,7 @@ ODDS = {
     "D": PairEvidence(0, 1, -0.5, 0.7, 0.62, 0),
     "E": PairEvidence(0, 1, -0.5, 1, 0.62, 0),
 }
-N_CHOSEN = 8
+N_CHOSEN, N_BINS = 8, 4
 
 
 def of_recording(family: str, seed: int, n_actions: int) -> dict[str, np.ndarray]:
@@ -81,7 +81,7 @@ def questions(p: np.ndarray, odds: int) -> list[tuple[Question, float]]:
 def table(scenes: list[np.ndarray]) -> list[dict[str, object]]:
     """A row for each of the odds, for the recordings of the choice and for the others."""
     rows = []
-    for part, chosen in (("choice", scenes[:N_CHOSEN]), ("others", scenes[N_CHOSEN:])):
+    for part, chosen in (("choice", scenes[:N_CHOSEN]), ("others", scenes[N_CHOSEN:]), ("all", scenes)):
         for k, name in enumerate(ODDS):
             pairs = [pair for p in chosen for pair in questions(p, k)]
             if pairs:
@@ -92,7 +92,7 @@ def table(scenes: list[np.ndarray]) -> list[dict[str, object]]:
                 row = {
                     "forecast": found.p @ found.count / found.n,
                     "frequency": found.yes.sum() / found.n,
-                    "calibration_error": diagram(found).error,
+                    "calibration_error": found.reliability(N_BINS).error,
                     "log_loss": -np.log((1 - SOFTENING) * right + SOFTENING * share).mean(),
                     "wrong_pairs": np.mean([excess for _, excess in pairs]),
                 }

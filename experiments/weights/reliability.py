@@ -55,7 +55,7 @@ SHORT = {
 #: Objects with a twin, on others, and hidden. `s3` has more twins than objects here, so it has fewer than in `s3`.
 FAMILIES: dict[str, dict[str, int]] = {"s1": {}, "s2": {}, "s3": {"n_twins": 3, "n_stacked": 2, "n_hidden": 2}}
 TEMPERATURES = (10.0, 6.0, 4.0, 3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.3)
-PER_BIN = 400  # least number of questions in a bin of a reliability diagram
+PER_BIN, MOST_BINS = 80, 5  # with all recordings, the bins of a reliability diagram have more than 400 questions
 FOLDS = 10
 #: Partitions that differ in a smaller share of the pairs of readings are one class. So are hypotheses whose quality
 #: against each other is above 1 - ALIKE.
@@ -304,8 +304,8 @@ def forecasts(asked: Sequence[Question]) -> ForecastTable:
 
 
 def diagram(table: ForecastTable) -> Reliability:
-    """The reliability diagram with at least `PER_BIN` forecasts in each bin, if there are so many."""
-    return table.reliability(max(int(table.n) // PER_BIN, 1))
+    """The reliability diagram on up to five bins. With one bin, the error is only the difference of the means."""
+    return table.reliability(min(max(int(table.n) // PER_BIN, 1), MOST_BINS))
 
 
 def held_out(losses: np.ndarray) -> tuple[float, list[float]]:
