@@ -141,7 +141,7 @@ def summary(rows: list[dict[str, float]], n_bins: int = 5) -> list[dict[str, obj
     table = []
     for pause in ("first", "second"):
         p, one = (np.array([row[name] for row in rows], float) for name in (pause, "one"))
-        prints = np.array([row["prints"] for row in rows])
+        prints = np.array([row["prints"] for row in rows], float)
         for name, chosen in (("all", prints > 0), ("print of one", prints == 1), ("print of two", prints == 2)):
             if chosen.any():
                 table.append((pause, name, chosen.sum(), p[chosen].mean(), one[chosen].mean()))
