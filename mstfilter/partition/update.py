@@ -121,8 +121,7 @@ class PartitionUpdate(Update):
         The log odds that two cells belong to one object.
     temperature : float
         T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
-        cells. A higher T makes the probabilities more even. They are best calibrated at T = 4 to 6
-        (`experiments/weights`), but no T is shown to be better than 1 for quality and log loss.
+        cells. A higher T makes the probabilities more even (`experiments/weights` compares several T).
     occupied_log_odds : float
         Added to the log odds of every uncertain voxel. The completion network is calibrated only for its training
         scenes, so the default was fitted in `experiments/partition_fit`.
