@@ -121,7 +121,7 @@ class PartitionUpdate(Update):
         The log odds that two cells belong to one object.
     temperature : float
         T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
-        cells. A higher T makes the probabilities more even.
+        cells. A higher T makes the probabilities more even (`experiments/weights` compares several T).
     evidence : tuple of Evidence
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.

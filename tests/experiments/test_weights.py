@@ -1,0 +1,89 @@
+"""The studies of experiments/weights: their definitions by hand and by enumeration."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from mstfilter.files import read_csv
+from tests.experiments.scripts import EXPERIMENTS, import_script, own_modules, run_script
+
+reliability = import_script("weights/reliability.py")
+with own_modules(EXPERIMENTS / "weights"):
+    ambiguity = import_script("weights/ambiguity.py")
+
+
+def test_disagreement_counts_pairs_of_readings():
+    """Readings are listed one by one; readings of no object (0) belong to no object together."""
+    rng = np.random.default_rng(0)
+    counts = rng.integers(0, 4, (4, 3))
+    truth = [(cell, label) for cell in range(4) for label in range(3) for _ in range(counts[cell, label])]
+    partitions = np.array([[1, 1, 1, 1], [1, 2, 1, 3], [1, 2, 3, 4]])
+    expected = [
+        sum((row[a] == row[b]) != (x == y > 0) for (a, x), (b, y) in combinations(truth, 2)) for row in partitions
+    ]
+    found = reliability.disagreements(partitions, counts)
+    # Pairs of a reading with itself are in every partition alike.
+    np.testing.assert_allclose(found - found[0], np.array(expected) - expected[0])
+
+
+def test_partitions_that_differ_in_few_pairs_are_one_class():
+    partitions = np.array([[1, 1, 2, 2], [1, 1, 1, 2], [1, 2, 3, 3]])  # the second one moves a small cell
+    assert reliability.classes(partitions, np.array([400, 500, 1, 300])).tolist() == [0, 0, 1]
+    assert len(set(reliability.classes(partitions, np.array([40, 50, 20, 30])))) == 3
+
+
+def test_the_most_probable_image_has_the_most_probable_components():
+    """Of two independent components, at T = 1 and at T = 1/2, with probabilities by hand."""
+    p = np.array([[0, 0, 0, 0.8, 5, 0], [0, 0, 1, 0.2, 7, 1], [0, 1, 0, 0.4, 3, 0], [0, 1, 1, 0.6, 1, 0]])
+    kept = {
+        "p": p,
+        "prediction": np.zeros(1),
+        "candidates": np.array([[0, 0.0], [0, 0.0]]),
+        "chosen": np.array([[0, 1], [1, 1]]),
+        "selected": np.array([[0, 0.5], [1, 0.7]]),
+        "mutual": np.array([[1.0, 0.6], [0.7, 1.0]]),
+    }
+    for temperature, first, second in ((1.0, 0.8, 0.6), (0.5, 16 / 17, 9 / 13)):
+        found = {one.name: one for one in reliability._of_pause(kept, temperature)}
+        assert found["component"].p.max() == pytest.approx(second)  # the last one
+        assert found["image"].p.max() == pytest.approx(first * second)
+        assert found["image"].right[found["image"].p.argmax()]
+        assert found["component, merged"].p.max() == pytest.approx(first)  # the second component has one class
+        assert found["image, merged"].p.max() == pytest.approx(first)
+        assert found["scene"].p.max() == pytest.approx(first)  # the second component is the same in both
+        assert not found["scene"].right[found["scene"].p.argmax()]
+
+
+def test_print_of_two_boxes_on_one():
+    rng = np.random.default_rng(1)
+    whole = ambiguity.carton(np.array([0.03, 0.08, 0.05]))
+    skin = ambiguity.draw_skin(rng, whole, ambiguity.TUNING)
+    again = ambiguity.joined(*ambiguity.halves(skin))
+    for one, other in zip(again.charts, skin.charts, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("seed", [0, 6])  # one box; two boxes
+def test_sides_of_an_ambiguous_scene(seed):
+    clips, sides, row = ambiguity.scene(seed)
+    n = np.bincount(sides.ravel(), minlength=3)
+    assert set(np.unique(sides)) == {0, 1, 2} and 0.2 < n[1] / n[1:].sum() < 0.8
+    assert clips[1].after is not clips[0].after and row["one"] == (seed == 0)
+
+
+def test_small_forms(tmp_path):
+    run_script("weights/reliability.py", "--smoke", "--out", tmp_path)
+    rows = read_csv(tmp_path / "reliability.csv")
+    at_1 = {row["question"]: row for row in rows if row["temperature"] == "1.0"}
+    assert {"component", "image", "scene"} <= set(at_1)
+    assert all(0 <= float(row["frequency"]) <= 1 and float(row["log_loss"]) >= 0 for row in at_1.values())
+    run_script("weights/pairs.py", "--smoke", "--out", tmp_path)
+    terms = np.load(tmp_path / "terms/s1-0.npz")["p"]
+    for k in np.unique(terms[:, 0]):  # the probabilities of a component, for each of the odds
+        np.testing.assert_allclose(terms[terms[:, 0] == k, 4:].sum(axis=0), 1, rtol=1e-6)
+    run_script("weights/ambiguity.py", "--smoke", "--out", tmp_path)
+    assert len(read_csv(tmp_path / "scenes.csv")) == 4
+    assert read_csv(tmp_path / "ambiguity.csv")[0]["scenes"] == "all"
