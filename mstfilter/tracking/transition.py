@@ -5,7 +5,8 @@
 {'static': 52, 'icp': 9, ...}
 
 Optical flow tracks the visible part of each object, a rule chooses a rigid motion, and a `Warp` moves the voxels.
-Flow and features are computed once per clip. A segment that several hypotheses share is tracked once.
+Flow and features are computed once per clip. Segments of several hypotheses with nearly the same pixels are tracked
+once.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from mstfilter.tracking.segments import MaskTracker, Segment, StaticTest, Track,
 
 _SMOOTHING = 0.5  # voxels, standard deviation; .3 to .6 differ little
 _LEAST_PROBABILITY = 0.02  # of a voxel that is more probably free
+_SIMILAR = 0.9  # least share of common pixels of segments with the same motion, of the larger segment
 
 
 @dataclass(frozen=True)
@@ -365,7 +367,26 @@ class TrackingTransition(Transition):
             candidates = self.rule.candidates(child(rng, "segment", _number(track.segment.key)), track)
             return ("tracked" if track.target_mask.any() else "lost"), candidates
 
-        return found | {track.segment.key: one for track, one in zip(moving, each(follow, moving), strict=True)}
+        # The most frequent of several similar segments is tracked.
+        n_hypotheses = Counter(one.key for of_hypothesis in segments for one in of_hypothesis.values())
+        moving.sort(key=lambda track: (-n_hypotheses[track.segment.key], track.segment.key))
+        tracked_as = _tracked_as([track.segment.support for track in moving])
+        chosen = sorted(set(tracked_as))
+        followed = dict(zip(chosen, each(follow, [moving[k] for k in chosen]), strict=True))
+        return found | {track.segment.key: followed[k] for track, k in zip(moving, tracked_as, strict=True)}
+
+
+def _tracked_as(supports: Sequence[np.ndarray]) -> list[int]:
+    """For each segment, the index of the first similar segment, by their pixels (S,)."""
+    found: list[int] = []
+    for k, own in enumerate(supports):
+        similar = (
+            n
+            for n in dict.fromkeys(found)
+            if len(np.intersect1d(own, supports[n], assume_unique=True)) >= _SIMILAR * max(len(own), len(supports[n]))
+        )
+        found.append(next(similar, k))
+    return found
 
 
 def _number(key: bytes) -> int:
