@@ -71,7 +71,7 @@ def _equal(a: Any, b: Any) -> bool:
 def late(location: str, summary: str) -> Callable[..., Any]:
     """A method that calls the function `location` (``module:function``) and imports the module at the first call.
 
-    Methods that draw and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend
+    Methods that plot and methods that find pauses use `late`. So `mstfilter.scene` and `mstfilter.smc` do not depend
     on `mstfilter.report` and `mstfilter.formats`.
     """
     module, _, name = location.partition(":")

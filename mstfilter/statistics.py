@@ -159,7 +159,8 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) ->
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
     """Ratios (mean of a resample - mean) / (standard deviation of the resample) of all resamples.
 
-    The ratio of a resample of equal values is infinite. Quantiles interpolate, so infinite ratios are set to +-1e200.
+    If all values of a resample are equal, its ratio is infinite. Such ratios are set to +-1e200, because quantiles
+    interpolate.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]

@@ -1,11 +1,11 @@
-"""Time of many runs in one sweep, relative to single runs and to a plain numpy program over (run, particle).
+"""Time of a batch of runs, relative to single runs and to a numpy program with arrays of shape (run, particle).
 
     python experiments/benchmarks/batch.py [--rounds 15] [--runs 200] [--particles 100] [--steps 100]
 
 All programs filter one AR(1) series, with systematic resampling if the effective sample size is below half of the
-particles. They run in turns; the figures are medians of ratios within a round. Further lines give the processor time
-of a batch relative to single runs for four resampling schemes and 200 seeds of a model of `StateSpaceModel.of` and of
-a program, and of PMMH in one sweep relative to single chains.
+particles. The programs run alternately; the figures are medians of ratios within a round. Further lines give the
+processor time of a batch of 200 seeds relative to single runs, for four resampling schemes, for a model made by
+`StateSpaceModel.of` and for a program. The last lines give the time of PMMH in a batch relative to single chains.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MODEL = StateSpaceModel(
 
 
 def plain(ys: np.ndarray, n_runs: int, n: int) -> np.ndarray:
-    """Log evidence of every run: one generator for all, no components."""
+    """Log evidence of every run, with one generator for all runs and without components."""
     rng = np.random.default_rng(0)
     x = rng.standard_normal((n_runs, n))
     lw = np.zeros((n_runs, n))
@@ -72,7 +72,7 @@ def walk(previous, y):
 
 
 def with_coefficient(theta, n=50):
-    """The AR(1) filter with another coefficient."""
+    """The AR(1) filter with the coefficient `theta`."""
     (rho,) = theta
     return bootstrap(
         StateSpaceModel(
@@ -92,7 +92,7 @@ def seconds_of(program) -> float:
 
 
 def ratios(ys: np.ndarray, n_runs: int, n: int) -> None:
-    """Print the time of batches and of PMMH in one sweep relative to single runs, in turns."""
+    """Print the time of batches and of PMMH in a batch, relative to single runs that run alternately with them."""
     schemes = (Systematic(), Stratified(), Multinomial(), Ssp())
     families = {
         "StateSpaceModel.of, 4 arms": [bootstrap(OF, n, scheme) for scheme in schemes],

@@ -16,7 +16,7 @@ def systematic(rng: np.random.Generator, w: np.ndarray) -> np.ndarray:
 
 
 def bootstrap_loop(rng: np.random.Generator, ys: list[float], n: int, rho: float, sigma: float, tau: float) -> float:
-    """The log evidence."""
+    """Log evidence of the observations `ys`."""
     x = rng.standard_normal(n) * (sigma / math.sqrt(1 - rho**2))
     lw, constant = np.zeros(n), math.log(tau) + 0.5 * math.log(2 * math.pi)
     for t, y in enumerate(ys):

@@ -1,8 +1,8 @@
 """Measure `particles` 0.4 in a separate environment; run by speed.py, one command per line on standard input.
 
 Commands: ``filter SEED N`` (bootstrap AR(1)), ``backward:METHOD SEED N`` (N paths of a filter of N particles by the
-method ``backward_sampling_METHOD``), and ``SCHEME SEED N`` or ``log:SCHEME SEED N`` (resampling N even weights, given
-normalised or as log weights); the answer is JSON. The first calls include compilation.
+method ``backward_sampling_METHOD``), ``SCHEME SEED N`` (resampling N even normalised weights), and
+``log:SCHEME SEED N`` (the same from log weights). The answer is one line of JSON. First calls include compilation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compare backward sampling with that of `particles` 0.4, interleaved; writes smoothing.csv.
+"""Compare backward sampling of this package and of `particles` 0.4, interleaved; writes smoothing.csv.
 
 README.md has the command.
 """
@@ -27,7 +27,7 @@ METHODS = {
 
 
 def smoothed(ys: list[float]) -> np.ndarray:
-    """(T,) exact smoothed means."""
+    """Exact smoothed means (T,)."""
     return kalman_filter([[RHO]], [[SIGMA**2]], [[1.0]], [[TAU**2]], [0.0], [[SD0**2]], ys).smoothed_means[:, 0]
 
 

@@ -77,7 +77,7 @@ class Box:
 
 
 class Boxes(Proposal):
-    """Proposes new objects without state."""
+    """Proposes new particles that are Python objects."""
 
     def sample(self, rng, observation, n):
         return Population(tuple(Box() for _ in range(n)))
@@ -182,13 +182,13 @@ def main() -> None:
     median = {name: float(np.median([r[name] for r in rows])) for name in rows[0]}
 
     def ratio(a: str, b: str) -> str:
-        """Median over the rounds of the ratio within a round."""
+        """Median over the rounds of the ratio a / b in one round."""
         if a not in rows[0] or b not in rows[0]:
             return "not measured"
         return f"{np.median([r[a] / r[b] for r in rows]):.2f}"
 
     def of_minima(a: str, b: str) -> str:
-        """Ratio of the shortest times, which other programs on the machine disturb least."""
+        """Ratio of the shortest times of a and b, which other programs on the machine disturb least."""
         if a not in rows[0] or b not in rows[0]:
             return "not measured"
         return f"{min(r[a] for r in rows) / min(r[b] for r in rows):.2f}"

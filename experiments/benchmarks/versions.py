@@ -4,13 +4,13 @@
     python experiments/benchmarks/versions.py OTHER_CHECKOUT --only smc --rounds 60
 
 In every round both checkouts run the same tasks in random order, each in a process that stays alive for all rounds.
-Times are processor time. A ratio is the median over the rounds of (this checkout / other checkout) within a round;
+Times are processor time. A ratio is the median over the rounds of (this checkout / other checkout) within a round.
 `ratio_of_shortest` is the ratio of the shortest times, which other programs on the machine disturb least.
 
-The names of tasks start with their area. `smc`: single filters (a random walk, a model of `StateSpaceModel.of`, a
-hidden Markov model, programs), batches of 200 seeds, the first 200 steps of a program that is new to the package,
-and resampling of a million weights. `mst`: all steps of the preset ``mst`` on the scene ``demo`` and on the full-size
-scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
+The names of tasks start with their area. Tasks of `smc` are single filters (a random walk, a model of
+`StateSpaceModel.of`, a hidden Markov model, programs), batches of 200 seeds, and resampling of a million weights.
+Another task is the first 200 steps of a program that is run for the first time. Tasks of `mst` are all steps of the
+preset ``mst`` on the scene ``demo`` and on the full-size scene ``table`` (640 x 480 images, 100 x 100 x 50 voxels).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def volatility(previous, y):
 
 
 def renewed(program: Any) -> Any:
-    """The same function with another code object, which the package has not met before."""
+    """The same function with a new code object, so that the package checks the program again."""
     return FunctionType(program.__code__.replace(), program.__globals__)
 
 
@@ -100,7 +100,7 @@ OF = smc.StateSpaceModel.of(smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 
 
 
 def smc_tasks() -> dict[str, Callable[[], Any]]:
-    """Filters of arrays of numbers, and resampling."""
+    """The tasks `smc: ...` by name: filters with particles in arrays, and resampling."""
     walk, ys = np.random.default_rng(0).normal(size=1000).cumsum(), np.random.default_rng(1).normal(size=200).tolist()
     vectors = [np.array([y]) for y in ys]
     log_weights, rng = np.log(np.random.default_rng(1).random(1_000_000)), np.random.default_rng(2)
@@ -141,7 +141,7 @@ def smc_tasks() -> dict[str, Callable[[], Any]]:
 
 
 def tasks(recordings: Path) -> dict[str, Callable[[], Any]]:
-    """What is timed, by name."""
+    """All timed tasks by name."""
 
     def mst(scene: str) -> Callable[[], Any]:
         def steps() -> None:
@@ -158,7 +158,7 @@ def tasks(recordings: Path) -> dict[str, Callable[[], Any]]:
 
 
 def clear_cache() -> None:
-    """Drop shared work, so that every round does all of it."""
+    """Clear the cache of intermediate results, so that every round computes all of them."""
     from mstfilter import scene
 
     if hasattr(scene, "scene_cache"):

@@ -2,8 +2,8 @@
 
     python experiments/comparison/run.py
 
-Differences of n units between arms and a reference have mean zero, so every claim is an error. A claim needs both
-intervals to exclude 0 and a p value below .05 after Holm. See README.md.
+The simulated differences of n units between arms and a reference have mean zero, so every claim of a difference is an
+error. For a claim, both intervals must exclude 0 and the p value must be below .05 after Holm. See README.md.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ POWER = (2.5, 3.5)  # true mean over its standard error
 
 
 def squared_errors(rng: np.random.Generator, n: int, shape: tuple[int, int]) -> np.ndarray:
-    """Squared normal errors minus those of a reference of the same mean and less spread, shared by the arms."""
+    """Squared normal errors of arms minus squared errors of one reference with the same mean and less spread."""
     reference = (rng.normal(size=(n, shape[0], 4)) ** 2).mean(axis=-1)
     return rng.normal(size=(n, *shape)) ** 2 - reference[..., None]
 
@@ -45,9 +45,9 @@ CASES: dict[str, Draw] = {
 
 
 def p_values(x: np.ndarray) -> dict[str, np.ndarray]:
-    """p values of the columns of (n, k) differences, by test: as in `compare`, by matrix products.
+    """p values of each column of differences (n, k), by test. The values are those of `compare`, computed faster.
 
-    The limits of both intervals are those of the tests `t` and `bootstrap`, so p values below .05 exclude 0.
+    Each interval inverts a test, `t` or `bootstrap`: it excludes 0 if the p value of its test is below .05.
     """
     n = len(x)
     mean, sd = x.mean(axis=0), x.std(axis=0, ddof=1)
@@ -80,7 +80,7 @@ def _by_bootstrap(x: np.ndarray) -> np.ndarray:
 
 
 def claims(x: np.ndarray, arms: int) -> dict[str, float]:
-    """Share of the tables (n, table, arm) with a claim, by t tests, sign flips, and the rule of `conclusion`."""
+    """Share of the tables in x (n, table, arm) with a claim: by t tests, sign flips, and the rule of `conclusion`."""
     parts = [p_values(x[:, k : k + CHUNK].reshape(len(x), -1)) for k in range(0, x.shape[1], CHUNK)]
     p = {name: np.concatenate([part[name] for part in parts]).reshape(-1, x.shape[2]) for name in parts[0]}
     both = np.maximum(p["t"], p["bootstrap"])  # both intervals exclude 0

@@ -1,10 +1,10 @@
-"""Completion of single masks: all completers on the test samples of a training.
+"""Completion of single masks: all completers on the test samples that a training of a network set aside.
 
     python experiments/completion/compare.py TRAINED_FOLDER [--out experiments/completion/results]
 
-The samples show objects that no network was trained on, of two kinds of shapes that no network was trained on, among
-others. completion.csv has the mean IoU after the veto of free space by completer and group of samples, with a 95 %
-interval over scenes for all samples; volume is the median of volume over true volume.
+No network was trained on the objects of these samples, and two of their kinds of shapes are not in the training data.
+The table has the mean IoU by completer and group of samples, after voxels in free space are removed. For all
+samples together, the IoU has a 95 % interval over scenes. `volume` is the median ratio of estimated to true volume.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CompletionSamples = training_program("completion_data").CompletionSamples
 
 
 def complete(completer: Completer, samples: CompletionSamples) -> np.ndarray:
-    """Filled voxels (n, 32, 32, 32) bool, after the veto."""
+    """Filled voxels (n, 32, 32, 32) bool, without voxels in free space."""
     filled = np.zeros(samples.truth.shape, bool)
     rngs = [np.random.default_rng([0, k]) for k in range(len(samples))]
     for start in range(0, len(samples), 64):

@@ -1,4 +1,4 @@
-"""Completion by a Bayesian Hilbert map, to compare with.
+"""Completion by a Bayesian Hilbert map, as a baseline.
 
 mstfilter run RECORDING update.completer=./experiments/completion/hilbert_map.py:HilbertMap
 """
@@ -19,11 +19,11 @@ from mstfilter.completion import Completer, ObservedBox
 class HilbertMap(Completer):
     """Occupancy as Bayesian logistic regression on radial features, after V-PRISM.
 
-    The visible surface is occupied; voxels observed as free, other surfaces and the space below the table are not.
-    The posterior of the weights is normal about its mode (Laplace), and the probability of a voxel averages over it.
-    (H. Wright, W. Zhi, M. Johnson-Roberson, T. Hermans, "V-PRISM: probabilistic mapping of unknown tabletop scenes",
-    2024; there one softmax for all objects of a scene, here one map for each mask, because completions of a frame do
-    not depend on one another.)
+    The training data are occupied voxels (the visible surface) and empty voxels (observed as free, on other surfaces,
+    or below the table). The posterior of the weights is normal about its mode (Laplace), and the probability of a
+    voxel averages over it. (H. Wright, W. Zhi, M. Johnson-Roberson, T. Hermans, "V-PRISM: probabilistic mapping of
+    unknown tabletop scenes", 2024. V-PRISM has one softmax for all objects of a scene. This class has one map for
+    each mask, because completions of a frame do not depend on one another.)
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class HilbertMap(Completer):
 
 
 def _laplace(features: np.ndarray, outcome: np.ndarray, prior: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mode (d,) of the weights of a logistic regression with a normal prior, and the covariance (d, d) there."""
+    """Mode (d,) of the weights of a logistic regression with a normal prior, and the covariance (d, d) at it."""
     d = features.shape[1]
     weights, precision = np.zeros(d), np.eye(d) / prior**2
     for _ in range(8):

@@ -1,19 +1,20 @@
-"""Does the gain of the filter come from the past?  Both endpoints on 30 scenes.
+"""Does the gain of the filter come from the past? Quality and log loss on 30 scenes.
 
     python experiments/controls/past.py [--workers 2] [--smoke --out FOLDER]
 
-Arms: samples of the latest image (`samples`), `mst`, and `mst` with
+The arms are samples of the latest image (`samples`), `mst`, and four changes of `mst`:
 
 - again: the image of pause t alone, processed t + 1 times: as many samples, no past;
 - stranger: the hypotheses of another scene as the past of the step;
 - shuffled: the inner frames of each clip in random order;
 - frozen: a past that is never moved.
 
-Scores, means over the pauses t >= 1: mean objects quality, and information: the log loss of "do these two voxels
-belong to one object?" in nats, after recalibration on the other scenes of the family. Mean quality rewards a filter
-that becomes sure by seeing one image several times; information does not.
+There are two scores, averaged over the pauses t >= 1. Quality is the mean `objects` quality of the hypotheses.
+Information is the log loss of forecasts of "these two voxels belong to one object" in nats, after recalibration on
+the other scenes of the family. Mean quality rewards a filter that becomes certain by processing one image several
+times; information does not.
 
-Writes past.csv: per score and arm the mean, and paired differences from `samples` and of `mst` with 95 % t intervals.
+Writes past.csv: the mean of each score and arm, the arm minus `samples`, and `mst` minus the arm, with t intervals.
 Finished scenes are not run again.
 """
 
@@ -44,7 +45,7 @@ ARMS = ("samples", "mst", "again", "stranger", "shuffled", "frozen")
 
 
 def again(filter: ParticleFilter, clip: Clip) -> State:
-    """A filter that processed only the last image of a clip, once per pause."""
+    """State after processing only the last image of a clip, once for each pause so far."""
     state = filter.start(0)
     for k in range(clip.index + 1):
         frames = (clip.after,) * (1 if k == 0 else 2)
@@ -53,7 +54,7 @@ def again(filter: ParticleFilter, clip: Clip) -> State:
 
 
 def scores(scene: tuple[str, int], other: tuple[str, int], small: bool) -> dict[str, np.ndarray]:
-    """Quality (arm, pause t >= 1), and counts of forecasts (arm, pause, rate of noise, forecast, answer)."""
+    """Quality (arm, pause t >= 1), and numbers of forecasts (arm, pause, rate of noise, forecast, answer)."""
     change = SMALL if small else {}
     recording, elsewhere = (open_recording(cached_recording(f, s, **change)) for f, s in (scene, other))
     mst, frozen = mstfilter.preset("mst", RULE), mstfilter.preset("mst", *FILTERS["frozen"])

@@ -1,16 +1,16 @@
-"""What of its clips does the filter use?
+"""Which part of the clips does the filter use?
 
     python experiments/controls/run.py [--smoke] [--out FOLDER]
 
-On tuning scenes, primary endpoint (objects quality against the true volumes, mean over pauses t >= 1):
+The scenes are tuning scenes. The score is the objects quality against the true volumes, mean over pauses t >= 1.
 
-- still: after each pause a clip of two frames in which no object moves (new sensor noise, the arm perhaps in view)
-  must not lower quality;
-- shuffled: with the inner frames of every clip in random order, the gain over samples must be smaller. `ends` uses
-  only the first and last frame of a clip, and `frozen` never finds a motion. The same for a filter that finds
-  motions by optical flow only (`flow`), and, without segmentation, for the objects that moved when the true labels
-  of the pause before are tracked (columns `moved: ...`, mean IoU);
-- start: at t = 0 `mst` and samples of the latest image must have the same quality.
+- still: A clip of two frames in which no object moves is added after each pause (new sensor noise, the robot arm
+  perhaps in view). The clip must not lower the quality.
+- shuffled: If the inner frames of every clip are in random order, the gain over samples must be smaller. `ends` uses
+  only the first and last frame of a clip, and `frozen` never finds a motion. `flow` finds motions only by optical
+  flow. The columns `moved: ...` show tracking without segmentation. The true labels of the previous pause are tracked
+  over one clip. The value is the mean IoU of the objects that moved.
+- start: At t = 0, `mst` and samples of the latest image must have the same quality.
 
 Samples are `samples_only` with as many samples as `mst` has.
 
@@ -54,12 +54,12 @@ FIELDS = [
 
 
 def quality(state: State, truth: np.ndarray) -> float:
-    """Unweighted mean over the hypotheses."""
+    """Mean quality of the hypotheses, without weights."""
     return float(np.mean([weighted_coverage(h.labels, truth) for h in state.population.particles]))
 
 
 def at_rest(recording: Recording, pause: int) -> int | None:
-    """The frame after a pause, or the one before it, if no object moves in between; else None."""
+    """Index of a frame next to a pause (after or before) between which and the pause no object moves, or None."""
     here = recording.poses(pause)
     for frame in (pause + 1, pause - 1):
         there = recording.poses(frame) if 0 <= frame < len(recording.frames) else None
@@ -97,7 +97,7 @@ def tracked(transition: Transition, labels: np.ndarray, truth: np.ndarray, clip:
 
 
 def run(scene: tuple[str, int], recording: Recording) -> dict[str, object]:
-    """Means over the pauses of a scene."""
+    """Scores of a scene, averaged over its pauses."""
     filters = {name: mstfilter.preset("mst", *changes) for name, changes in FILTERS.items()}
     mst = filters["mst"]
     samples = mstfilter.preset("samples_only", f"n_proposed={mst.n_proposed}")

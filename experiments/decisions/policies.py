@@ -1,4 +1,4 @@
-"""Policies: which of the candidate pushes comes next? Each sees the belief and the candidates, never the scene."""
+"""Policies select the next push from candidates. A policy knows the belief and the candidates, but not the scene."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ TOLERANCE = 50  # voxels: 50 cm^3 of 1 cm voxels
 
 
 def random(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
-    """Any candidate."""
+    """A random candidate."""
     return int(rng.integers(len(pushes)))
 
 
 def information(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
-    """The largest expected information about which voxels move; any candidate if the hypotheses agree."""
+    """The push with the most expected information about which voxels move; a random one if all hypotheses agree."""
     found = expected_information(belief, pushes)
     best = belief.most_informative(range(len(pushes)), found.__getitem__)
     return random(rng, belief, pushes) if best is None else best
 
 
 def one_hypothesis(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
-    """By the hypothesis of least expected loss alone: the push of objects with the largest contact with others."""
+    """The push whose touched objects have the largest contact with other objects in the estimate."""
     return _largest(rng, contact(belief, pushes))
 
 
 def least_sure(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> int:
-    """The push that touches the least sure object of the estimate."""
+    """The push with the largest `doubt`."""
     return _largest(rng, doubt(rng, belief, pushes))
 
 
@@ -52,8 +52,11 @@ def contact(belief: Belief, pushes: Sequence[FingerPush]) -> list[float]:
 
 
 def doubt(rng: np.random.Generator, belief: Belief, pushes: Sequence[FingerPush]) -> list[float]:
-    """1 - the lowest mean probability, over the objects that each push touches, that two voxels of an object of the
-    estimate belong together, given that both are occupied."""
+    """Largest doubt about an object of the estimate that each push touches; 0 if a push touches no object.
+
+    The doubt about an object is 1 minus the mean probability that two of its voxels belong to one object, given that
+    both are occupied.
+    """
     labels, occupancy = belief.estimate().labels, belief.occupancy()
     found = {}
     for k in np.unique(labels[labels > 0]).tolist():
@@ -80,6 +83,6 @@ POLICIES = {"random": random, "information": information, "one hypothesis": one_
 
 
 def _largest(rng: np.random.Generator, values: Sequence[float]) -> int:
-    """The index of the largest value, any of equal ones."""
+    """Index of the largest value; a random one of equal values."""
     best = np.flatnonzero(np.asarray(values) == max(values))
     return int(rng.choice(best))

@@ -1,24 +1,27 @@
-"""Decisions: is a scene known better after pushes that the belief chooses?
+"""Decisions: are the hypotheses about a scene better after pushes that the belief chooses?
 
     python experiments/decisions/run.py [--workers 2] [--smoke --out FOLDER]
 
-The loop is closed: a policy chooses one of twelve candidate pushes, the simulator plays it, `mst` filters the clip,
-and so on, six times. All policies start from the same scene. The objects of the first scene are judged, followed by
-their true identity; objects that have left the workspace count as not found.
+A policy chooses one of twelve candidate pushes, the simulator executes the push, and `mst` filters the clip. This
+loop is repeated six times. All policies start from the same scene. The objects on the table before the first push are
+scored, identified by their true labels. Objects that have left the workspace have an IoU of 0.
 
 Columns of runs.csv, one row per scene, policy and number of pushes k:
-coverage: IoU of each object of the first scene with the best object of a hypothesis, weighted by the volume at the
-start, 0 for lost objects, mean over the hypotheses. quality: `objects` quality of what is on the table.
-recalibrated_log_loss:
-log loss of "do these two voxels belong to one object?" at the present pause, in nats, after recalibration on the
-other scenes of the family; one recalibration for all policies. brier and log_loss: of the same questions, forecasts
-as they come. lost: objects that have left. entropy: of the segmentation, in nats, as the filter believes.
 
-On the first `--regret` scenes of a family all candidates are tried at every push of the random policy: `best` is
-the coverage after the best one, and the regret of a policy is the best coverage minus that of its choice.
+- coverage: the IoU of each scored object with the best object of a hypothesis, averaged over the objects with their
+  volumes at the start as weights, and over the hypotheses.
+- quality: the `objects` quality against the objects on the table.
+- recalibrated_log_loss: the log loss of forecasts of "these two voxels belong to one object" at the present pause, in
+  nats. Forecasts are recalibrated on the other scenes of the family, with one recalibration for all policies.
+- brier and log_loss: the scores of the same forecasts without recalibration.
+- lost: the number of objects that have left the workspace.
+- entropy: the entropy of the segmentation, in nats.
 
-Finished scenes are not run again; with `--scenes 0` the tables are made of those. summary.csv has the differences to
-the random policy, paired by scene; decisions.png has the means.
+On the first `--regret` scenes of a family all candidates are simulated at every push of the random policy: `best` is
+the coverage after the best candidate. The regret of a policy is `best` minus the coverage after the policy's choice.
+
+Finished scenes are not run again; with `--scenes 0` the tables are made from the finished scenes. summary.csv has the
+differences from the random policy, paired by scene. decisions.png has the means.
 """
 
 from __future__ import annotations
@@ -71,7 +74,7 @@ def measure(loop: PushLoop, state: State) -> tuple[dict[str, float], np.ndarray]
 
 
 def play(family: str, seed: int, regret: bool, small: bool) -> tuple[list[dict[str, Any]], np.ndarray]:
-    """One scene with all policies: the rows of k = 0 .. n pushes, and their counts of forecasts."""
+    """Rows of one scene for all policies and k = 0 .. n pushes, and the counts of forecasts of each row."""
     changes, n = (SMALL, 1) if small else (CHANGES, N_PUSHES)
     mst = preset("mst", *(["n=2"] if small else []))
     loop = PushLoop(replace(scene_family(family), **changes), seed)
@@ -100,9 +103,9 @@ def play(family: str, seed: int, regret: bool, small: bool) -> tuple[list[dict[s
 def _regret(
     mst: ParticleFilter, loop: PushLoop, state: State, pushes: Sequence[FingerPush], key: Sequence[int]
 ) -> dict[str, float]:
-    """The coverage after the best of all candidates, and what the choice of each policy stays below it.
+    """Coverage after the best of all candidates, and the regret of each policy.
 
-    That of the random policy is the mean over all candidates.
+    The regret of the random policy is the mean over all candidates.
     """
     saved, outcomes = loop.save(), []
     for push in pushes:
@@ -145,9 +148,9 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Differences to the random policy by family, score and number of pushes; "all": all families, the mean over k.
+    """Differences from the random policy by family, score and number of pushes; "all": all families, or mean over k.
 
-    The regret of all policies is that at the scenes which the random policy made.
+    The regrets of all policies are measured at the states that the random policy reaches.
     """
     last = max(row["k"] for row in rows)
     pushes = {"all": range(1, last + 1), **{str(k): [k] for k in sorted({min(4, last), last})}}
@@ -166,7 +169,7 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _by_scene(rows: list[dict[str, Any]], policy: str, score: str, pushes: Sequence[int]) -> dict[str, float]:
-    """Mean of a score over numbers of pushes, by scene."""
+    """Mean of a score over the given numbers of pushes, by scene."""
     found: dict[str, list[float]] = {}
     name, plays = (f"regret {policy}", "random") if score == "regret" else (score, policy)
     for row in rows:

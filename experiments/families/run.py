@@ -3,8 +3,9 @@
     python experiments/families/run.py            # an hour on one core; finished scenes are not run again
     python experiments/families/run.py --smoke --out DIR    # half a minute
 
-Writes counts.csv (one row per scene: physics and visibility), difficulty.csv (one row per first pause: quality of the
-single-frame baseline in the image and in space, and floors), summary.csv and pictures. Tuning seeds only.
+Writes counts.csv (one row per scene: physics and visibility), difficulty.csv, summary.csv and pictures. A row of
+difficulty.csv has the quality of the single-frame baseline and of floors on a first pause, in the image and in space.
+All seeds are tuning seeds.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ MOVED = 0.01  # metres
 
 
 def visible(scene: SimulatedScene) -> np.ndarray:
-    """(n,) pixels of each object, noiseless, as at 640 x 480."""
+    """Visible pixels (n,) of each object without sensor noise, scaled to an image of 640 x 480 pixels."""
     camera = scene.camera
     rays = camera.rays().reshape(-1, 3) @ camera.pose.as_matrix()[:3, :3].T
     geom, _, _ = scene.world.cast(np.array(camera.position), rays, (1,))
@@ -47,7 +48,7 @@ def visible(scene: SimulatedScene) -> np.ndarray:
 
 
 def count(family: SceneFamily, seed: int) -> dict[str, float]:
-    """Simulate one scene and its pushes without rendering; counts of objects and contacts."""
+    """Simulate one scene and its pushes without rendering, and count objects and contacts."""
     scene = SimulatedScene(replace(family, width=160, height=120, supersample=False), seed)
     world = scene.world
     pixels, contacts, deepest = [visible(scene)], [len(world.contacts())], [world.deepest_overlap()]
@@ -142,7 +143,7 @@ def _missing(objects: np.ndarray, read: np.ndarray) -> float:
 def fill(
     target: Path, work: Callable[[SceneFamily, int], dict[str, float]], jobs: list[tuple[SceneFamily, int]]
 ) -> list:
-    """One row per scene; rows in the file are kept, a new row is written when it is done."""
+    """One row per scene. Rows that are in the file are not computed again; each new row is written immediately."""
     lines = read_csv(target) if target.exists() else []
     done = {(line["family"], line["seed"]) for line in lines}
     for family, seed in jobs:
@@ -156,7 +157,7 @@ def fill(
 
 
 def summarise(target: Path, tables: list[list[dict[str, str]]]) -> None:
-    """Mean, least and greatest of every column by family."""
+    """Mean, smallest and largest value of every column by family."""
     header = ("mean", "least", "greatest", "half_width_95")
     rows = []
     for name in FAMILIES:

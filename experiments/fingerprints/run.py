@@ -1,11 +1,11 @@
-"""Fingerprints: hashes of the results that a change of structure must not change.
+"""Fingerprints: hashes of results that a change of the code's structure must not change.
 
     python experiments/fingerprints/run.py before.json               # before the change
     python experiments/fingerprints/run.py after.json --against before.json
 
-For each preset and scene: the hypotheses (labels, weights, parents) after every pause. For each scene: the simulated
-images and the true volumes. For a few filters of `mstfilter.smc`: particles and log evidence. Hashes are comparable
-on one machine with one set of library versions only, so none is kept in the repository.
+There are hashes of the hypotheses (labels, weights, parents) for each preset, scene and pause. There are also hashes
+of the simulated images and true volumes, and of particles and log evidence of filters of `mstfilter.smc`. Hashes can
+be compared only on one machine with one set of library versions, so the repository stores no hashes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Quality and processor time of `mst` on images of 1440 x 1080 pixels, in full size and reduced to 410,000 pixels.
+"""Quality and processor time of `mst` on images of 1440 x 1080 pixels, at full size and reduced to 410,000 pixels.
 
     python experiments/full_size/large_images.py            # 20 minutes of one core; prints a line per run
     python experiments/full_size/large_images.py --small    # one small scene: shows only that it works
@@ -22,7 +22,7 @@ from mstfilter.simulation import scene_family, simulate_recording
 
 
 def filtered(recording: Recording, seed: int, max_pixels: int) -> tuple[float, float]:
-    """Mean quality over the pauses and processor seconds of all steps."""
+    """Mean quality over the pauses, and processor seconds of all steps together."""
     filter = mstfilter.preset("mst")
     state, quality, seconds = filter.start(seed), [], 0.0
     for clip in recording.clips():

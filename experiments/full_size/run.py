@@ -3,9 +3,9 @@
     python experiments/full_size/run.py [--seed 1] [--rounds 3]
     python experiments/full_size/run.py --smoke --out DIR    # a small recording: shows only that it works
 
-Filters a simulated recording of the scene `table` with both presets in turn, in separate processes with one thread.
-Writes results/full_size.csv: the seconds of every step by component, medians over the rounds, and the peak memory.
-Prints the ratios of the two presets.
+Filters a simulated recording of the scene `table` with both presets alternately, in separate processes with one
+thread. Writes results/full_size.csv: the seconds of every step by component (medians over the rounds), and the peak
+memory. Prints the ratios of `mst` to `mst_rules`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SLOTS = ("transition", "proposal", "update", "resampler", "build")
 
 
 def filter_in_process(recording: Path, out: Path, preset: str, smoke: bool) -> list[dict[str, Any]]:
-    """Filter a recording in a process of its own; one row per step."""
+    """Filter a recording in a separate process; returns one row per step."""
     command = [sys.executable, "-m", "mstfilter", "run", str(recording), *(["n=2"] if smoke else [])]
     threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     process = subprocess.Popen(

@@ -8,9 +8,9 @@ Parameters (rho, sigma) are drawn from the prior and T observations from the mod
     rho ~ N(0.5, 0.3^2),  1 / sigma^2 ~ Gamma(3, rate 1).
 
 If a chain has the exact posterior, the rank of the true parameter among L independent posterior draws is uniform on
-0 .. L (Talts, Betancourt, Simpson, Vehtari, Gelman 2018). Chains start at a new draw of the prior; the first
-iterations are left out and the rest is thinned. The filters have few particles, so that an error shows. The control
-is particle Gibbs without the condition: its paths come from an ordinary filter of the same size.
+0 .. L (Talts, Betancourt, Simpson, Vehtari, Gelman 2018). Each chain starts at a new draw from the prior; the first
+iterations are dropped and the rest is thinned. The filters have few particles, so that an error is visible. The
+control is particle Gibbs in which an ordinary filter of the same size, instead of conditional SMC, draws the paths.
 
 Writes results/ranks.csv, one row per data set and method, and results/summary.csv with chi-square tests of ten bins.
 Finished data sets are not run again.
@@ -35,18 +35,18 @@ FIELDS = ["method", "data_set", "rho", "sigma"]
 
 
 def draw_prior(rng: np.random.Generator) -> np.ndarray:
-    """(rho, sigma)."""
+    """A draw (rho, sigma) from the prior."""
     return np.array([rng.normal(0.5, 0.3), rng.gamma(3.0, 1.0) ** -0.5])
 
 
 def log_prior(theta: np.ndarray) -> float:
-    """Of (rho, log sigma), without its constant: the density of log sigma is precision^3 exp(-precision)."""
+    """Log density of (rho, log sigma) up to a constant; the density of log sigma is precision^3 exp(-precision)."""
     rho, log_sigma = theta
     return -0.5 * ((rho - 0.5) / 0.3) ** 2 - 6 * log_sigma - np.exp(-2 * log_sigma)
 
 
 def simulate(seed: int) -> tuple[np.ndarray, list[float], np.ndarray]:
-    """True parameters, observations, and first parameters of a chain."""
+    """True parameters, observations, and parameters at which a chain starts."""
     rng = np.random.default_rng(seed)
     rho, sigma = theta = draw_prior(rng)
     x, ys = rng.normal(), []
@@ -57,7 +57,7 @@ def simulate(seed: int) -> tuple[np.ndarray, list[float], np.ndarray]:
 
 
 def filter_of(theta: np.ndarray, n: int) -> ParticleFilter:
-    """Bootstrap filter; arrays (2, R, 1) of parameters make one filter of R runs."""
+    """Bootstrap filter. With parameters of shape (2, R, 1), the filter has R runs."""
     rho, sigma = theta
     model = StateSpaceModel(
         lambda rng, n: rng.standard_normal(n),
@@ -70,7 +70,7 @@ def filter_of(theta: np.ndarray, n: int) -> ParticleFilter:
 
 
 def draw_parameters(rng: np.random.Generator, theta: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """rho given sigma and the path is normal, the precision given rho and the path is a gamma variable."""
+    """Gibbs draw: rho from a normal law given sigma and the path, then the precision from a gamma law given rho."""
     old, new = path[:-1], path[1:]
     precision = 1 / 0.3**2 + old @ old / theta[1] ** 2
     rho = rng.normal((0.5 / 0.3**2 + old @ new / theta[1] ** 2) / precision, precision**-0.5)

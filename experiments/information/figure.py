@@ -2,10 +2,10 @@
 
     python experiments/information/figure.py STUDY [--out FOLDER]
 
-Writes reliability.csv, the share of true answers by forecast, and reliability.png: the forecasts of some methods that
-"these two voxels belong to one object", pooled over families, scenes and pauses t >= 1, with 95 % bootstrap intervals
-over scenes. Forecasts between 0 and 1 are in bins of .2. Prints the calibration error of all forecasts of a method
-together (ten bins).
+Writes reliability.csv and reliability.png: the share of true answers by forecast, for forecasts of some methods that
+"these two voxels belong to one object". The forecasts are pooled over families, scenes and pauses t >= 1. Intervals
+are 95 % bootstrap intervals over scenes. Forecasts strictly between 0 and 1 are in bins of width .2. Prints the
+calibration error of each method, computed from its pooled forecasts with ten bins.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def forecasts_of(folder: StudyFolder, arm: str) -> list[ForecastTable]:
 
 
 def binned(table: ForecastTable) -> np.ndarray:
-    """Forecasts by bin, columns count, sum of forecasts, true answers."""
+    """One row per bin of forecasts: number of forecasts, their sum, and number of true answers."""
     which = np.searchsorted(EDGES, table.p) - 1
     columns = (table.count, table.count * table.p, table.yes)
     return np.stack([np.bincount(which, c, len(EDGES) - 1) for c in columns], axis=1)

@@ -1,11 +1,11 @@
-"""What each further hypothesis is worth: the table and the figure of a study of the number of hypotheses.
+"""Table and figure of a study of the number of hypotheses.
 
     python experiments/information/number.py STUDY [--out experiments/information/results]
 
-number.csv has one row per number of hypotheses, means over the scenes that all numbers have: recalibrated log loss
-(nats, lower is better) and its difference from that of the next smaller number, paired by scene with a 95 % interval;
-the calibration error of the forecasts as they come; the quality of the estimate (`Belief.estimate`) and the mean
-quality; processor seconds of a step.
+number.csv has one row per number of hypotheses, with means over the scenes that were run with all numbers. The
+columns have the recalibrated log loss (nats, lower is better) and its difference from the row above, paired by scene
+with a 95 % interval. Further columns have the calibration error of the forecasts without recalibration, the quality
+of the estimate (`Belief.estimate`), the mean quality, and the processor seconds of a step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ COLUMNS = (LOG_LOSS, "calibration_error", "quality_estimate", "quality", "core_s
 
 
 def by_scene(path: Path, column: str) -> dict[int, dict[str, float]]:
-    """Number of hypotheses -> scene -> mean over the pauses t >= 1."""
+    """Mean of a column over the pauses t >= 1, by number of hypotheses and scene."""
     found: dict[int, dict[str, list[float]]] = {}
     for row in read_csv(path):
         if int(row["pause"]) >= 1 and row.get(column):

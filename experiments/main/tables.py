@@ -2,15 +2,16 @@
 
     python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"] [--pooled]
 
-Files are named after the study: NAME.csv (one row per family and arm: means over scenes of pauses t >= 1),
-NAME_scenes.csv (the primary endpoints of each scene) and NAME_differences.csv (arm minus reference in the primary
-endpoints; unadjusted t interval, studentised bootstrap, sign-flip p, p after Holm over endpoints, families and arms),
-which are also printed as tables for the README. NAME_cases.csv has the quality of visible, hidden and never seen
-objects; a case is one object at one pause t >= 1 (mean over cases, not over scenes). NAME_time.csv has core seconds
-of a step t >= 1: of the first filter seed, in which an arm may be the first to process a recording, and of later
-seeds, which use shared work on disk. With --pooled, differences are over the scenes of all families together:
-NAME_pooled_differences.csv; NAME_pooled_described.csv has those of further metrics, and NAME_pooled_pauses.csv the
-means by pause, and the change from pause 1 to the last one with its 95 % interval over scenes.
+The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
+scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
+minus the reference in the primary endpoints: unadjusted t interval, studentised bootstrap, sign-flip p, and p after
+Holm over endpoints, families and arms. The differences are also printed as tables for the README. NAME_cases.csv has
+the quality of visible, hidden and never seen objects, averaged over cases; a case is one object at one pause t >= 1.
+NAME_time.csv has the core seconds of steps t >= 1. They differ between the first filter seed, in which an arm may be
+the first to process a recording, and later seeds, which use shared results on disk. With --pooled,
+NAME_pooled_differences.csv has the differences over the scenes of all families together, and
+NAME_pooled_described.csv has these differences in further metrics. NAME_pooled_pauses.csv has the means by pause, and
+the change from pause 1 to the last pause with its 95 % interval over scenes.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def by_scene(found: Summary) -> list[dict[str, str]]:
 
 
 def means(found: Summary) -> list[dict[str, str]]:
-    """One row per family and arm."""
+    """Means of all metrics, one row per family and arm."""
     lines = []
     for family, arm in product(found.families, found.arms):
         if endpoint := found.metric(family, arm):
@@ -86,7 +87,7 @@ def means(found: Summary) -> list[dict[str, str]]:
 
 
 def differences(found: Summary, metrics: Iterable[str] = ENDPOINTS) -> list[dict[str, str]]:
-    """One row per metric, family and arm that is compared with the reference."""
+    """Differences from the reference, one row per metric, family and compared arm."""
     lines = []
     for c in [c for name in metrics for c in found.compared(name)]:
         d = c.difference

@@ -1,9 +1,10 @@
-"""Play the first hour of a new user: the commands of the documentation, in an empty folder, in their order.
+"""Run the commands of the first hour of a new user: those of the documentation, in order, in an empty folder.
 
     python experiments/newcomer/run.py [--smoke] [--out FOLDER]
 
-Every step is a process of its own. A step fails if its exit code is not 0, its output lacks what the documentation
-shows, or contains a traceback. FOLDER gets hour.csv (one row per step) and outputs.txt; default: results/.
+Every step is a separate process. A step fails if its exit code is not 0, or if its output lacks text that the
+documentation shows, or contains a traceback. The script writes hour.csv (one row per step) and outputs.txt into
+FOLDER (default: results/).
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def steps(smoke: bool) -> list[Step]:
 
 
 def play(step: Step, folder: Path) -> tuple[str, str, float]:
-    """Run a step; returns its fault or "", its output, its seconds."""
+    """Run a step; returns the reason why it failed (or ""), its output, and its seconds."""
     name = "python" if step.command[0] == "-c" or step.command[0].endswith(".py") else step.command[0]
     arguments = step.command if name == "python" else ["-m", "mstfilter", *step.command]
     start = time.perf_counter()
@@ -121,7 +122,7 @@ def play(step: Step, folder: Path) -> tuple[str, str, float]:
 
 
 def main(out: Path, smoke: bool) -> int:
-    """Play all steps; returns the number that failed."""
+    """Run all steps; returns the number of failed steps."""
     from mstfilter.files import write_csv, write_text
 
     rows, outputs = [], []

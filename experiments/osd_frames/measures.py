@@ -1,8 +1,8 @@
 """Precision, recall and F of segments and of their borders, for objects matched one to one.
 
-The measures of Y. Xie, Y. Xiang, A. Mousavian, D. Fox, "Unseen object instance segmentation for robotic
-environments" (2021), section VI-A. Objects are matched so that the sum of F is largest; all pixels of all objects
-count together. A border pixel is right if the true border is within .3 % of the image's diagonal.
+The measures are defined by Y. Xie, Y. Xiang, A. Mousavian, D. Fox, "Unseen object instance segmentation for robotic
+environments" (2021), section VI-A. Objects are matched so that the sum of F is largest, and the pixels of all objects
+are pooled. A border pixel is correct if its distance to the true border is at most .3 % of the image's diagonal.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _NEAR = 0.003
 
 
 def segment_f(labels: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Overlap F and boundary F of labels (H, W) for true labels (H, W); 0 is no object in both."""
+    """Overlap F and boundary F of labels (H, W) against true labels (H, W). In both, 0 means no object."""
     size = int(labels.max()) + 1, int(truth.max()) + 1
     both = np.bincount((labels * size[1] + truth).ravel(), minlength=size[0] * size[1]).reshape(size)
     areas, true_areas = both.sum(axis=1)[1:], both.sum(axis=0)[1:]
@@ -46,6 +46,6 @@ def _border(mask: np.ndarray, square: np.ndarray) -> np.ndarray:
 
 
 def _f(right: float, claimed: float, hit: float, true: float) -> float:
-    """F of `right` of `claimed` and `hit` of `true` pixels."""
+    """F score for precision `right` / `claimed` and recall `hit` / `true` (numbers of pixels)."""
     precision, recall = (a / b if b else 0.0 for a, b in ((right, claimed), (hit, true)))
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0

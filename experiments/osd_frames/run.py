@@ -1,13 +1,13 @@
-"""Segmentation quality on 45 real frames: optimal cut, sampled cuts and floors; constants held out by set-up.
+"""Segmentation quality on 45 real frames: optimal cut, sampled cuts and floors; constants from other set-ups.
 
     python experiments/osd_frames/run.py
     python experiments/osd_frames/run.py --smoke --out DIR    # two frames: shows only that it works
     python experiments/osd_frames/run.py --border FOLDER --out DIR    # another border model than that of the package
 
 Needs the frames in MSTFILTER_SHARED (default ../shared) under real/osd_learn. Writes results/*.csv beside this file.
-The learned tree was fitted on simulated scenes only. SceneCut's constants (colour weight, centre and slope of the
-calibration) are fitted on the frames of the other camera set-ups, and so is the colour weight of the first row.
-differences.csv: paired differences by frame, of the tree with a border model and without.
+The learned tree was fitted on simulated scenes only. For each frame, SceneCut's constants (colour weight, centre and
+slope of the calibration) are chosen on the frames of the other camera set-ups. The same holds for the colour weight
+of the first row. differences.csv has the tree with a border model minus the tree without, paired by frame.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Case:
     border: dict[float, tuple[Tree, Segments]]  #: with the evidence of a border model
 
     def score(self, labels: np.ndarray) -> float:
-        """`objects` quality; pixels without a label count on neither side."""
+        """`objects` quality; pixels without a label are ignored in prediction and truth."""
         return weighted_coverage(np.where(self.ignored, 0, labels), self.truth, form="objects")
 
     def score_cut(self, tree: Tree, found: Segments, cut: np.ndarray) -> float:
@@ -105,7 +105,7 @@ class Case:
         return self.score(objects_of(tree, found, cut))
 
     def asked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs of flat pixels (m,) above the table, near each other, and whether one object has both."""
+        """Flat indices (m,) and (m,) of pairs of near pixels above the table, and whether one object has both."""
         rng = np.random.default_rng(int(self.name[5:]))
         asked = readings_above_table(self.frame) & ~self.ignored
         v, u = np.nonzero(asked)
@@ -137,7 +137,7 @@ def objects_of(tree: Tree, found: Segments, cut: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Given(TreeBuilder):
-    """A given tree: both front ends start from the same leaves."""
+    """Returns a given tree, so that both front ends start from the same leaves."""
 
     tree: Tree
 
@@ -178,7 +178,7 @@ def load(number: int, border: str) -> Case:
 
 
 def tree_of_heights(boundary: np.ndarray) -> Tree:
-    """The tree of `UcmTree` whose `start` is the merge height, for `calibrated`."""
+    """The tree of `UcmTree` with merge heights as `start`, which `calibrated` maps to probabilities."""
     parent, height, leaves = prune(*merge_tree(boundary), UcmTree().max_leaves)
     return Tree(parent, leaves, height)  # the height of leaves is 0
 
@@ -190,14 +190,14 @@ def calibrated(tree: Tree, centre: float, slope: float) -> Tree:
 
 
 def without_labels(tree: Tree) -> Tree:
-    """Calibration by quantiles of the heights, which needs no labels."""
+    """Tree calibrated by quantiles of the merge heights, without labels."""
     low, high = np.quantile(tree.start[tree.n_leaves :], (0.9, 0.995))
     slope = (np.log(0.8 / 0.2) - np.log(0.15 / 0.85)) / (high - low)
     return calibrated(tree, low - np.log(0.15 / 0.85) / slope, slope)
 
 
 def components(case: Case, step: float = np.inf) -> np.ndarray:
-    """Floor: 4-connected components above the table; neighbours whose depth differs by `step` m are not joined."""
+    """Floor: 4-connected components above the table; a depth step of `step` m or more separates pixels."""
     own = readings_above_table(case.frame)
     depth = np.where(own, case.frame.depth, 0)
 
@@ -238,7 +238,7 @@ def main(numbers: Sequence[int], out: Path, border: str) -> None:
     chosen = {g: int(scores[:, setup != g].mean(axis=1).argmax()) for g, _, _ in groups}
 
     def judge(parts: Callable[[Case, float], tuple[Tree, Segments]]) -> tuple[np.ndarray, dict[int, int], np.ndarray]:
-        """Scores (weights, frames), the best weight without each set-up, the scores at these weights."""
+        """Scores (weights, frames), index of the best weight on the other set-ups, and scores at that weight."""
         judged = np.zeros((len(COLOUR_WEIGHTS), len(cases)))
         for k, weight in enumerate(COLOUR_WEIGHTS):
             for i, case in enumerate(cases):

@@ -1,4 +1,4 @@
-"""Shared parts of the figures: pages of panels, voxel pictures, tables, small files."""
+"""Shared parts of the figures: pages of panels, voxel pictures, tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BLUE, ORANGE, FLOOR = "#336fb9", "#ee9138", "#b26a1c"
 
 
 def page(rows: int, columns: int, width: float, height: float, **layout: Any) -> tuple[Figure, np.ndarray]:
-    """A figure of a size in inches and its axes (rows, columns)."""
+    """A figure of `width` x `height` inches, and its axes (rows, columns)."""
     figure = Figure((width, height), layout="constrained", facecolor=PAPER)
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=layout or None)
@@ -37,7 +37,7 @@ def show(axes: Axes, image: np.ndarray, title: str = "") -> None:
 
 
 def voxels(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[int, Colour]) -> np.ndarray:
-    """Voxels from a viewpoint on the colour of the page, (h, w, 3) uint8."""
+    """Picture (h, w, 3) uint8 of voxels seen by the camera `view`, on the colour of the page."""
     picture = voxel_picture(np.asarray(labels).astype(np.uint16), grid, view, colours)
     alpha = picture[..., 3:] / 255
     paper = np.array([int(PAPER[k : k + 2], 16) for k in (1, 3, 5)])
@@ -45,7 +45,7 @@ def voxels(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[i
 
 
 def save(figure: Figure, path: Path, dpi: int = 100) -> Path:
-    """Write the figure; the same values give the same bytes."""
+    """Write the figure. Equal figures give files with equal bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"Date": None, "Creator": None} if path.suffix == ".svg" else {"Software": None}
     figure.savefig(path, dpi=dpi, metadata=metadata)

@@ -1,11 +1,11 @@
 """Figures like those of the paper, drawn from simulated scenes and the authors' data.
 
     python experiments/paper_figures/make.py                       # all, about a quarter of an hour
-    python experiments/paper_figures/make.py merging sampled_cuts  # some
+    python experiments/paper_figures/make.py merging sampled_cuts  # some figures, by name
     python experiments/paper_figures/make.py quality_over_time --study studies/main
     python experiments/paper_figures/make.py --smoke --out DIR     # all at small size, a minute
 
-`merging` needs the authors' particles (r1.py) and is left out, with a message, if these are missing;
+`merging` needs the authors' particles (r1.py); if they are missing, the script prints a message and skips the figure.
 `quality_over_time` needs the folder of a study.
 """
 

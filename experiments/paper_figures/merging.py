@@ -1,7 +1,8 @@
-"""Figure `merging`: the merge of two real hypotheses, step by step, and how often each merge probability merges.
+"""Figure `merging`: merges of two real hypotheses, step by step, and the frequency of merges by formula.
 
-Rows: a sample, a prediction and their conflict graph; then, twice, the same random order with other merges, what is
-painted, and what the mode filter leaves. The particles are the authors' (see r1.py), the fusion is that of `paper`.
+The first row shows a sample, a prediction and their conflict graph. Each of two further rows shows the same random
+order with other merges, the painted objects, and the result of the mode filter. The particles are the authors' (see
+r1.py), and the fusion is the fusion of `paper`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ Chance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Replay(Structure):
-    """A structure with a given draw: by the first vertex of a component, its order and its edges."""
+    """A structure that returns given draws: (order, edges) of each component, by the component's first vertex."""
 
     drawn: dict[int, tuple[list[int], Edges]]
 
@@ -104,7 +105,7 @@ def count(labels: np.ndarray) -> int:
 
 
 def colours_of(graph: ConflictGraph) -> list[Colour]:
-    """Cool colours for the objects of the sample, warm ones for those of the prediction; successive ones differ."""
+    """Cool colours for objects of the sample, warm ones for objects of the prediction; successive colours differ."""
     from matplotlib.colors import LinearSegmentedColormap
 
     colours: list[Colour] = [(0, 0, 0)] * len(graph)
@@ -117,7 +118,7 @@ def colours_of(graph: ConflictGraph) -> list[Colour]:
 
 
 def layout(graph: ConflictGraph) -> np.ndarray:
-    """Positions (n, 2): sample above, prediction below, components side by side, few crossings."""
+    """Positions (n, 2) of the objects: sample above, prediction below, components side by side, few crossings."""
     places, left = np.zeros((len(graph), 2)), 0.0
     neighbours = graph.networkx().adj
     for component in graph.components():
@@ -194,10 +195,10 @@ STRUCTURES: tuple[tuple[str, Structure], ...] = (
 
 
 def table(particles: Particles, path: Path, smoke: bool) -> Path:
-    """How often each form merges the conflicts of all 25 pairs: in both directions, and as structures draw them.
+    """Write how often each form of the merge probability merges the conflicts of all 25 pairs.
 
-    ``mean`` .. ``at 1`` count every conflict in both directions. For each structure: the share of the edges that it
-    draws along which a merge happens, and the mean number of objects after all merges.
+    The columns ``mean`` to ``at 1`` count every conflict in both directions. For each structure, the table has the
+    share of the drawn edges along which a merge happens, and the mean number of objects after all merges.
     """
     graphs = [conflict_graph(s.labels, p.labels) for s in particles.samples for p in particles.predictions]
     both = [np.concatenate([g.intersection] * 2) for g in graphs]
@@ -229,7 +230,7 @@ def table(particles: Particles, path: Path, smoke: bool) -> Path:
 
 
 def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int) -> list[tuple[int, np.ndarray]]:
-    """Directed edges (m, 2) that a structure draws in repeated draws of each graph."""
+    """Index of the graph and directed edges (m, 2), for each of `rounds` draws of each graph."""
     rng, found = np.random.default_rng(SEED), []
     for k, graph in enumerate(graphs):
         links = graph.networkx()

@@ -1,7 +1,7 @@
 """Figure `quality_over_time`: both endpoints over pauses, by family and method, from a study folder.
 
-The quality of all hypotheses is the figure of the study report as a file, in the report's light colours; the same
-figure of their log loss is `recalibrated_log_loss_over_time`.
+`quality_over_time` is the figure of the study report with the quality of all hypotheses, in light colours.
+`recalibrated_log_loss_over_time` is the same figure of the log loss.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-f
 
 
 def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
-    """The figures of the runs that are done, with the arms chosen, or else all but those beside the comparisons.
+    """Write the figures of the finished runs of the chosen arms; by default, of all that are not `reported_only`.
 
-    More than twelve arms make several figures.
+    More than twelve arms give several figures.
     """
     folder = StudyFolder.open(study)
     known = [arm["name"] for arm in folder.description["arms"]]

@@ -1,7 +1,7 @@
 """The authors' own real particles (experiment R1 of the paper), in the folder MSTFILTER_SHARED or ``../shared``.
 
-They are Copyright (c) 2020 The Autonomous Robotic Manipulation Lab, MIT licence (results/LICENSE-R1), and no part of
-this program.
+The particles are Copyright (c) 2020 The Autonomous Robotic Manipulation Lab, MIT licence (results/LICENSE-R1). They
+are not part of this package.
 """
 
 from __future__ import annotations
@@ -52,32 +52,32 @@ class Particles:
 
     @cached_property
     def samples(self) -> tuple[Hypothesis, ...]:
-        """The five of ten samples at t = 1 that the authors fused."""
+        """The five samples at t = 1 (of ten) that the authors fused."""
         return self._hypotheses(self._load("measurement", "labels")[1, :5], 1)
 
     @cached_property
     def predictions(self) -> tuple[Hypothesis, ...]:
-        """Five hypotheses of t = 0, moved to t = 1, without voxels in free space."""
+        """Five hypotheses at t = 0, moved to t = 1 and without voxels in free space."""
         return self._hypotheses(self._load("freespace_refined", "labels")[0], 0)
 
     @cached_property
     def estimates(self) -> tuple[Hypothesis, ...]:
-        """The five of 125 fused hypotheses that the authors' program kept."""
+        """The five fused hypotheses (of 125) that the authors' program kept."""
         return self._hypotheses(self._load("estimate", "labels")[0], 1)
 
     @cached_property
     def log_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Log weights of samples and predictions (5,), and the share of the predictions outside free space (5,)."""
+        """Log weights (5,) of samples, of predictions, and the predictions' shares (5,) outside free space."""
         measured = self._load("measurement", "weight")
         return measured[1, :5], measured[0, :5], self._load("freespace_refined", "weight")[0]
 
     def partition(self, labels: np.ndarray) -> np.ndarray:
-        """The voxels of a hypothesis divided into can (2) and carton (1): the reference of its segmentation."""
+        """Reference for scoring a hypothesis: its voxels divided into can (2) and carton (1)."""
         can = self._load("pseudo_truth", "can_footprint")[1].astype(bool)
         return np.where(labels > 0, np.where(can[:, :, None], 2, 1), 0).astype(np.uint16)
 
     def score(self, labels: np.ndarray) -> float:
-        """Objects quality against that partition; it measures segmentation only, not missing or invented voxels."""
+        """Objects quality against `partition`. It measures segmentation only, not missing or invented voxels."""
         return weighted_coverage(labels, self.partition(labels))
 
 

@@ -1,8 +1,8 @@
 """Figure `sampled_cuts`: cuts of the segmentation tree of one simulated frame, on the tree and over the image.
 
-The best cut, and the first two cuts drawn by the sampler of `mst` that show other objects. Height in the tree is the
-log odds that a merge joins different objects (where a merge above has less, that of the strongest inside it). Merges
-below `LEAST` are not drawn.
+The figure shows the optimal cut, and the first two cuts with other objects that the sampler of `mst` draws. The
+height of a merge is its log odds of joining different objects, or the largest log odds of a merge inside it. Merges
+with log odds below `LEAST` are not drawn unless a cut divides them.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def objects(found: Segments, cut: np.ndarray) -> list[int]:
 
 
 def colours_of(tree: Tree, found: Segments, cuts: Sequence[np.ndarray]) -> dict[int, Colour]:
-    """A colour for each object; an object that overlaps one of an earlier cut has the same colour."""
+    """A colour for each object; objects of different cuts that overlap have the same colour."""
     names: dict[int, int] = {}
     for cut in cuts:
         used: set[int] = set()
@@ -90,9 +90,9 @@ class Drawn:
     Parameters
     ----------
     inside : dict
-        Node -> children that are drawn; none for a node whose inside is not.
+        Node -> its drawn children; an empty list for a node below which nothing is drawn.
     x, y : dict
-        Place of each drawn node.
+        Position of each drawn node.
     root : int
     """
 
@@ -103,7 +103,7 @@ class Drawn:
 
     @classmethod
     def of(cls, tree: Tree, cuts: Sequence[np.ndarray]) -> Drawn:
-        """Merges above `LEAST`, and all merges that a cut divides."""
+        """The merges of a tree above `LEAST`, and the merges that a cut divides."""
         odds = np.where(np.arange(tree.n_nodes) < tree.n_leaves, -np.inf, tree.odds)
         taken = np.zeros(tree.n_nodes, bool)  # has a node of a cut strictly inside
         for cut in cuts:
@@ -133,7 +133,7 @@ class Drawn:
 
 
 def draw_tree(axes: Axes, part: Drawn, cut: dict[int, Colour], ylabel: bool) -> None:
-    """The tree: in the colours of the segments below the cut, grey above it; a disc on each node of the cut."""
+    """Draw the tree, grey above the cut and in the segments' colours below, with a disc on each node of the cut."""
     lines, colours, widths = [], [], []
     stack: list[tuple[int, Colour | None]] = [(part.root, None)]
     while stack:

@@ -1,7 +1,7 @@
 """Figure `teaser`: several hypotheses about one simulated table over time, while an object is hidden.
 
-Columns are pauses. Rows: the image; the true volumes; the three heaviest distinct hypotheses of `mst` with their
-weights (equal hypotheses are counted as one). Voxels are seen from the camera's right. An object has
+Columns are pauses. The rows show the image, the true volumes, and the three heaviest distinct hypotheses of `mst`
+with their weights (equal hypotheses are counted as one). Voxels are seen from the camera's right. An object has
 the same colour at all pauses and in all hypotheses.
 """
 
@@ -42,7 +42,7 @@ def make(out: Path, smoke: bool) -> list[Path]:
 
 
 def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Path:
-    """One column per pause."""
+    """Draw the figure with one column per pause."""
     identities, grid = assign_identities(run), recording.grid
     truths = [recording.truth(t) for t in range(run.n_pauses)]
     everything = np.max([truth > 0 for truth in truths], axis=0)
@@ -69,7 +69,7 @@ def picture(recording: Recording, run: RunFolder, path: Path, smoke: bool) -> Pa
 
 
 def hypotheses(column: np.ndarray, run: RunFolder, t: int, identities: Identities, view: Camera) -> None:
-    """The heaviest distinct hypotheses of a pause."""
+    """Draw the heaviest distinct hypotheses of a pause."""
     found, weights = run.hypotheses(t), run.info(t)["weights"]
     first: dict[bytes, int] = {}
     total: dict[int, float] = {}
@@ -85,7 +85,7 @@ def hypotheses(column: np.ndarray, run: RunFolder, t: int, identities: Identitie
 
 
 def bar(axes: Axes, weight: float, said: str) -> None:
-    """A caption with the weight, also as a bar above the picture."""
+    """Draw the weight as a bar above the picture, with a caption."""
     for width, colour in ((0.4, LINE), (0.4 * weight, INK)):
         axes.add_patch(
             Rectangle((0.02, 1.02), width, 0.025, transform=axes.transAxes, color=colour, lw=0, clip_on=False)
@@ -94,7 +94,7 @@ def bar(axes: Axes, weight: float, said: str) -> None:
 
 
 def table(recording: Recording, run: RunFolder, path: Path) -> Path:
-    """One row per pause, hypothesis and object that is hidden at some pause: its largest IoU with an object."""
+    """Write the largest IoU of each object that is hidden at some pause, for every pause and hypothesis."""
     status = [object_status(recording, t) for t in range(run.n_pauses)]
     watched = sorted({k for one in status for k, s in one.items() if s != "visible"})
     rows = []

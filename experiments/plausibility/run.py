@@ -1,9 +1,9 @@
-"""Right recordings, and wrong ones made from them: what the examination of a recording finds.
+"""Results of the examination of a recording on correct recordings, and on wrong recordings made from them.
 
     python experiments/plausibility/run.py     # 12 minutes of one core; simulated recordings are cached
     python experiments/plausibility/run.py --only demo,s1 --out DIR   # recordings whose names begin so
 
-Needs the real recordings in MSTFILTER_SHARED (default ../shared) under real/, and leaves those out that are absent.
+Needs the real recordings in MSTFILTER_SHARED (default ../shared) under real/, and skips missing recordings.
 Writes findings.csv (one row per recording and input) and statistics.csv (range of each statistic per input).
 """
 
@@ -46,7 +46,7 @@ GROUPS = [(0, 1), (2, 4), (6, 16), (17, 24), (25, 26), (27, 29), (31, 32), (33, 
 
 @dataclass(frozen=True)
 class Scene:
-    """The images at the pauses of a recording; pose and workspace are found if they are None."""
+    """The images at the pauses of a recording. Poses or workspace that are None are estimated from the images."""
 
     rgb: np.ndarray
     depth: np.ndarray
@@ -82,7 +82,7 @@ class Scene:
 
 
 def recordings() -> Iterator[tuple[str, Scene]]:
-    """All right recordings: simulated ones with and without their pose, real ones."""
+    """All correct recordings: simulated recordings with and without their pose, and real recordings."""
     for family, seed, changes in SIMULATED:
         scene = Scene.of(open_recording(cached_recording(family, seed, **changes)))
         yield f"{family}-{seed}", scene
@@ -98,7 +98,7 @@ def recordings() -> Iterator[tuple[str, Scene]]:
 
 
 def two_cameras() -> Iterator[tuple[str, Scene]]:
-    """Two cameras with known poses, and one whose pose is found from the table."""
+    """Two cameras with known poses, and the second camera with a pose that is estimated from the table."""
     import json
 
     from mstfilter.scene import read_depth, read_rgb
@@ -122,7 +122,7 @@ def two_cameras() -> Iterator[tuple[str, Scene]]:
 
 
 def seen_from(scene: Scene, k: int, motion: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
-    """Pause k seen by a camera that is displaced by `motion` in its own axes; small holes are filled."""
+    """Images (rgb, depth) of pause k for a camera displaced by `motion` in its own axes; small holes are filled."""
     height, width = scene.depth.shape[1:]
     camera = Camera(scene.K, width, height)
     known = np.isfinite(scene.depth[k])
@@ -140,7 +140,7 @@ def seen_from(scene: Scene, k: int, motion: RigidTransform) -> tuple[np.ndarray,
 
 
 def moved(x: float = 0, y: float = 0, pan: float = 0, tilt: float = 0) -> Callable[[Scene], Scene | None]:
-    """The camera is displaced from the second pause on: metres to the right and down, degrees."""
+    """Displaces the camera from pause 1 on: x m to the right, y m down, pan and tilt in degrees."""
     motion = RigidTransform.from_components([x, y, 0], Rotation.from_euler("yx", [pan, tilt], degrees=True))
 
     def change(scene: Scene) -> Scene | None:
@@ -153,7 +153,7 @@ def moved(x: float = 0, y: float = 0, pan: float = 0, tilt: float = 0) -> Callab
 
 
 def followed(scene: Scene) -> Scene | None:
-    """A moved camera with its poses: a right recording."""
+    """A moved camera with its true poses, which is a correct recording."""
     changed = moved(0.05, 0.03, 4, 3)(scene)
     if scene.poses is None or changed is None:
         return None
@@ -162,7 +162,7 @@ def followed(scene: Scene) -> Scene | None:
 
 
 def shifted(x: float = 0, y: float = 0, scale: float = 1) -> Callable[[Scene], Scene | None]:
-    """Depth is displaced by shares of the image width, and enlarged about the middle."""
+    """Shifts depth by shares x and y of the image width, and scales it about the image centre."""
 
     def change(scene: Scene) -> Scene:
         height, width = scene.depth.shape[1:]
@@ -187,7 +187,7 @@ def scaled_K(focal: float, centre: float) -> Callable[[Scene], Scene | None]:
 
 
 def on_floor(scene: Scene) -> Scene | None:
-    """The table ends 0.3 m around the objects; beyond it is the floor, 0.7 m below."""
+    """A table that ends 0.3 m (x) and 0.2 m (y) from the middle of the workspace, with the floor 0.7 m below."""
     frames, grid = scene.frames()
     middle = (grid.origin + grid.upper)[:2] / 2
     depth = []
@@ -249,7 +249,7 @@ INPUTS: dict[str, Callable[[Scene], Scene | None]] = {
 
 
 def statistics(looks: list[Look]) -> dict[str, float]:
-    """What the limits are compared with."""
+    """The statistics that the examination compares with its limits."""
     first, camera = looks[0], looks[0].frame.camera
     tilt, height = first.table or (np.nan, np.nan)
     drifts = np.array([drift(first, look) for look in looks[1:]]).reshape(-1, 3)
@@ -271,7 +271,7 @@ def statistics(looks: list[Look]) -> dict[str, float]:
 
 
 def examined(scene: Scene) -> dict[str, object]:
-    """What is found, the statistics, and the time."""
+    """Findings, statistics, and milliseconds per pause of the examination."""
     try:
         frames, grid = scene.frames()
     except InputError as error:

@@ -2,8 +2,8 @@
 
     python experiments/readme_picture/differences.py [--out docs/images/differences.png]
 
-The scenes are the sixty of `experiments/information/update.toml`, which nothing was tuned on. Differences are paired
-by scene over all families, with t intervals that are not adjusted for multiple comparisons.
+The scenes are the sixty scenes of `experiments/information/update.toml`, which were not used for tuning. Differences
+are paired by scene over all families, with t intervals that are not adjusted for multiple comparisons.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python experiments/readme_picture/make.py [--seed 0] [--out docs/images/demo.png]
     python experiments/readme_picture/make.py --smoke --out FILE    # a small scene: shows only that it works
 
-Rows are the first, second and last pause; columns the image, the heaviest hypothesis, the one that differs most from
-it, and the voxels of the heaviest. An object has the same colour in all pictures.
+Rows are the first, second and last pause. Columns are the image, the heaviest hypothesis, the hypothesis that differs
+most from it, and the voxels of the heaviest hypothesis. An object has the same colour in all pictures.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HEADS = ("image", "heaviest hypothesis", "another hypothesis", "heaviest: voxels
 
 
 def window(masks: list[np.ndarray], shape: tuple[int, int]) -> tuple[slice, slice]:
-    """The part of the image around all objects of all pauses, in the picture's proportions."""
+    """Rows and columns of the image around all objects of all pauses, with the proportions of the picture."""
     rows, columns = np.nonzero(np.any(masks, axis=0))
     centre = np.array([rows.min() + rows.max(), columns.min() + columns.max()]) / 2
     half = 1.25 * max((rows.max() - rows.min()) / HEIGHT, (columns.max() - columns.min()) / WIDTH) / 2

@@ -5,12 +5,13 @@
 >>> disk.lose("unsynced")
 
 Operations are those that change files below a folder: open for writing, write, sync, rename, remove, make a folder.
-The operation `stop_at` raises `Stop` before it happens (a write stops after half of its bytes), and no later one has
-an effect, so that cleaning up in ``finally`` cannot hide what a killed process leaves. After a power failure more is
-lost:
+Operation number `stop_at` is not executed and raises `Stop` (a write stops after half of its bytes). Later operations
+have no effect, so that cleaning up in ``finally`` cannot hide what a killed process leaves. `lose` then removes what
+a power failure loses:
 
-- ``"unsynced"``: all that is not synced. Names are durable when their folder is synced, contents when the file is.
-- ``"contents"``: contents of files that are not synced; names remain. This is how journaling file systems behave.
+- ``"unsynced"``: Everything that is not synced is lost. A name is durable if its folder is synced, the contents of a
+  file if the file is synced.
+- ``"contents"``: The contents of files that are not synced are lost; names remain, as in journaling file systems.
 
 The functions of `os` and `open` of Python are replaced inside the block. Memory maps and files that other languages
 write are not seen.
@@ -33,7 +34,7 @@ _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
 class Stop(BaseException):
-    """The end of the process."""
+    """Raised at the operation at which the process ends."""
 
 
 class Disk:
@@ -48,7 +49,7 @@ class Disk:
         self._remember(self.root)
 
     def _remember(self, path: Path) -> None:
-        """All that exists in the beginning is durable."""
+        """Mark everything that exists at the start as durable."""
         if path.is_dir():
             self._sync(path)
             for child in path.iterdir():
@@ -80,7 +81,7 @@ class Disk:
         self._stack.close()
 
     def operation(self, half: Callable[[], None] = lambda: None) -> bool:
-        """Count an operation; whether it happens. At the last one, `half` is done and `Stop` is raised."""
+        """Count an operation and return whether it is executed. At `stop_at`, call `half` and raise `Stop`."""
         if self.stopped:
             return False
         self.count += 1
@@ -150,7 +151,7 @@ class Disk:
             self._contents[inode] = path.read_bytes()
 
     def lose(self, what: str) -> None:
-        """Change the folder to what a power failure leaves: see the module."""
+        """Remove what a power failure loses, "unsynced" or "contents" (see the module)."""
         if what == "contents":
             for path in self.root.rglob("*"):
                 if path.is_file():
@@ -189,6 +190,6 @@ class _File(io.FileIO):
 
 
 def content(root: Path, skip: Callable[[str], bool] = lambda name: False) -> dict[str, bytes]:
-    """Path below a folder -> bytes, of all files; those to skip have no bytes."""
+    """Bytes of all files by path below a folder; skipped files have empty bytes."""
     files = (path for path in sorted(root.rglob("*")) if path.is_file())
     return {(name := path.relative_to(root).as_posix()): b"" if skip(name) else path.read_bytes() for path in files}

@@ -1,4 +1,4 @@
-"""What writes files, in a small form: each flow writes below a folder, and gives the same bytes again."""
+"""Small flows that write files: a flow writes below a folder, and gives equal bytes each time."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def nothing(root: Path) -> None:
 
 @dataclass(frozen=True)
 class Flow:
-    """A command: ``act(root)`` after ``prepare(root)``; ``always(root)`` raises if something is lost at any time."""
+    """A command: ``act(root)`` after ``prepare(root)``. ``always(root)`` raises if something is lost after a stop."""
 
     name: str
     act: Callable[[Path], object]
@@ -94,7 +94,7 @@ def flows(recording: Recording) -> list[Flow]:
 
 
 def demo(recording: Recording, root: Path, seed: int) -> None:
-    """The command demo with a copied recording, a light preset and without pictures."""
+    """The command `demo` with a copied recording, with a light preset, and without pictures."""
     copied = mock.patch.object(running, "_simulate", lambda family, out, seed: shutil_copy(recording, out, seed))
     light = mock.patch("mstfilter.presets.load_config", lambda name: load_config(PRESET))
     page = mock.patch("mstfilter.report.write_report", lambda run, path, numbers: path.write_text("mstfilter"))
@@ -111,7 +111,7 @@ def shutil_copy(recording: Recording, out: Path, seed: int) -> None:
 
 
 def trial(flow: Flow, root: Path, stop_at: int, loss: str, expected: dict[str, bytes], template: Path) -> str:
-    """Stop a flow at an operation, lose what a power failure loses, repeat it; "same", or what is wrong.
+    """Stop a flow at an operation, lose data as in a power failure, and repeat the flow; returns "same" or the fault.
 
     If the flow ends before the operation, nothing may be lost.
     """
@@ -138,13 +138,13 @@ def trial(flow: Flow, root: Path, stop_at: int, loss: str, expected: dict[str, b
 
 
 def begin(root: Path, template: Path) -> None:
-    """Make the folder what it is before a trial."""
+    """Restore the folder to its state before a trial."""
     shutil.rmtree(root, ignore_errors=True)
     shutil.copytree(template, root)
 
 
 def reference(flow: Flow, root: Path, template: Path) -> tuple[dict[str, bytes], int]:
-    """Files after a flow that is not stopped, and the number of its operations; the template is prepared."""
+    """Prepare the template; returns the files after a flow that is not stopped, and the number of its operations."""
     shutil.rmtree(template, ignore_errors=True)
     shutil.rmtree(root, ignore_errors=True)
     root.mkdir()
@@ -156,7 +156,7 @@ def reference(flow: Flow, root: Path, template: Path) -> tuple[dict[str, bytes],
 
 
 def contents(root: Path, flow: Flow) -> dict[str, bytes]:
-    """Path -> bytes of all files; those with times, and temporaries that may be left, are not compared."""
+    """Bytes of all files by path, without contents that have times and without temporary files."""
     found = content(root, lambda name: name.endswith(_TIMES))
     return {name: data for name, data in found.items() if not (flow.leaves and ".partial" in name)}
 

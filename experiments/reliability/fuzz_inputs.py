@@ -2,9 +2,9 @@
 
     python experiments/reliability/fuzz_inputs.py --trials 60    # for each kind; writes fuzz_inputs.csv
 
-A trial copies a valid input, spoils it (`tests/hostile.py`) and reads it in another process, with a limit of time.
-Recorded are the outcome, the seconds, the peak of memory above the start, and whether a file outside the input was
-touched or code of the input ran.
+A trial copies a valid input, modifies the copy (`tests/hostile.py`) and reads it in another process, with a limit of
+time. The table has the outcome, the seconds, the peak of memory above the start, and whether a file outside the
+input was changed or code of the input ran.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def resident() -> float:
 
 
 def trial(name: str, seed: int, example: str, folder: str) -> dict[str, object]:
-    """Spoil a copy of an example in one or two ways, and read it."""
+    """Modify a copy of an example in one or two ways, and read it."""
     from mstfilter.study.jobs import peak_megabytes, reset_peak
     from tests.hostile import KINDS, copy, outcome, spoil
 

@@ -1,4 +1,4 @@
-"""Stop everything that writes files, at every operation, by power failures and by kills, and start it twice."""
+"""Test commands that write files: stop at every operation, kill at random times, start twice at the same time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def stops(one: Flow, folder: Path, every: int, known: set[tuple[str, ...]]) -> I
 
 
 def commands(recording: Path) -> dict[str, Callable[[Path, int], list[str]]]:
-    """Commands that write ``out`` in a folder, by name; the number is a seed."""
+    """Functions (folder, seed) -> arguments of a command that writes ``out`` in the folder, by name."""
     small = [f"{name}={str(value).lower()}" for name, value in TINY.items()]
     run = ["run", str(recording), "--preset", PRESET, "--no-report"]
     return {
@@ -63,7 +63,7 @@ def start(command: list[str]) -> subprocess.Popen[str]:
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
-    """Exit code and standard error; a process that hangs is killed and has exit code -99."""
+    """Exit code and standard error of a process. A process that hangs is killed and gets the exit code -99."""
     try:
         error = process.communicate(timeout=HANGS_S)[1]
     except subprocess.TimeoutExpired:
@@ -105,7 +105,7 @@ def kills(name: str, command: Callable[[Path, int], list[str]], n: int, folder: 
 
 
 def pairs(name: str, command: Callable[[Path, int], list[str]], n: int, folder: Path) -> Iterator[Row]:
-    """Trials of a command with two seeds that is started twice at the same time in one folder."""
+    """Trials in which a command is started with two seeds at the same time in one folder."""
     wholes = []
     for seed in (1, 2):
         assert finish(start(command(folder / f"whole{seed}", seed)))[0] == 0
@@ -152,7 +152,7 @@ def summary(rows: list[Row]) -> list[Row]:
 
 
 def main() -> None:
-    """Run the batteries that are wanted; trials in results.csv are not repeated."""
+    """Run the trials of the chosen flows that trials.csv lacks, and write both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=HERE, help="folder of trials.csv and results.csv")
     parser.add_argument("--every", type=int, default=1, help="stop at every n-th operation")

@@ -31,7 +31,7 @@ WIDEST = 100  # per cent
 
 
 def draw(out: Path) -> None:
-    """Differences from systematic in per cent of its mean, with their 95 % intervals; figure.png."""
+    """Draw figure.png: differences from `systematic` in per cent of its mean, with 95 % intervals."""
     import matplotlib
 
     matplotlib.use("Agg")

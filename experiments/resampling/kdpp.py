@@ -3,10 +3,10 @@
     mstfilter check ./experiments/resampling/kdpp.py:KDpp
     mstfilter run RECORDING resampler=./experiments/resampling/kdpp.py:KDpp
 
-`KDpp` draws a set A of n particles with probability proportional to det L_A, L_ij = sqrt(w_i w_j) S_ij, S the
-similarity. Equal particles are never selected together. A selected particle gets the weight w_i / pi_i, pi_i its
-probability of being selected, which makes the selection unbiased. It needs more candidates than particles to select,
-and its eigenproblems take 3,500 times as long as `Systematic` for 250 of 1000 (README.md).
+`KDpp` draws a set A of n particles with probability proportional to det L_A, where L_ij = sqrt(w_i w_j) S_ij and S is
+the similarity. Equal particles are never selected together. A selected particle gets the weight w_i / pi_i, where
+pi_i is its selection probability, so the selection is unbiased. `KDpp` needs more candidates than particles to
+select. The eigenproblems take 3,500 times as long as `Systematic` to select 250 of 1000 particles (README.md).
 
 References: Kulesza and Taskar (2011), "k-DPPs: fixed-size determinantal point processes"; (2012), "Determinantal
 point processes for machine learning", sections 2.4 and 5.2.
@@ -30,14 +30,14 @@ from mstfilter.smc.resampling import checked_weights
 class KDpp(Resampler):
     """n heavy particles that differ from each other, with weights w_i / pi_i.
 
-    ``notes["kdpp"]`` holds the rank of L, and ``"fallback"`` if `scheme` was used.
+    ``notes["kdpp"]`` has the rank of L, followed by ``"fallback"`` if `scheme` was used.
 
     Parameters
     ----------
     similarity : Similarity
         Compares particles. It is made positive semidefinite by dropping negative eigenvalues.
     scheme : Resampler
-        Selects instead if fewer than n particles differ from each other (rank of L below n).
+        Fallback if fewer than n particles differ from each other (rank of L below n).
     """
 
     similarity: Similarity = Gaussian()  # noqa: RUF009 (frozen)
@@ -53,7 +53,7 @@ class KDpp(Resampler):
         return self.scheme.properly_weighted
 
     def likelihood(self, population: Population) -> np.ndarray:
-        """(p, p) L of the particles with positive weight, in units of the largest weight."""
+        """L (p, p) of the particles with positive weight, with weights divided by the largest weight."""
         weights = checked_weights(population.log_weights, 1)
         positive = weights > 0
         root = np.sqrt(weights[positive])
@@ -105,7 +105,7 @@ class Spectrum:
 
 
 def _log_polynomials(values: np.ndarray, k: int) -> np.ndarray:
-    """Row j, column l: log of the l-th elementary symmetric polynomial of the first j values.
+    """Logs of elementary symmetric polynomials: element (j, l) is the log of e_l(v_1 .. v_j).
 
     e_l(v_1 .. v_{j+1}) = e_l(v_1 .. v_j) + v_{j+1} e_{l-1}(v_1 .. v_j).
     """
@@ -117,10 +117,11 @@ def _log_polynomials(values: np.ndarray, k: int) -> np.ndarray:
 
 
 def inclusion(spectrum: Spectrum, k: int) -> np.ndarray:
-    """(m,) probability of each item to be in a set of k.
+    """Probability (m,) of each item to be in a set of k items.
 
-    pi_i = sum_j v_ij^2 P(eigenvector j is used), P = value_j e_{k-1}(all values but j) / e_k. The polynomial without
-    value j is the convolution of those of the values before j and after j, a sum of positive terms.
+    pi_i = sum_j v_ij^2 P_j, where P_j = value_j e_{k-1}(all values but j) / e_k is the probability that eigenvector j
+    is used. The polynomial of all values but j is a sum of positive terms: the convolution of the polynomials of the
+    values before j and of the values after j.
     """
     before = spectrum.log_e[:-1, :k]
     after = _log_polynomials(spectrum.values[::-1], k)[::-1][1:, :k]
@@ -134,7 +135,7 @@ def inclusion(spectrum: Spectrum, k: int) -> np.ndarray:
 
 
 def sample_kdpp(rng: np.random.Generator, spectrum: Spectrum, k: int) -> np.ndarray:
-    """(k,) ascending items: k eigenvectors drawn by the polynomials, then items one by one by projection."""
+    """Draw a set of k items (k,), ascending: first k eigenvectors by the polynomials, then items by projection."""
     log_values, log_e, left, used = np.log(spectrum.values).tolist(), spectrum.log_e.tolist(), k, []
     uniforms = rng.random(spectrum.rank).tolist()
     for j in range(spectrum.rank, 0, -1):

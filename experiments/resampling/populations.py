@@ -1,4 +1,4 @@
-"""Weighted candidates to resample: of the four models, and of MST on real particles."""
+"""Weighted candidates to resample: from the four models, and from MST on real particles."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class Candidates:
     Parameters
     ----------
     population : Population
-        Of numbers, or of the row numbers of m objects.
+        The particles are numbers, or the row numbers of m objects.
     arms : mapping
         Name -> resampler.
     alike : (m, m)
         Similarities.
     distance : callable or None
-        For `energy_distance`: for objects 1 - similarity, for numbers None.
+        Argument of `energy_distance`: 1 - similarity for objects, None for numbers.
     quality : (m,) or None
-        Against the truth.
+        Quality of each candidate against the truth.
     """
 
     population: Population
@@ -47,7 +47,7 @@ class Candidates:
 
     @classmethod
     def of(cls, population: Population, similarity: Any, equivalence: Any, quality: Any = None) -> Candidates:
-        """Compare the particles once."""
+        """Candidates with the similarities of all pairs of particles."""
         found = population.realised()
         particles, log_weights = found.particles, found.log_weights
         matrix = np.asarray(similarity.matrix(particles))
@@ -61,17 +61,17 @@ class Candidates:
 
 
 class Catch(WeightResampler):
-    """Systematic, and keeps the candidates that it saw last."""
+    """Systematic resampling that keeps the latest population before selection in `seen`."""
 
     def __init__(self) -> None:
         self.seen: list[Population] = []
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> Any:
-        """As systematic."""
+        """Select by `Systematic`."""
         return Systematic().select(rng, log_weights, n)
 
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
-        """Keep, then select."""
+        """Keep the population, then select."""
         self.seen = [population]
         return super().resample(rng, population, n)
 
@@ -109,16 +109,16 @@ def real(eta: int = 5) -> Candidates | None:
     can = np.load(folder / "pseudo_truth.npz")["can_footprint"][1][:, :, None]
 
     def quality(candidate: Hypothesis) -> float:
-        """Against a partition of the candidate's own voxels into can and carton, made for scoring."""
+        """Quality against a partition of the candidate's voxels into can and carton, which was made for scoring."""
         return weighted_coverage(candidate.labels, np.where(candidate.labels > 0, np.where(can, 2, 1), 0))
 
     return Candidates.of(fused, WeightedCoverage(), SameSegmentation(), quality)
 
 
 def choose(candidates: Candidates, n: int, draws: int, seed: int) -> dict[str, dict[str, float]]:
-    """Measures of each scheme, means over draws of n; draw k has the same seed for all schemes.
+    """Measures of each scheme, averaged over `draws` selections of n; draw k has the same seed for all schemes.
 
-    A scheme that makes new particles has no copies to count: only its energy distance is measured.
+    For a scheme that makes new particles, which are not copies, only the energy distance is measured.
     """
     population, quality, out = candidates.population, candidates.quality, {}
     m, expected = len(population), n * population.weights

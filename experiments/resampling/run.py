@@ -2,8 +2,8 @@
 
     python experiments/resampling/run.py [--smoke] [--out results]
 
-Finished parts are stored in OUT/parts; the same command runs the missing ones. Every measure of every scheme is
-compared with that of `systematic`, paired by unit.
+Finished parts are stored in OUT/parts; the same command runs the missing parts. Measures of every scheme are compared
+with `systematic`, paired by unit.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ SMOKE = {"seeds": 2, "reference": 500, "populations": 2, "draws": 3, "eta": 1, "
 
 
 def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Iterator[Row]:
-    """A filter of a model with every scheme; a unit is a seed, with the same data for all schemes.
+    """Errors of the filter of one model with every scheme. A unit is a seed, with the same data for all schemes.
 
-    Errors are the absolute error of a mean or the total variation of a law, averaged over the steps.
+    Errors are absolute errors of a mean, or total variation distances of a distribution, averaged over the steps.
     """
     left_out = ("kdpp",) if setting == "plain" else ()  # it keeps all, as fearnhead_clifford does
     make, full, small = {"plain": (plain, world.sizes[0], 12), "branching": (branching, world.sizes[1], 5)}[setting]
@@ -71,19 +71,19 @@ def filtered(name: str, world: World, setting: str, size: dict[str, int]) -> Ite
 
 
 def rows(part: str, setting: str, scheme: str, unit: int, found: dict[str, float]) -> Iterator[Row]:
-    """One row per finite measure: a lost run has no errors."""
+    """One row per finite measure; a run whose weights all became zero has no errors."""
     for measure, value in ((m, v) for m, v in found.items() if np.isfinite(v)):
         yield dict(zip(FIELDS, (part, setting, scheme, measure, unit, value), strict=True))
 
 
 def chosen(part: str, setting: str, unit: int, candidates: Candidates, n: int, draws: int) -> Iterator[Row]:
-    """Measures of one population."""
+    """Measures of every scheme on one population."""
     for scheme, found in choose(candidates, n, draws, unit).items():
         yield from rows(part, setting, scheme, unit, found)
 
 
 def from_worlds(all_worlds: dict[str, World], size: dict[str, int]) -> Iterator[Row]:
-    """Populations of the four models that a filter resamples; a unit is a population."""
+    """Measures on populations that filters of the four models resample; a unit is a population."""
     for (name, world), (k, make) in product(all_worlds.items(), enumerate((plain, branching))):
         for seed in range(size["populations"]):
             n = world.sizes[k] if size is FULL else (12, 5)[k]
@@ -93,7 +93,7 @@ def from_worlds(all_worlds: dict[str, World], size: dict[str, int]) -> Iterator[
 
 
 def from_real(size: dict[str, int]) -> Iterator[Row]:
-    """The real candidates; a unit is a batch of draws, so intervals cover the draws only."""
+    """Measures on the real candidates; a unit is a batch of draws, so intervals show only the variation of draws."""
     candidates = real(size["eta"])
     if candidates is None:
         print("real candidates left out: no folder r1 (MSTFILTER_SHARED names the folder that holds it)")
@@ -104,7 +104,7 @@ def from_real(size: dict[str, int]) -> Iterator[Row]:
 
 
 def timed(size: dict[str, int]) -> Iterator[Row]:
-    """Time per call relative to systematic in the same round; the schemes run in turns."""
+    """Time per call relative to systematic in the same round; the schemes run alternately."""
     for m, n in ((100, 20), (1000, 250)) if size is FULL else ((100, 20),):
         rng = np.random.default_rng(m)
         population = Population(rng.normal(size=m), rng.normal(size=m))
@@ -123,7 +123,7 @@ def timed(size: dict[str, int]) -> Iterator[Row]:
 
 
 def summarise(found: list[dict[str, str]], out: Path) -> None:
-    """summary.csv: means with intervals, paired differences from systematic, and what can be claimed."""
+    """Write summary.csv: means with intervals, paired differences from systematic, and conclusions."""
     table: dict[tuple[str, str, str], dict[str, dict[int, float]]] = {}
     for r in found:
         key = (r["part"], r["setting"], r["measure"])
@@ -152,7 +152,7 @@ def summarise(found: list[dict[str, str]], out: Path) -> None:
 
 
 def short(value: float) -> str:
-    """Four digits."""
+    """A number as text with four significant digits."""
     return f"{value:.4g}"
 
 

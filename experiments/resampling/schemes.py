@@ -34,7 +34,7 @@ BASE = "systematic"  # what all others are compared with
 
 
 def schemes(similarity: Similarity, equivalence: Equivalence) -> dict[str, Resampler]:
-    """Schemes by registered name; wrappers around their default scheme. Two of them need numbers (`Gaussian`)."""
+    """Schemes by registered name; wrappers wrap their default scheme. `sorted` is only for numbers (`Gaussian`)."""
     for_all = {
         BASE: Systematic(),
         "ssp": Ssp(),
@@ -63,7 +63,7 @@ class Table(Similarity):
     known: np.ndarray
 
     def matrix(self, particles: Any) -> np.ndarray:
-        """(n, n)."""
+        """Similarities (n, n) of the rows."""
         return self.known[np.ix_(particles, particles)]
 
 
@@ -74,5 +74,5 @@ class Names(Equivalence):
     known: np.ndarray
 
     def classes(self, particles: Any) -> np.ndarray:
-        """(n,)."""
+        """Classes (n,) of the rows."""
         return self.known[particles]

@@ -39,7 +39,7 @@ BRANCHES = 4
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Observations, log p(y) and the filtering answers (T, ...)."""
+    """Observations, their log evidence log p(y), and exact (or reference) filtering results `answers` (T, ...)."""
 
     observations: Sequence[Any]
     log_evidence: float
@@ -48,9 +48,9 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A model: its bootstrap filter, its data by seed, and the estimate () or (S,) to compare with the answers.
+    """A model: its bootstrap filter, its data by seed, and the estimate () or (S,) that is compared with the answers.
 
-    `sizes` are the particles of the plain and of the branching filter.
+    `sizes` are the numbers of particles of the plain and of the branching filter.
     """
 
     filter: Callable[[int], ParticleFilter]
@@ -62,12 +62,12 @@ class World:
 
 
 def plain(world: World, resampler: Resampler, n: int) -> ParticleFilter:
-    """The bootstrap filter: n in, n out, before the next prediction where the ESS is below n / 2."""
+    """Bootstrap filter that resamples n of n particles before a prediction if the ESS is below n / 2."""
     return replace(world.filter(n), resampler=resampler, trigger=EssBelow(0.5), resample="before")
 
 
 def branching(world: World, resampler: Resampler, n: int) -> ParticleFilter:
-    """n particles, BRANCHES * n candidates at every step, of which the resampler keeps n."""
+    """Filter with n particles and BRANCHES * n candidates at every step, of which the resampler keeps n."""
     filter = world.filter(n)
     return replace(
         filter,
@@ -85,7 +85,7 @@ S0 = S / np.sqrt(1 - R**2)
 
 @cache
 def kalman(seed: int) -> Data:
-    """Data of a seed, their log evidence and filtered means by the Kalman filter."""
+    """Data of a seed, with log evidence and filtered means by the Kalman filter."""
     rng = np.random.default_rng([seed, 21])
     x, ys = rng.normal(0, S0), []
     for _ in range(STEPS):
@@ -113,7 +113,7 @@ VOLATILITY = StateSpaceModel.of(
 
 
 def volatility_data(reference: int) -> Callable[[int], Data]:
-    """The same data for all seeds; answers are the mean of four runs with `reference` particles."""
+    """Function seed -> data, equal for all seeds. Answers are means of four runs with `reference` particles."""
 
     @cache
     def known() -> Data:
@@ -158,7 +158,7 @@ def change(rng: np.random.Generator, shelf: tuple[int, ...]) -> tuple[int, ...]:
 
 @cache
 def shelf_data(seed: int) -> Data:
-    """Counts; only the number of boxes matters for them, a birth-death chain that is summed exactly."""
+    """Observed counts of boxes. They depend only on the number of boxes, a birth-death chain with an exact filter."""
     rng = np.random.default_rng([seed, 23])
     shelf: tuple[int, ...] = ()
     counts = []
@@ -186,10 +186,10 @@ SHELF = StateSpaceModel(
 
 @dataclass(frozen=True)
 class SameBoxes(Similarity):
-    """Boxes in common over boxes in either, by colour; 1 for two empty shelves."""
+    """Number of common boxes divided by the size of the union, both by colour; 1 for two empty shelves."""
 
     def matrix(self, particles: Any) -> np.ndarray:
-        """(n, n)."""
+        """Similarities (n, n) of all pairs."""
         have = np.array([np.bincount(np.array(p, dtype=int), minlength=len(COLOURS)) for p in particles])
         both = np.minimum(have[:, None], have[None]).sum(axis=2)
         either = np.maximum(have[:, None], have[None]).sum(axis=2)
@@ -207,14 +207,14 @@ TABLE = Miniature((3, 2))
 
 @cache
 def table_data(seed: int) -> Data:
-    """Six observations at a table; all configurations are enumerated."""
+    """Six observations of the miniature MST, with the exact posterior by enumeration."""
     _, observations = TABLE.simulate(np.random.default_rng([seed, 24]), 6)
     exact = exact_filter(TABLE, observations)
     return Data(observations, float(exact.log_evidence[-1]), exact.posterior)
 
 
 def worlds(reference: int) -> dict[str, World]:
-    """By name."""
+    """The four models by name."""
     return {
         "linear_gaussian": World(lambda n: bootstrap(AR1, n), kalman, mean, Gaussian(0.3), ExactEquality()),
         "stochastic_volatility": World(

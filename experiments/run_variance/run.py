@@ -1,4 +1,4 @@
-"""Variance of the log evidence and of a mean, estimated from one run, against that over many runs.
+"""Variance of the log evidence and of a mean: estimates from one run, compared with the variance over many runs.
 
 python experiments/run_variance/run.py [--smoke] [--sizes] [--out results.csv]
 """
@@ -38,7 +38,7 @@ with np.errstate(divide="ignore"):
 
 
 def states(p: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """States by rows of probabilities (..., 3) and uniforms (...)."""
+    """States drawn with probabilities (..., 3) by uniform numbers (...)."""
     return np.minimum((np.cumsum(p, axis=-1) <= u[..., None]).sum(axis=-1), 2)
 
 
@@ -97,7 +97,7 @@ FEW, SIZES = ("multinomial, always", "systematic"), (30, 100, 300)
 
 
 def rows(n: int, many: int, single: int, arms: Iterable[str] = ARMS) -> Iterator[dict[str, object]]:
-    """For each model and scheme: the variance over seeds, and mean and spread of the estimates over it."""
+    """For each model and scheme: variance over seeds, and mean and spread of estimates divided by this variance."""
     for model_name, (model, ys) in MODELS.items():
         for arm in arms:
             scheme, trigger = ARMS[arm]

@@ -1,4 +1,4 @@
-"""Quality of both front ends on simulated first pauses that were not used in the fit, in the image and in space.
+"""Quality of the front ends on simulated first pauses that were not used in the fit, in the image and in space.
 
     python experiments/segmentation_fit/check.py
     python experiments/segmentation_fit/check.py --border FOLDER --out DIR    # another border model

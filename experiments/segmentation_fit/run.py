@@ -1,13 +1,13 @@
 """Fit the weights of the learned trees, `models/tree/weights.json`, on simulated scenes; no real image is used.
 
     python experiments/segmentation_fit/run.py
-    python experiments/segmentation_fit/run.py --border FOLDER       # of a border model, with its evidence
+    python experiments/segmentation_fit/run.py --border FOLDER       # fit the weights of a border model
     python experiments/segmentation_fit/run.py --smoke --out FILE    # few scenes, one round: a quick test
 
-With ``--border`` the features include what the network sees, and the weights are written into the model.
-Regions of each scene are merged in the order of their odds under the present weights. A pair of different objects is
-recorded and not merged; a pair of one object is recorded and merged. So the pairs are those that the tree evaluates.
-Three rounds; each fits a logistic regression to the pairs of all rounds so far.
+With ``--border`` the features include the evidence of the border network, and the weights are written into its model.
+In each of three rounds, the regions of each scene are merged in the order of their odds under the present weights.
+Each evaluated pair is recorded, and merged only if both regions belong to one object. So the recorded pairs are those
+that the tree evaluates. Each round fits a logistic regression to the pairs of all rounds so far.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Pairs = tuple[list[np.ndarray], list[bool], list[float]]
 def measured(
     families: Iterable[SceneFamily], seeds: Iterable[int], builder: MergedTree
 ) -> list[tuple[Regions, np.ndarray, float]]:
-    """Regions of every scene, their pixels of each true object (R, K), and the image scale."""
+    """For every scene: regions, numbers of pixels (R, K) of each region in each true object, and image scale."""
     found = []
     for family in families:
         for seed in seeds:
@@ -70,7 +70,7 @@ def measured(
 
 
 def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: dict[str, float], pairs: Pairs) -> None:
-    """Merge the regions of one scene by the ground truth and record the pairs that come up."""
+    """Merge the regions of one scene by the ground truth, and append the evaluated pairs to `pairs`."""
     w = np.array(list(weights.values()))
     growing = Agglomeration(regions, lambda *pair: pair_features(*pair, scale, weights) @ w)
     true = np.zeros((2 * len(pixels), pixels.shape[1]))

@@ -36,7 +36,7 @@ class Pause:
 
 
 def small(family: SceneFamily) -> SceneFamily:
-    """A family with a quarter of the pixels and an eighth of the voxels, for the small forms."""
+    """A family with a quarter of the pixels and an eighth of the voxels, for `--smoke`."""
     return replace(family, width=family.width // 2, height=family.height // 2, voxel_size=2 * family.voxel_size)
 
 

@@ -1,4 +1,4 @@
-"""Errors of motions in millimetres: one clip is predicted from the true labels of the pause before it.
+"""Errors of motions in millimetres: each clip is predicted from the true labels of the previous pause.
 
 python experiments/tracking/run.py RECORDING...               # folders of `mstfilter simulate`
 python experiments/tracking/run.py --smoke --out DIR          # one small scene: shows only that it works
@@ -36,7 +36,7 @@ FEW, NEAR, WRONG = 300, 10.0, 20.0  # pixels, mm, mm
 
 @dataclass(frozen=True)
 class Kept(MotionRule):
-    """A rule that keeps the candidates of every segment."""
+    """Wraps a rule, and keeps the candidates of every segment in `found`."""
 
     rule: MotionRule = field(default_factory=MstRule)
     found: dict = field(default_factory=dict)
@@ -50,7 +50,7 @@ class Kept(MotionRule):
 
 
 def surface_points(shape: Shape) -> np.ndarray:
-    """Points (N, 3) of the surface in the frame of the body: cells of a 4 mm grid with a neighbour outside."""
+    """Surface points (N, 3) in the body's frame: the cells of a 4 mm grid inside with a neighbour outside."""
     axes = [np.arange(-h - 0.006, h + 0.008, 0.004) for h in shape.half]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     inside = shape.inside(cells.reshape(-1, 3)).reshape(cells.shape[:3])
@@ -61,7 +61,7 @@ def surface_points(shape: Shape) -> np.ndarray:
 
 
 def error_mm(shape: Shape, points: np.ndarray, pose: np.ndarray, after: np.ndarray, T: np.ndarray) -> float:
-    """Mean distance of the surface under a motion and under the true one; to the nearest point if it is turned."""
+    """Mean distance of surface points under T from the true points, or the nearest ones on solids of revolution."""
     off = np.linalg.inv(after) @ T @ pose
     moved = points @ off[:3, :3].T + off[:3, 3]
     if shape.family in TURNED and not np.allclose(off, np.eye(4), atol=1e-4):
@@ -122,7 +122,7 @@ def group(row: dict) -> str:
 
 
 def table(rows: list[dict]) -> list[dict]:
-    """Number of objects, those within 10 mm of the truth, and those with a candidate within 10 mm, by class."""
+    """By class: numbers of objects, of objects within 10 mm of the truth, and with a candidate within 10 mm."""
     out = []
     for name in ("still", "turned < 20", "turned 20 - 60", "turned > 60", "few pixels", "hidden"):
         chosen = [row for row in rows if group(row) == name]

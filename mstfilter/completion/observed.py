@@ -84,7 +84,7 @@ def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 def observed_in(
     frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer, low: np.ndarray, high: np.ndarray
 ) -> ObservedBox:
-    """The observation of a mask in the box from voxel `low` to `high`. The mask may be empty."""
+    """What a frame shows of the object of a mask, in the box from voxel `low` to `high`. The mask may be empty."""
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     shape = tuple(int(n) for n in high - low)
     mine = mask_voxels(frame, mask, grid)
@@ -166,7 +166,7 @@ def observed_again(
 
 
 def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """First voxel (3,) of a box around `voxels` (k, 3) down to the grid's floor, and the voxel after the box."""
+    """First voxel (3,) and end (3,), excluded, of a box around `voxels` (k, 3) that reaches the grid's floor."""
     if not len(voxels):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)

@@ -193,7 +193,7 @@ def _check_structure(
 
 
 class Structure(Checked, ABC):
-    """Draws the painting order of conflicting objects, and the edges along which objects may be merged."""
+    """Samples the painting order of conflicting objects, and the edges along which objects may be merged."""
 
     @returns(_check_structure)
     @abstractmethod

@@ -72,7 +72,7 @@ class Crossover(Bounded):
     Parameters
     ----------
     structure : Structure
-        Draws the painting order and the edges along which objects may be merged.
+        Samples the painting order and the edges along which objects may be merged.
     merge : {"share", "printed", "always", "never"}
         Probability of a merge along a directed edge (`mstfilter.crossover.conflicts`).
     mode_filter : ModeFilter

@@ -2,8 +2,9 @@
 
 >>> pauses_from_text("still"), pauses_from_text("0,40,85"), pauses_from_text("0s,4.2s")
 
-A clip goes from one pause to the next. At a pause, neither the robot nor a hand should be in the image. Only the
-recording folder of mstfilter stores the pauses. For other layouts, a rule of this module finds the pauses.
+A clip goes from one pause to the next. At a pause, neither the robot nor a hand should be in the image. Only
+recording folders in the layout of mstfilter store their pauses. For other layouts, a rule of this module finds the
+pauses.
 """
 
 from __future__ import annotations

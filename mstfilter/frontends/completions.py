@@ -5,7 +5,7 @@
 Each pause has a subfolder, whose name is the number of the pause (`Clip.index`), from 0:
 
 * ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, nonzero on the object.
-* ``shapes/000001/cup/a.ply``, ``b.npz``: shapes of this object. Each hypothesis draws one shape.
+* ``shapes/000001/cup/a.ply``, ``.../cup/b.npz``: shapes of the object. Each hypothesis draws one shape.
 * ``shapes/000001/cup/weights.json``: optional weights of the shapes, for example {"a.ply": 2, "b.npz": 1}.
 
 A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world. The file types are:

@@ -13,10 +13,10 @@ that shares most readings with the segment. An object that is the main object of
 A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
 1. The first rule considers only segments whose main object is the predicted object. A considered segment continues
-   the object if it has more than 80 % of the object's readings in all considered segments. The first rule ignores
-   readings at which another object now occludes the predicted object.
-2. The second rule considers all segments. A segment continues the object if it has more than 80 % of the object's
-   readings in all segments.
+   the object if it has more than 80 % of those readings of the object that lie in considered segments. The first rule
+   ignores readings at which another object now occludes the predicted object.
+2. The second rule considers all segments. A segment continues the object if it has more than 80 % of those readings
+   of the object that lie in any segment.
 
 In a component of one segment and one object, the share is 50 % instead of 80 %. The rules have consequences:
 

@@ -441,7 +441,7 @@ def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int]
 
 
 def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A finding if depth edges do not agree with colour edges at the same pixels and the same pause."""
+    """A finding if the edges of the depth image and of the colour image of a pause are not at the same pixels."""
     peak, lost, shift, rise = edge_agreement(looks)
     if peak < _PEAK:
         return

@@ -95,7 +95,7 @@ def score_belief(
 
 
 def forecast_table(counts: np.ndarray) -> ForecastTable:
-    """The table of forecasts and outcomes from counts (1001, 2)."""
+    """The table of forecasts 0, .001, ... 1 from the number (1001, 2) of "no" and "yes" answers to each."""
     kept = counts.any(axis=1)
     no, yes = counts[kept].T.astype(float)
     return ForecastTable(np.flatnonzero(kept) / (N_LEVELS - 1), no, yes)

@@ -87,7 +87,7 @@ class MergeLogOdds(CutValue):
     ``w(n) = -sum of logit P(boundary) over the merges inside n``. The probability that exactly the merges above the
     cut join different objects is proportional to exp(v(c)). The values are log probabilities, so the sampler needs a
     `temperature` but no scale `sigma2`. If the tree has `odds` (`LearnedTree`), the logits are the `odds`. Without
-    `odds`, P(boundary) is `start`. Probabilities are clipped to 0.001 .. 0.999.
+    `odds`, the probability of a border is `start`. Probabilities are clipped to 0.001 .. 0.999.
     """
 
     def values(self, tree: Tree, frame: Frame) -> np.ndarray:

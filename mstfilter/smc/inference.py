@@ -176,8 +176,8 @@ def pmmh(
         Whether ``filter_of`` also accepts parameters (d, m), one column for each of the m particles of all chains.
         The filters of all chains then run as one batch, see `mstfilter.smc.batching`. To combine a parameter with
         particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs. If estimates
-        differ by more than rounding, the runs are made one by one with a warning; if the component states
-        ``batched=True``, InputError is raised.
+        differ by more than rounding, a warning is issued and the filters run one by one. If they differ and a
+        component of the filter states ``batched=True``, InputError is raised.
 
     Raises
     ------

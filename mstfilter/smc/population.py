@@ -320,7 +320,7 @@ class Population:
         return self.labelled(parents, {**self.notes, **notes} if notes else self.notes)
 
     def labelled(self, parents: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> Population:
-        """The same particles and weights with the given `parents`, (n,) int64 arrays, and `notes` (default empty)."""
+        """The same particles and weights with other `parents` (each an (n,) int64 array) and other `notes`."""
         new = object.__new__(Population)  # checked already
         new.__dict__.update(self.__dict__, parents=parents, notes=notes or {})
         return new

@@ -143,8 +143,8 @@ def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, 
     """Select the heaviest particle of each class, with the total weight of the class.
 
     Returns the representatives (k,) in ascending order and their log weights (k,). If several particles have equal
-    weights, the first is the representative. The output log weight of a class of total weight w is ``log(w k / m)``,
-    so the mean weight does not change. Classes of weight zero are omitted.
+    weights, the first is the representative. With m particles and k classes, the output log weight of a class of
+    total weight w is ``log(w k / m)``, so the mean weight does not change. Classes of weight zero are omitted.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
     classes = np.asarray(classes)

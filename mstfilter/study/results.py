@@ -244,7 +244,7 @@ class StudyFolder:
         return _without_lists(self.records())
 
     def summary(self, records: Sequence[Mapping[str, Any]] | None = None) -> Summary:
-        """Means and differences of the finished runs. By default, `records` are read from the folder."""
+        """Means of the arms and differences from the reference. By default, `records` are read from the folder."""
         rows = _without_lists(self.records() if records is None else records)
         return summarise(rows, self.description["reference"], cost_columns(rows), self.reported_only)
 

@@ -316,8 +316,8 @@ class UpdateContract(ScaleContract, ExactContract):
 class RejuvenationContract(ExactContract):
     """The contract of every `Rejuvenation`. The statistical test has a false-alarm rate of at most 1e-6.
 
-    The statistical test needs a method ``exact(self, rng, n)`` that returns n rows x_{t-1} (None at the first step),
-    exact draws of x_t given x_{t-1} and y_t, and y_t.
+    The statistical test needs a method ``exact(self, rng, n)`` that returns three values: n rows x_{t-1}, exact
+    draws of x_t given x_{t-1} and y_t, and the observation y_t. At the first step x_{t-1} is None.
     """
 
     columns = "(x_t, x_t - x_{t-1})"
