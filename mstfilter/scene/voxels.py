@@ -14,7 +14,7 @@ axis of the world points up, and the table is at z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from functools import cached_property
@@ -488,22 +488,3 @@ class Hypothesis:
         centre = [x + middle[0], y + middle[1], (low + high) / 2]
         turn = Rotation.from_euler("z", angle, degrees=True)
         return RigidTransform.from_components(centre, turn), np.array([width, depth, high - low])
-
-
-def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
-    """Raise InputError if the grid of a hypothesis differs from `grid`."""
-    if hypothesis.grid != grid:
-        found, expected = (
-            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
-        )
-        raise InputError(
-            f"grid of {name} is {found}, expected {expected}",
-            "all hypotheses of a run share the workspace of its clips",
-            "parts of one session: open the later part with later.in_world_of(first)",
-        )
-
-
-def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
-    """Raise InputError if a hypothesis has a grid other than `grid`. `side` names the hypotheses in the message."""
-    for k, hypothesis in enumerate(hypotheses):
-        check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)
