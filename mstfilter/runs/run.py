@@ -27,7 +27,7 @@ from mstfilter.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.processes import machine, parallel, threads
 from mstfilter.registry import nested_components
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings
+from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings, scene_cache
 from mstfilter.scoring import ask
 from mstfilter.smc import ParticleFilter
 
@@ -118,6 +118,7 @@ def filter_recording(
                     if not doubts and state.population is not None:  # said once
                         doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
                         report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
+                    scene_cache.forget()
                     advance(clip.index + 1, len(clips))
             except BaseException as error:
                 if folder is not None:

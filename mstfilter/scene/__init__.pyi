@@ -28,6 +28,8 @@ from mstfilter.scene.evidence import (
     FreeSpace as FreeSpace,
     NoFreeSpace as NoFreeSpace,
     Projection as Projection,
+    check_grid as check_grid,
+    check_grids as check_grids,
     log_quality as log_quality,
     surface_agreement as surface_agreement,
 )
@@ -96,7 +98,5 @@ from mstfilter.scene.voxels import (
     Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
-    check_grid as check_grid,
-    check_grids as check_grids,
     occupied_box as occupied_box,
 )

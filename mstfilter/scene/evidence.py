@@ -196,3 +196,22 @@ class Evidence(Checked, ABC):
     @abstractmethod
     def log_score(self, hypotheses: Sequence[Hypothesis], clip: Clip) -> np.ndarray:
         """Finite log scores (n,), in nats and up to a common constant, of hypotheses at the end of a clip."""
+
+
+def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
+    """Raise InputError if the grid of a hypothesis differs from `grid`."""
+    if hypothesis.grid != grid:
+        found, expected = (
+            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
+        )
+        raise InputError(
+            f"grid of {name} is {found}, expected {expected}",
+            "all hypotheses of a run share the workspace of its clips",
+            "parts of one session: open the later part with later.in_world_of(first)",
+        )
+
+
+def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
+    """Raise InputError if a hypothesis has a grid other than `grid`. `side` names the hypotheses in the message."""
+    for k, hypothesis in enumerate(hypotheses):
+        check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)

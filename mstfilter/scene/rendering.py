@@ -33,26 +33,22 @@ class Rendering(NamedTuple):
 
 
 def project(hypothesis: Hypothesis, camera: Camera) -> np.ndarray:
-    """Label image (H, W) uint16 of a hypothesis. Pixels without a visible object are 0. The result is cached."""
+    """Label image (H, W) uint16 of a hypothesis. Pixels without a visible object are 0."""
     return render_hypothesis(hypothesis, camera).labels
 
 
 def render_hypothesis(hypothesis: Hypothesis, camera: Camera) -> Rendering:
-    """Read-only label image and depth image of a hypothesis. The result is cached."""
-
-    def compute() -> Rendering:
-        image = np.zeros((camera.height, camera.width), np.uint16)
-        depth = np.full(image.shape, np.inf, np.float32)
-        for label, box in enumerate(find_objects(hypothesis.labels), 1):
-            if box is not None:
-                window, of_object = _object_depth(hypothesis.labels[box] == label, box, hypothesis.grid, camera)
-                nearer = of_object < depth[window]
-                image[window][nearer] = label
-                depth[window][nearer] = of_object[nearer]
-        depth[image == 0] = np.nan
-        return Rendering(read_only(image), read_only(depth))
-
-    return memo("render", (hypothesis.key, camera.key), compute)
+    """Read-only label image and depth image of a hypothesis. The images of its objects are cached."""
+    image = np.zeros((camera.height, camera.width), np.uint16)
+    depth = np.full(image.shape, np.inf, np.float32)
+    for label, box in enumerate(find_objects(hypothesis.labels), 1):
+        if box is not None:
+            window, of_object = _object_depth(hypothesis.labels[box] == label, box, hypothesis.grid, camera)
+            nearer = of_object < depth[window]
+            image[window][nearer] = label
+            depth[window][nearer] = of_object[nearer]
+    depth[image == 0] = np.nan
+    return Rendering(read_only(image), read_only(depth))
 
 
 def _object_depth(mask: np.ndarray, box: _Box, grid: VoxelGrid, camera: Camera) -> tuple[_Box, np.ndarray]:

@@ -14,7 +14,7 @@ axis of the world points up, and the table is at z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from functools import cached_property
@@ -26,7 +26,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError
 from mstfilter.lazy import late
-from mstfilter.scene.arrays import content_key, frozen
+from mstfilter.scene.arrays import content_key, frozen, read_only
 
 MAX_LABEL = 65535
 MAX_VOXELS = 2**28
@@ -280,23 +280,52 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
     return labels
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Occupancy:
-    """Probability that each voxel is occupied, given the objects of a hypothesis and the positions of the objects."""
+    """Probability that each voxel is occupied, given the objects of a hypothesis and the positions of the objects.
 
-    #: (X, Y, Z) uint16, the most probable object, also where free space is more probable. Equal to the label where
-    #: there is one.
-    owner: np.ndarray
-    probability: np.ndarray  #: (X, Y, Z) float16, probability that the voxel belongs to its owner
+    Most voxels have probability 0, so only the others are stored.
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "owner", frozen(np.asarray(self.owner, dtype=np.uint16)))
-        object.__setattr__(self, "probability", frozen(np.asarray(self.probability, dtype=np.float16)))
+    Parameters
+    ----------
+    owner : (X, Y, Z) uint16
+        The most probable object, also where free space is more probable. Equal to the label where there is one.
+    probability : (X, Y, Z) float16
+        Probability that the voxel belongs to its owner.
+    """
+
+    shape: tuple[int, ...]
+    _voxels: np.ndarray  # (k,) int32, flat indices
+    _owners: np.ndarray  # (k,) uint16
+    _probabilities: np.ndarray  # (k,) float16
+
+    def __init__(self, owner: np.ndarray, probability: np.ndarray) -> None:
+        owners, p = np.asarray(owner, np.uint16), np.asarray(probability, np.float16)
+        voxels = np.flatnonzero((owners > 0) | (p > 0)).astype(np.int32)
+        object.__setattr__(self, "shape", owners.shape)
+        object.__setattr__(self, "_voxels", read_only(voxels))
+        object.__setattr__(self, "_owners", read_only(owners.ravel()[voxels]))
+        object.__setattr__(self, "_probabilities", read_only(p.ravel()[voxels]))
+
+    @property
+    def owner(self) -> np.ndarray:
+        """The most probable object (X, Y, Z) uint16 of each voxel; 0 is none."""
+        return self._dense(self._owners)
+
+    @property
+    def probability(self) -> np.ndarray:
+        """Probability (X, Y, Z) float16 that each voxel belongs to its owner."""
+        return self._dense(self._probabilities)
+
+    def _dense(self, values: np.ndarray) -> np.ndarray:
+        array = np.zeros(self.shape, values.dtype)
+        array.ravel()[self._voxels] = values
+        return read_only(array)
 
     @cached_property
     def key(self) -> bytes:
         """Content key."""
-        return content_key("occupancy", self.owner, self.probability)
+        return content_key("occupancy", str(self.shape), self._voxels, self._owners, self._probabilities)
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
         """The occupancy for new labels. Changed voxels get probability 0 or 1. Owners outside `known` are removed."""
@@ -334,8 +363,8 @@ class Hypothesis:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", frozen(labels_on(self.grid, self.labels)))
-        if self.occupancy is not None and self.occupancy.owner.shape != self.grid.shape:
-            raise InputError(f"occupancy has shape {self.occupancy.owner.shape}, the voxel grid is {self.grid.shape}")
+        if self.occupancy is not None and self.occupancy.shape != self.grid.shape:
+            raise InputError(f"occupancy has shape {self.occupancy.shape}, the voxel grid is {self.grid.shape}")
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
@@ -461,22 +490,3 @@ class Hypothesis:
         centre = [x + middle[0], y + middle[1], (low + high) / 2]
         turn = Rotation.from_euler("z", angle, degrees=True)
         return RigidTransform.from_components(centre, turn), np.array([width, depth, high - low])
-
-
-def check_grid(name: str, hypothesis: Hypothesis, grid: VoxelGrid) -> None:
-    """Raise InputError if the grid of a hypothesis differs from `grid`."""
-    if hypothesis.grid != grid:
-        found, expected = (
-            f"{g.shape} voxels of {g.voxel_size:g} m at {g.origin.tolist()}" for g in (hypothesis.grid, grid)
-        )
-        raise InputError(
-            f"grid of {name} is {found}, expected {expected}",
-            "all hypotheses of a run share the workspace of its clips",
-            "parts of one session: open the later part with later.in_world_of(first)",
-        )
-
-
-def check_grids(side: str, hypotheses: Sequence[Hypothesis], grid: VoxelGrid) -> None:
-    """Raise InputError if a hypothesis has a grid other than `grid`. `side` names the hypotheses in the message."""
-    for k, hypothesis in enumerate(hypotheses):
-        check_grid(f"{side} hypothesis {k}".strip(), hypothesis, grid)

@@ -5,7 +5,8 @@
 {'static': 52, 'icp': 9, ...}
 
 Optical flow tracks the visible part of each object, a rule chooses a rigid motion, and a `Warp` moves the voxels.
-Flow and features are computed once per clip. A segment that several hypotheses share is tracked once.
+Flow and features are computed once per clip. Segments of several hypotheses with nearly the same pixels are tracked
+once.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.fields import Bounded
+from mstfilter.fields import Bounded, Share
 from mstfilter.processes import each
 from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid, content_key, memo
 from mstfilter.smc import Population, Transition, child
@@ -162,9 +163,9 @@ def _moved_occupancy(
     The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label.
     Labelled voxels have a probability of at least one half, and other voxels at most one half.
     """
-    still = np.isin(before.owner, [r.label for r in kept if r.label not in moving])
-    still &= (labels == 0) | (labels == before.owner)
-    owner, p = np.where(still, before.owner, labels), np.where(still, before.probability, labels > 0)
+    owner = before.owner
+    still = np.isin(owner, [r.label for r in kept if r.label not in moving]) & ((labels == 0) | (labels == owner))
+    owner, p = np.where(still, owner, labels), np.where(still, before.probability, labels > 0)
     for record in kept:
         crop = record.source
         if record.label not in moving or crop is None or crop.probability is None:
@@ -268,6 +269,9 @@ class TrackingTransition(Transition):
         Objects that pass this test do not move and are not tracked.
     warp : Warp
         Moves the voxels.
+    similarity : float
+        Segments are tracked as one if they share at least this part of the pixels of the larger segment. The most
+        frequent segment is tracked. With 1, every distinct segment is tracked.
     tracker : MaskTracker, optional
         Tracks the masks of moving objects to the last frame. By default, the flow is used instead.
     min_support : int
@@ -279,6 +283,7 @@ class TrackingTransition(Transition):
     static: StaticTest = field(default_factory=StaticTest)
     warp: Warp = field(default_factory=Warp)
     min_support: int = 12
+    similarity: Share = 0.9
     tracker: MaskTracker | None = None
 
     properly_weighted: ClassVar[bool] = False
@@ -365,7 +370,24 @@ class TrackingTransition(Transition):
             candidates = self.rule.candidates(child(rng, "segment", _number(track.segment.key)), track)
             return ("tracked" if track.target_mask.any() else "lost"), candidates
 
-        return found | {track.segment.key: one for track, one in zip(moving, each(follow, moving), strict=True)}
+        n_hypotheses = Counter(one.key for of_hypothesis in segments for one in of_hypothesis.values())
+        moving.sort(key=lambda track: (-n_hypotheses[track.segment.key], track.segment.key))
+        tracked_as = _tracked_as([track.segment.support for track in moving], self.similarity)
+        chosen = sorted(set(tracked_as))
+        followed = dict(zip(chosen, each(follow, [moving[k] for k in chosen]), strict=True))
+        return found | {track.segment.key: followed[k] for track, k in zip(moving, tracked_as, strict=True)}
+
+
+def _tracked_as(supports: Sequence[np.ndarray], similarity: float) -> list[int]:
+    """For each segment, the index of the first similar segment, by their pixels (S,)."""
+    if similarity >= 1:
+        return list(range(len(supports)))
+    found: list[int] = []
+    for k, own in enumerate(supports):
+        common = {n: len(np.intersect1d(own, supports[n], assume_unique=True)) for n in dict.fromkeys(found)}
+        similar = (n for n, m in common.items() if m >= similarity * max(len(own), len(supports[n])))
+        found.append(next(similar, k))
+    return found
 
 
 def _number(key: bytes) -> int:

@@ -109,6 +109,20 @@ def sure_of(array, rng):
 
 
 @settings(max_examples=40, deadline=None)
+@given(labels)
+def test_occupancy_returns_what_it_was_given(array):
+    rng = np.random.default_rng(int(array.sum()))
+    owner, p = array, rng.uniform(0, 1, array.shape).astype(np.float16) * (rng.random(array.shape) < 0.3)
+    found = Occupancy(owner, p)
+    for given_array, stored in ((owner, found.owner), (p, found.probability)):
+        assert stored.dtype == given_array.dtype and not stored.flags.writeable
+        np.testing.assert_array_equal(stored, given_array)
+    other = p.copy()
+    other[0, 0, 0] = 0.75 if p[0, 0, 0] < 0.5 else 0.25
+    assert found.key == Occupancy(owner.copy(), p.astype(float)).key != Occupancy(owner, other).key
+
+
+@settings(max_examples=40, deadline=None)
 @given(labels, labels)
 def test_probabilities_follow_the_labels(before, after):
     rng = np.random.default_rng(0)

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from mstfilter.scene import Clip, Frame, Hypothesis
 from mstfilter.smc import Population
@@ -14,6 +15,7 @@ from mstfilter.tracking import (
     TrackingTransition,
     Warp,
 )
+from mstfilter.tracking.transition import _tracked_as
 from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, iou, slide
 
 RULES = {"mst": MstRule(), "paper": PaperRule(), "authors": AuthorsRule()}
@@ -77,6 +79,38 @@ def test_the_order_of_hypotheses_has_no_effect(rule, textured):
     for a, b in zip(forward.particles, backward.particles[::-1], strict=True):
         np.testing.assert_array_equal(a.labels, b.labels)
     assert forward.notes == backward.notes
+
+
+@given(st.lists(st.frozensets(st.integers(0, 30), min_size=8), min_size=1, max_size=8))
+def test_similar_segments_are_tracked_as_the_first_of_them(pixels):
+    found = _tracked_as([np.array(sorted(one)) for one in pixels], 0.9)
+    for k, n in enumerate(found):
+        earlier = sorted(set(found[:k]))
+        similar = [m for m in earlier if len(pixels[m] & pixels[k]) >= 0.9 * max(len(pixels[m]), len(pixels[k]))]
+        assert n == (similar[0] if similar else k)
+
+
+@pytest.mark.parametrize("share, n_tracked", [(0.03, 1), (0.3, 2)])
+def test_nearly_equal_segments_have_one_motion(share, n_tracked, textured):
+    """A hypothesis in which a strip of a moved object is missing, narrow or broad."""
+    scene, clip = textured
+    h = scene.hypothesis()
+    moved = predict(clip, h).particles[0]
+    label = next(r.label for r in moved.objects if np.abs(r.motion.translation).max() > 0.01)
+    voxels = np.argwhere(h.labels == label)
+    labels = h.labels.copy()
+    labels[tuple(voxels[voxels[:, 0] < np.quantile(voxels[:, 0], share)].T)] = 0
+    calls = []
+
+    class Counting(MstRule):
+        def candidates(self, rng, track):
+            calls.append(track.segment.key)
+            return super().candidates(rng, track)
+
+    pair = predict(clip, h, h.with_labels(labels), transition=TrackingTransition(Counting()))
+    first, second = (p.record(label).motion.as_matrix() for p in pair.particles)
+    assert np.array_equal(first, second) is (n_tracked == 1)
+    assert len(calls) >= n_tracked
 
 
 def test_a_stochastic_rule_moves_copies_differently_and_repeats_with_the_seed(textured):
