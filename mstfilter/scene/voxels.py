@@ -282,9 +282,7 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, init=False)
 class Occupancy:
-    """Probability that each voxel is occupied, given the objects of a hypothesis and the positions of the objects.
-
-    Most voxels have probability 0, so only the others are stored.
+    """Probability of each voxel, given the objects of a hypothesis. Stores only voxels that have an owner.
 
     Parameters
     ----------
