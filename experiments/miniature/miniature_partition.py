@@ -83,6 +83,7 @@ class CellView:
     """What an observation showed of an object: OWN, FREE, BEHIND or NOTHING of each cell (X, Y, 1)."""
 
     cells: np.ndarray
+    colours: ClassVar[np.ndarray] = np.zeros(0, np.float32)  # the world has no colours
 
     def shifted(self, step: tuple[int, int]) -> CellView:
         """The view after the object moved by `step`."""
