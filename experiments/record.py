@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -32,10 +31,12 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from mstfilter.processes import machine
+from mstfilter.reading import read_json
 from mstfilter.runs import library_versions, write_json
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -138,9 +139,12 @@ def _files(place: str) -> Iterator[str]:
 
 def _content(path: Path) -> bytes:
     """The bytes of a file; of Python code, the syntax tree without docstrings."""
-    if path.suffix != ".py":
-        return path.read_bytes()
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return _syntax(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
+
+
+@cache  # most studies depend on the same files
+def _syntax(code: bytes) -> bytes:
+    tree = ast.parse(code)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
             del node.body[0]
@@ -148,7 +152,7 @@ def _content(path: Path) -> bytes:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_json(path, "a record") if path.is_file() else {}
 
 
 def main() -> None:

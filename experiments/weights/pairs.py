@@ -12,10 +12,11 @@ terms/*.npz: probabilities of one recording (finished recordings are not run aga
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from reliability import FAMILIES, SHORT, Question, classes, disagreements, forecasts, recorded
+from reliability import FAMILIES, SHORT, Question, classes, disagreements, finished, forecasts, recorded
 
 import mstfilter
 from mstfilter.files import write_csv
@@ -110,15 +111,9 @@ def main() -> None:
     options = parser.parse_args()
     if options.smoke and options.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    (options.out / "terms").mkdir(parents=True, exist_ok=True)
-    scenes = []
-    for seed in range(1 if options.smoke else options.seeds):
-        for family in ("s1",) if options.smoke else FAMILIES:
-            path = options.out / "terms" / f"{family}-{seed}.npz"
-            if not path.exists():
-                np.savez_compressed(path, **of_recording(family, seed, 2 if options.smoke else 9))
-                print(path.stem, flush=True)
-            scenes.append(np.load(path)["p"])
+    n_seeds, families, n_actions = (1, ("s1",), 2) if options.smoke else (options.seeds, FAMILIES, 9)
+    compute = partial(of_recording, n_actions=n_actions)
+    scenes = [found["p"] for found in finished(options.out / "terms", n_seeds, families, compute)]
     write_csv(options.out / "pairs.csv", table(scenes))
 
 

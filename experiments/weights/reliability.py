@@ -15,8 +15,9 @@ errors and log losses for each question and T. bins.csv: the reliability diagram
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -373,6 +374,24 @@ def draw(diagrams: dict[tuple[str, float], Reliability], path: Path) -> None:
     plt.close(figure)
 
 
+def finished(
+    folder: Path, seeds: int, families: Sequence[str], compute: Callable[[str, int], dict[str, np.ndarray]]
+) -> Iterator[dict[str, np.ndarray]]:
+    """The arrays of each recording, which `compute` makes from family and seed and a file of the folder keeps."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(seeds):
+        for family in families:
+            path = folder / f"{family}-{seed}.npz"
+            if not path.exists():
+                try:
+                    np.savez_compressed(path, **compute(family, seed))
+                except InputError as error:  # the objects of some seeds cannot be arranged
+                    print(path.stem, error, flush=True)
+                    continue
+                print(path.stem, flush=True)
+            yield dict(np.load(path))
+
+
 def main() -> None:
     """Run the missing recordings, then make the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -382,20 +401,9 @@ def main() -> None:
     chosen = parser.parse_args()
     if chosen.smoke and chosen.out == parser.get_default("out"):
         parser.error("--smoke would overwrite the results: name another folder with --out")
-    (chosen.out / "scenes").mkdir(parents=True, exist_ok=True)
-    scenes = []
-    for seed in range(2 if chosen.smoke else chosen.seeds):
-        for family in ("s1",) if chosen.smoke else FAMILIES:
-            path = chosen.out / "scenes" / f"{family}-{seed}.npz"
-            if not path.exists():
-                try:
-                    np.savez_compressed(path, **of_recording(family, seed, 2 if chosen.smoke else 9))
-                except InputError as error:  # the objects of some seeds cannot be arranged
-                    print(path.stem, error, flush=True)
-                    continue
-                print(path.stem, flush=True)
-            scenes.append(dict(np.load(path)))
-    tables(scenes, chosen.out)
+    n_seeds, families, n_actions = (2, ("s1",), 2) if chosen.smoke else (chosen.seeds, FAMILIES, 9)
+    compute = partial(of_recording, n_actions=n_actions)
+    tables(list(finished(chosen.out / "scenes", n_seeds, families, compute)), chosen.out)
 
 
 if __name__ == "__main__":
