@@ -86,6 +86,11 @@ class Readings:
         found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
         return found[nearest][of_reading]
 
+    def share_voxel(self, chosen: np.ndarray) -> np.ndarray:
+        """Whether the voxel of each reading (m,) contains a chosen reading (m,) bool."""
+        of_reading = self._distinct[1]
+        return (np.bincount(of_reading, chosen) > 0)[of_reading]
+
     @cached_property
     def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
         """The distinct voxels (k, 3) with readings, and the voxel of each reading (m,)."""

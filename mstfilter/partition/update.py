@@ -169,18 +169,21 @@ class PartitionUpdate(Update):
         """
         check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
         check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
-        mended = self._mended(observation)
+        found = foreground(observation.after, observation.grid)
+        # Free-space projection does not use the estimates of missing depth.
+        mended = Clip((found.frame,), observation.grid, observation.index) if self.mend else observation
         readings = Readings.of(mended.after, mended.grid)
+        raised = readings.of_image(found.pixels)
         if predicted is None:
             assert proposed is not None
-            described, segments = _distinct(proposed, _segments(proposed, readings))
+            described, segments = _distinct(proposed, _segments(proposed, readings, raised))
             objects_of = partial(_new_objects, segments)
         else:
             projected = self._project(predicted, observation)
             if proposed is None:
                 return projected
             predictions = self._predictions(predicted, projected, readings, observation.after)
-            cells = Cells.of(readings, _segments(proposed, readings), [one.objects for one in predictions])
+            cells = Cells.of(readings, _segments(proposed, readings, raised), [one.objects for one in predictions])
             choices = self._choices(cells, predictions, projected.log_weights, mended)
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)
@@ -191,10 +194,6 @@ class PartitionUpdate(Update):
 
         candidates = replace(described, particles=Candidates(build, len(described)))
         return self._scored(candidates, observation) if self.evidence else candidates
-
-    def _mended(self, clip: Clip) -> Clip:
-        """The last frame with estimated missing depth. Free-space projection does not use the estimates."""
-        return Clip((foreground(clip.after, clip.grid).frame,), clip.grid, clip.index) if self.mend else clip
 
     # 1. Free-space projection -----------------------------------------------------------------------------------
 
@@ -341,13 +340,19 @@ class PartitionUpdate(Update):
         return replace(built, log_weights=built.log_weights + total, notes={**built.notes, "scores": scores})
 
 
-def _segments(proposed: Population, readings: Readings) -> list[np.ndarray]:
-    """The segment (m,) of each reading in each sample, where 0 means none.
+def _segments(proposed: Population, readings: Readings, raised: np.ndarray) -> list[np.ndarray]:
+    """The segment (m,) of each reading in each sample, where 0 means none. `raised` (m,) bool: above the table.
 
-    A reading belongs to the segment of its voxel, or to the nearest segment within one voxel. At a border, a pixel of
-    one object can measure the depth of another object.
+    A reading above the table belongs to the segment of its voxel, or to the nearest segment within one voxel. At a
+    border, a pixel of one object can measure the depth of another object. Any other reading belongs to the segment
+    of its voxel, or to the table if the voxel contains a reading above the table.
     """
-    found = {id(h): readings.labels(h.labels, 1.0) for h in {id(h): h for h in proposed.particles}.values()}
+    beside = readings.share_voxel(raised)
+
+    def labels(h: Hypothesis) -> np.ndarray:
+        return np.where(raised, readings.labels(h.labels, 1.0), np.where(beside, 0, readings.labels(h.labels, 0.0)))
+
+    found = {id(h): labels(h) for h in {id(h): h for h in proposed.particles}.values()}
     return [found[id(h)] for h in proposed.particles]
 
 
