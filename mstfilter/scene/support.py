@@ -36,7 +36,6 @@ _SMALLEST = 25  # pixels of a region of readings
 _RISE = 1.75  # mean rise of a region of readings, in tolerances
 _SMALLEST_DARK = 60  # pixels of a region without readings
 _COLOUR_REACH = 40.0  # standard deviation of the surroundings that show the colour of the table, pixels
-_EMPTY = 0.05  # share of readings of a row or column in the margin of the image, at most
 _TABLE_NEAR = 0.1  # share of table in these surroundings
 _COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the table; 1 % of its pixels are above
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
@@ -227,12 +226,12 @@ def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarr
 
 
 def _measured_part(frame: Frame) -> np.ndarray:
-    """The rectangle (H, W) bool of the image that contains readings. Registered depth images have empty margins."""
-    part = np.zeros(frame.depth.shape, bool)
-    rows, columns = (np.flatnonzero(frame.valid.mean(axis=axis) >= _EMPTY) for axis in (1, 0))
-    if len(rows) and len(columns):
-        part[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
-    return part
+    """The convex hull (H, W) bool of the readings, without its rim. Registered depth images have empty margins."""
+    part = np.zeros(frame.depth.shape, np.uint8)
+    points = cv2.findNonZero(cv2.erode(frame.valid.astype(np.uint8), np.ones((3, 3), np.uint8)))
+    if points is not None:
+        cv2.fillConvexPoly(part, cv2.convexHull(points), 1)
+    return cv2.erode(part, _ellipse(_reach(part.shape[1]))) > 0
 
 
 def _surroundings(image: np.ndarray) -> np.ndarray:

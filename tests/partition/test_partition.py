@@ -10,6 +10,7 @@ import pytest
 from mstfilter.completion import Extrude, SurfaceOnly
 from mstfilter.errors import InputError
 from mstfilter.partition import PairEvidence, PartitionUpdate, Readings
+from mstfilter.partition.update import _segments
 from mstfilter.scene import Clip, Evidence, Hypothesis, Occupancy, surface_agreement
 from mstfilter.segmentation import hypothesis_of
 from mstfilter.smc import Population
@@ -212,6 +213,20 @@ def test_labels_of_readings_by_brute_force():
         distance = np.linalg.norm(occupied - voxel, axis=1)
         nearest = {int(labels[tuple(v)]) for v in occupied[distance == distance.min()]}
         assert label in nearest if distance.min() <= 2.5 else label == 0
+
+
+@pytest.mark.parametrize(
+    ("labelled", "expected"), [((10, 10, 0), [1, 0, 1, 0, 0, 0]), ((20, 20, 0), [0, 0, 0, 0, 1, 0])]
+)
+def test_readings_of_the_table_belong_to_an_object_only_if_its_voxel_has_no_others(labelled, expected):
+    """A voxel with readings of the table and of an object, beside a voxel with readings of the table alone."""
+    labels = np.zeros(GRID.shape, np.uint16)
+    labels[labelled] = 7
+    voxels = np.array([(10, 10, 0), (10, 10, 0), (11, 10, 0), (11, 10, 0), (20, 20, 0), (21, 20, 0)])
+    raised = np.array([True, False, True, False, False, False])
+    readings = Readings(np.arange(6), voxels, (2, 3))
+    found = _segments(Population((Hypothesis.from_labels(labels, GRID),)), readings, raised)[0]
+    np.testing.assert_array_equal(found > 0, expected)
 
 
 def test_candidates_have_the_weights_of_their_predictions():
