@@ -226,12 +226,12 @@ def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarr
 
 
 def _measured_part(frame: Frame) -> np.ndarray:
-    """The convex hull (H, W) bool of the readings, without its rim. Registered depth images have empty margins."""
+    """The convex hull (H, W) bool of the readings. Registered depth images have empty margins."""
     part = np.zeros(frame.depth.shape, np.uint8)
     points = cv2.findNonZero(cv2.erode(frame.valid.astype(np.uint8), np.ones((3, 3), np.uint8)))
     if points is not None:
         cv2.fillConvexPoly(part, cv2.convexHull(points), 1)
-    return cv2.erode(part, _ellipse(_reach(part.shape[1]))) > 0
+    return part > 0
 
 
 def _surroundings(image: np.ndarray) -> np.ndarray:
