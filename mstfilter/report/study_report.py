@@ -17,7 +17,7 @@ from mstfilter.report.figures import differences_figure, figure_groups, reliabil
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
 from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import CLAIM
-from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, title_of
+from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, interval_text, number_text, title_of
 
 # Columns of the tables of results: name in the study, heading.
 _TABLES = {
@@ -72,9 +72,8 @@ def _page(study: StudyFolder) -> str:
     filters: dict[str, Callable[..., str]] = {
         "metric_title": title_of,
         "seconds": seconds_text,
-        "number": _number,
-        "signed": lambda x: _number(x, "+"),
-        "range": _range,
+        "number": number_text,
+        "interval": interval_text,
     }
     records, failures = study.records(), study.failures()
     summary = study.summary(records)
@@ -125,16 +124,6 @@ def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
             if group
         ]
     return figures
-
-
-def _number(value: float | None, sign: str = "") -> str:
-    """A number with three decimals; a dash for an unknown value."""
-    return "–" if value is None or value != value else f"{value:{sign}.3f}"
-
-
-def _range(ends: tuple[float, float], sign: str = "") -> str:
-    """An interval as text; a dash for an unknown interval."""
-    return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
 
 
 def _drawn(

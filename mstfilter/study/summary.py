@@ -41,6 +41,16 @@ def bounds_of(metric: str) -> tuple[float, float]:
     return 0.0, 1.0 if metric.startswith(_SHARES) else np.inf
 
 
+def number_text(value: float | None, sign: str = "") -> str:
+    """A number with three decimals; a dash for an unknown value. `sign` is "+" to write the sign of all numbers."""
+    return "–" if value is None or value != value else f"{value:{sign}.3f}"
+
+
+def interval_text(low: float, high: float, sign: str = "") -> str:
+    """An interval as text; a dash for an unknown interval."""
+    return "–" if low != low else f"[{low:{sign}.3f}, {high:{sign}.3f}]"
+
+
 @dataclass(frozen=True)
 class ArmMetric:
     """A metric of an arm on the scenes of a family.
@@ -112,6 +122,8 @@ class Summary:
     families, arms, names : tuple of str
         Families, arms and names of metrics, in the order of the study.
     reference : str
+    warm : bool
+        Whether all times are of runs that found work in the cache that other runs have done.
     metrics : tuple of ArmMetric
     differences : tuple of Compared
         Primary endpoints first, then their slopes, then all other metrics.
@@ -121,6 +133,7 @@ class Summary:
     arms: tuple[str, ...]
     names: tuple[str, ...]
     reference: str
+    warm: bool
     metrics: tuple[ArmMetric, ...]
     differences: tuple[Compared, ...]
 
@@ -233,7 +246,7 @@ def summarise(
         for arm in arms
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
     ]
-    return Summary(families, arms, names, reference, metrics, _adjust(differences))
+    return Summary(families, arms, names, reference, set(seeds) == set(filling), metrics, _adjust(differences))
 
 
 def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
