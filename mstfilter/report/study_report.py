@@ -13,11 +13,20 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mstfilter.report.figures import differences_figure, figure_groups, reliability_figure, time_figure
+from mstfilter.report.identities import match_runs
 from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
+from mstfilter.report.pictures import viewpoint
+from mstfilter.report.run_report import scene_content
+from mstfilter.report.scenes import scene_of_run
+from mstfilter.runs import RunFolder
 from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import CLAIM
 from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, interval_text, number_text, title_of
+
+_MOST_ROWS, _MOST_PICTURES = 3, 4  # pauses with large differences: of each arm and endpoint, with pictures
 
 # Columns of the tables of results: name in the study, heading.
 _TABLES = {
@@ -89,6 +98,7 @@ def _page(study: StudyFolder) -> str:
         simulated=any("family" in scene["source"] for scene in study.description["scenes"]),
         scenes=scenes,
         claim=CLAIM,
+        endpoints=ENDPOINTS,
         compared=[one for name in ENDPOINTS for one in summary.compared(name) if one.difference.n],
         better=[
             f"{summary.reference} is better than {arm} on {family}."
@@ -96,6 +106,9 @@ def _page(study: StudyFolder) -> str:
             for arm in summary.arms
             if summary.is_better(family, arm)
         ],
+        values={(one.family, one.arm, one.name): one.by_scene for one in summary.metrics if one.name in ENDPOINTS},
+        extremes=(extremes := _extremes(study, records, summary)),
+        pictures=_pictures(study, extremes),
         tables={
             title: chosen
             for title, columns in _TABLES.items()
@@ -124,6 +137,49 @@ def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
             if group
         ]
     return figures
+
+
+def _extremes(study: StudyFolder, records: Sequence[Mapping[str, Any]], summary: Summary) -> list[dict[str, Any]]:
+    """The pauses at which the mean over seeds of an endpoint differs most between an arm and the reference."""
+    values: dict[Any, dict[Any, float]] = defaultdict(dict)
+    for row in records:
+        for name in ENDPOINTS:
+            if row["pause"] >= 1 and row.get(name) is not None:
+                values[row["arm"], name][row["scene"], row["pause"], row["seed"]] = row[name]
+    found: list[dict[str, Any]] = []
+    for arm in summary.arms:
+        for name in ENDPOINTS if arm != summary.reference and arm not in study.reported_only else ():
+            theirs, ours = values[arm, name], values[summary.reference, name]
+            pairs: dict[Any, list[tuple[float, float, int]]] = defaultdict(list)
+            for scene, pause, seed in [place for place in theirs if place in ours]:
+                pairs[scene, pause].append((theirs[scene, pause, seed], ours[scene, pause, seed], seed))
+            rows = []
+            for (scene, pause), of in pairs.items():
+                value, reference, _ = np.mean(of, axis=0).tolist()
+                _, seed = max((abs(a - b), -seed) for a, b, seed in of)
+                place = {"metric": name, "arm": arm, "scene": scene, "pause": pause, "seed": -seed}
+                rows.append({**place, "value": value, "reference": reference, "difference": value - reference})
+            rows.sort(key=lambda row: -abs(row["difference"]))
+            found += [{**row, "rank": rank} for rank, row in enumerate(rows[:_MOST_ROWS])]
+    return found
+
+
+def _pictures(study: StudyFolder, extremes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Hypotheses of both arms at a few of the `extremes` whose runs have been kept, the largest of each arm first."""
+    folders = {(r["arm"], r["scene"], r["seed"]): study.run(r["folder"]) for r in study.description["runs"]}
+    found: dict[Any, dict[str, Any]] = {}
+    for row in sorted(extremes, key=lambda row: row["rank"]):
+        t, arms = row["pause"], (study.description["reference"], row["arm"])
+        key = row["arm"], row["scene"], t
+        runs = [RunFolder(folders[arm, row["scene"], row["seed"]]) for arm in arms]
+        if len(found) == _MOST_PICTURES or key in found or not all(run.pause(t).is_dir() for run in runs):
+            continue
+        scenes = [scene_of_run(*one, 3) for one in zip(runs, (t, t), match_runs(runs, t), strict=True)]
+        volumes = [one.hypothesis for scene in scenes for one in scene.views]
+        view = viewpoint(volumes, scenes[0].camera)
+        both = [scene_content(scene, volumes, view) for scene in scenes]
+        found[key] = {**row, **both[0], "t": len(found), "arms": list(zip(arms, both, strict=True))}
+    return list(found.values())
 
 
 def _drawn(

@@ -289,7 +289,9 @@ class StudyFolder:
             if n := _counts_text(d.n for d in of_arm):
                 texts = [s for d in of_arm for s in (_estimate(d.mean, d.low, d.high, "+"), _p_text(d.p_holm))]
                 differences.append([*start, n, *texts])
-        how = "over pauses (without the first), filter seeds and n scenes, with 95 % t intervals. Quality is from 0 to"
+        how = (
+            "over pauses (without the first), filter seeds and n scenes, with 95 % t intervals. Quality is from 0 to"
+        )
         how += " 1 (higher is better). Log loss is recalibrated (lower is better)."
         how += " * uses the ground truth." if self.truth_users else ""
         time = "with a warm cache" if found.warm else "and shared work counts for the first method that needs it"
@@ -313,13 +315,14 @@ def _counts_text(counts: Iterable[int]) -> str:
     return " / ".join(dict.fromkeys(str(n) for n in counts if n))
 
 
-_TEX: dict[str, str | int | None] = {c: f"\\{c}" for c in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
-_TEX |= {"\\": r"\textbackslash{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
+_TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
+_TEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 
 
 def _tex(text: str) -> str:
     """Text for LaTeX, with signs of numbers in math mode."""
-    return re.sub(r"(?<![\w.])[-+](?=\d+\.\d)", r"$\g<0>$", text.translate(str.maketrans(_TEX)))
+    escaped = "".join(_TEX.get(c, f"\\{c}" if c in "&%$#_{}" else c) for c in text)
+    return re.sub(r"(?<![\w.])[-+](?=\d+\.\d)", r"$\g<0>$", escaped)
 
 
 def latex_table(cells: Sequence[Sequence[str]], caption: str, label: str) -> str:
