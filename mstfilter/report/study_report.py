@@ -22,47 +22,10 @@ from mstfilter.report.pictures import viewpoint
 from mstfilter.report.run_report import scene_content
 from mstfilter.report.scenes import scene_of_run
 from mstfilter.runs import RunFolder
-from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import CLAIM
-from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, interval_text, number_text, title_of
+from mstfilter.study import ENDPOINTS, StudyFolder, Summary, interval_text, number_text, title_of
 
 _MOST_ROWS, _MOST_PICTURES = 3, 4  # pauses with large differences: of each arm and endpoint, with pictures
-
-# Columns of the tables of results: name in the study, heading.
-_TABLES = {
-    "Quality": (
-        ("quality", "quality"),
-        (SLOPES["quality"], "slope"),
-        ("quality_top", "most probable"),
-        ("quality_best", "best of n"),
-        ("quality_estimate", "estimate"),
-        ("quality_visible", "visible objects"),
-        ("quality_hidden", "hidden, seen before"),
-        ("quality_unseen", "never seen"),
-        ("quality_one_blob", "baseline: one blob"),
-        ("quality_components", "baseline: components"),
-    ),
-    "Log loss": (
-        (LOG_LOSS, "recalibrated"),
-        (SLOPES[LOG_LOSS], "slope"),
-        ("log_loss", "as it comes"),
-        ("calibration_error", "calibration error"),
-        ("brier", "Brier"),
-        ("diversity", "diversity"),
-    ),
-    "Objects and volume": (
-        ("object_f", "object F"),
-        ("split", "split"),
-        ("merged", "merged"),
-        ("missed", "missed"),
-        ("invented", "invented"),
-        ("occupancy", "occupancy IoU"),
-        ("volume_missed", "missed volume"),
-        ("volume_invented", "invented volume"),
-        ("quality_authors", "quality, authors' form"),
-        ("quality_paper", "quality, paper's form"),
-    ),
-}
 
 
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
@@ -100,23 +63,12 @@ def _page(study: StudyFolder) -> str:
         claim=CLAIM,
         endpoints=ENDPOINTS,
         compared=[one for name in ENDPOINTS for one in summary.compared(name) if one.difference.n],
-        better=[
-            f"{summary.reference} is better than {arm} on {family}."
-            for family in summary.families
-            for arm in summary.arms
-            if summary.is_better(family, arm)
-        ],
         values={(one.family, one.arm, one.name): one.by_scene for one in summary.metrics if one.name in ENDPOINTS},
         extremes=(extremes := _extremes(study, records, summary)),
         pictures=_pictures(study, extremes),
-        tables={
-            title: chosen
-            for title, columns in _TABLES.items()
-            if (chosen := [(name, heading) for name, heading in columns if name in summary.names])
-        },
         figures=_drawn(records, summary, study.reported_only),
         reliability=_reliability(study, summary),
-        costs=_costs(summary),
+        stages=[name for name in summary.names if name.startswith("seconds_")],
         arms=_arms(study.description),
         truth_users=study.truth_users,
         failures=failures,
@@ -141,27 +93,26 @@ def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
 
 def _extremes(study: StudyFolder, records: Sequence[Mapping[str, Any]], summary: Summary) -> list[dict[str, Any]]:
     """The pauses at which the mean over seeds of an endpoint differs most between an arm and the reference."""
-    values: dict[Any, dict[Any, float]] = defaultdict(dict)
-    for row in records:
-        for name in ENDPOINTS:
-            if row["pause"] >= 1 and row.get(name) is not None:
-                values[row["arm"], name][row["scene"], row["pause"], row["seed"]] = row[name]
-    found: list[dict[str, Any]] = []
-    for arm in summary.arms:
-        for name in ENDPOINTS if arm != summary.reference and arm not in study.reported_only else ():
-            theirs, ours = values[arm, name], values[summary.reference, name]
-            pairs: dict[Any, list[tuple[float, float, int]]] = defaultdict(list)
-            for scene, pause, seed in [place for place in theirs if place in ours]:
-                pairs[scene, pause].append((theirs[scene, pause, seed], ours[scene, pause, seed], seed))
-            rows = []
-            for (scene, pause), of in pairs.items():
-                value, reference, _ = np.mean(of, axis=0).tolist()
-                _, seed = max((abs(a - b), -seed) for a, b, seed in of)
-                place = {"metric": name, "arm": arm, "scene": scene, "pause": pause, "seed": -seed}
-                rows.append({**place, "value": value, "reference": reference, "difference": value - reference})
-            rows.sort(key=lambda row: -abs(row["difference"]))
-            found += [{**row, "rank": rank} for rank, row in enumerate(rows[:_MOST_ROWS])]
-    return found
+    values = {
+        (name, row["arm"], row["scene"], row["pause"], row["seed"]): row[name]
+        for row in records
+        for name in ENDPOINTS
+        if row["pause"] >= 1 and row.get(name) is not None
+    }
+    pairs: dict[Any, list[tuple[float, ...]]] = defaultdict(list)
+    for (name, arm, *place, seed), value in values.items():
+        ours = values.get((name, summary.reference, *place, seed))
+        if ours is not None and arm not in (summary.reference, *study.reported_only):
+            pairs[arm, name, *place].append((value - ours, value, ours, seed))
+    found: dict[Any, list[dict[str, Any]]] = defaultdict(list)
+    for (arm, name, scene, pause), of in pairs.items():
+        means = zip(("difference", "value", "reference"), np.mean(of, axis=0).tolist(), strict=False)
+        seed = max(of, key=lambda one: abs(one[0]))[-1]
+        found[arm, name].append(
+            {"arm": arm, "metric": name, "scene": scene, "pause": pause, "seed": seed, **dict(means)}
+        )
+    largest = [sorted(rows, key=lambda row: -abs(row["difference"]))[:_MOST_ROWS] for rows in found.values()]
+    return [{**row, "rank": rank} for rows in largest for rank, row in enumerate(rows)]
 
 
 def _pictures(study: StudyFolder, extremes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -213,24 +164,6 @@ def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str,
         if of_row and of_row[0] is not None:
             values[row["family"]][row["arm"]][row["pause"]] += of_row
     return values
-
-
-def _costs(summary: Summary) -> dict[str, Any]:
-    """Seconds of each stage, core seconds and memory, by family and arm, as means over pauses."""
-    stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
-    rows: list[dict[str, Any]] = []
-    per = ("seconds_", "peak_mb")
-    for family in summary.families:
-        for arm in summary.arms:
-            cells = {
-                name: metric.mean
-                for name in ("seconds", "core_seconds", *(n for n in summary.names if n.startswith(per)))
-                if (metric := summary.metric(family, arm, name)) is not None
-            }
-            if cells:
-                rows.append({"family": family, "arm": arm, **cells})
-    most = max((sum(float(r.get(f"seconds_{s}", 0.0)) for s in stages) for r in rows), default=1.0)
-    return {"stages": stages, "rows": rows, "most": most or 1.0}
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

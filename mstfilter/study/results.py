@@ -178,12 +178,6 @@ class StudyFolder:
         """Path of the folder of a run, from the name of the folder."""
         return self.path / "runs" / folder
 
-    def write_failure(self, folder: str, identity: str, outcome: JobOutcome) -> None:
-        """Record why a run failed."""
-        record = {"identity": identity, "status": "failed", "error": outcome.error, "hints": outcome.hints}
-        self.run(folder).mkdir(parents=True, exist_ok=True)
-        write_result(self.run(folder), {**record, "tries": outcome.tries, "trace": outcome.trace})
-
     def failures(self) -> list[dict[str, Any]]:
         """Runs of this study that failed: name, error, hints, tries, folder, trace."""
         found = []
@@ -281,18 +275,17 @@ class StudyFolder:
         for family, arm in itertools.product(found.families, found.arms):
             start = [family, f"{arm} *" if arm in self.truth_users else arm]
             values = [found.metric(family, arm, name) or ArmMetric(family, arm, name, {}) for name in ENDPOINTS]
-            if n := _counts_text(len(one.by_scene) for one in values):
+            if n := _numbers(len(one.by_scene) for one in values):
                 seconds = found.metric(family, arm, "seconds")
                 texts = [_estimate(one.mean, *one.interval) for one in values]
                 means.append([*start, n, *texts, "–" if seconds is None else f"{seconds.mean:.2f}"])
             of_arm = [pairs.get((family, arm, name), compare({}, {})) for name in ENDPOINTS]
-            if n := _counts_text(d.n for d in of_arm):
-                texts = [s for d in of_arm for s in (_estimate(d.mean, d.low, d.high, "+"), _p_text(d.p_holm))]
-                differences.append([*start, n, *texts])
-        how = (
-            "over pauses (without the first), filter seeds and n scenes, with 95 % t intervals. Quality is from 0 to"
-        )
-        how += " 1 (higher is better). Log loss is recalibrated (lower is better)."
+            if n := _numbers(d.n for d in of_arm):
+                p = [number_text(d.p_holm).replace("0.000", "<0.001") for d in of_arm]
+                texts = [_estimate(d.mean, d.low, d.high, "+") for d in of_arm]
+                differences.append([*start, n, *itertools.chain(*zip(texts, p, strict=True))])
+        how = "over pauses (without the first), filter seeds and n scenes, with 95 % t intervals. Quality is from "
+        how += "0 to 1 (higher is better). Log loss is recalibrated (lower is better)."
         how += " * uses the ground truth." if self.truth_users else ""
         time = "with a warm cache" if found.warm else "and shared work counts for the first method that needs it"
         pair = f"{found.reference} (method minus {found.reference}), paired by scene: means"
@@ -302,17 +295,13 @@ class StudyFolder:
         }
 
 
+def _numbers(of_endpoints: Iterable[int]) -> str:
+    """Numbers of scenes as text, one number if they are equal."""
+    return " / ".join(dict.fromkeys(str(n) for n in of_endpoints if n))
+
+
 def _estimate(mean: float, low: float, high: float, sign: str = "") -> str:
     return f"{number_text(mean, sign)} {interval_text(low, high, sign)}".replace(" –", "")
-
-
-def _p_text(p: float) -> str:
-    return "<0.001" if p < 0.0005 else number_text(p)
-
-
-def _counts_text(counts: Iterable[int]) -> str:
-    """Numbers of scenes of the two endpoints as text: one number if they are equal or one is 0."""
-    return " / ".join(dict.fromkeys(str(n) for n in counts if n))
 
 
 _TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}

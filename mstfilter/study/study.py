@@ -26,7 +26,7 @@ from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Executor, Local, Tell
 from mstfilter.study.plan import Plan, StudyRun, StudyScene, make_plan
-from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
+from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result, write_result
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -253,7 +253,8 @@ def _is_done(run: StudyRun, folder: StudyFolder) -> bool:
 def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
     """Record the reason of a failed run. If the disk is full, nothing is written."""
     with contextlib.suppress(OSError):
-        folder.write_failure(run.folder, run.identity, outcome)
+        folder.run(run.folder).mkdir(parents=True, exist_ok=True)
+        write_result(folder.run(run.folder), {"identity": run.identity, **asdict(outcome)})
 
 
 def _is_recorded(source: dict[str, Any], recordings: Path) -> bool:
