@@ -127,7 +127,7 @@ def _pictures(study: StudyFolder, extremes: Sequence[dict[str, Any]]) -> list[di
             continue
         scenes = [scene_of_run(*one, 3) for one in zip(runs, (t, t), match_runs(runs, t), strict=True)]
         volumes = [one.hypothesis for scene in scenes for one in scene.views]
-        view = viewpoint(volumes, scenes[0].camera)
+        view = viewpoint(volumes, scenes[0].camera, 480, 360)
         both = [scene_content(scene, volumes, view) for scene in scenes]
         found[key] = {**row, **both[0], "t": len(found), "arms": list(zip(arms, both, strict=True))}
     return list(found.values())
