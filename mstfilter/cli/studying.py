@@ -58,7 +58,7 @@ def _print_tables(folder: Any) -> None:
     for caption, (head, *rows) in folder.main_tables().values():
         table = Table(*head, caption=caption, caption_justify="left")
         for row in rows:
-            table.add_row(*map(Text, row))
+            table.add_row(*(Text(cell, overflow="fold") for cell in row))
         if rows:
             Console(width=None if sys.stdout.isatty() else 180).print(table)
 

@@ -311,14 +311,15 @@ _TEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
 def _tex(text: str) -> str:
     """Text for LaTeX, with signs of numbers in math mode."""
     escaped = "".join(_TEX.get(c, f"\\{c}" if c in "&%$#_{}" else c) for c in text)
-    return re.sub(r"(?<![\w.])[-+](?=\d+\.\d)", r"$\g<0>$", escaped)
+    return re.sub(r"(?<![\w.])[-+](?=\d+\.\d)", r"$\g<0>$", escaped).replace(r" \%", r"~\%")
 
 
 def latex_table(cells: Sequence[Sequence[str]], caption: str, label: str) -> str:
     """A table for LaTeX with the package booktabs. The first row of `cells` is the head."""
     head, *rows = [" & ".join(map(_tex, row)) + r" \\" for row in cells]
-    lines = [r"% \usepackage{booktabs}", r"\begin{table}", r"\centering\small", rf"\caption{{{_tex(caption)}}}"]
-    lines += [rf"\label{{{label}}}", rf"\begin{{tabular}}{{ll{'r' * (len(cells[0]) - 2)}}}", r"\toprule", head]
+    lines = [r"% \usepackage{booktabs}", r"\begin{table}", r"\centering", r"\footnotesize"]
+    lines += [rf"\caption{{{_tex(caption)}}}", rf"\label{{{label}}}"]
+    lines += [rf"\begin{{tabular}}{{ll{'r' * (len(cells[0]) - 2)}}}", r"\toprule", head]
     return "\n".join([*lines, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
 
 

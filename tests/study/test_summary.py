@@ -165,4 +165,4 @@ def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
         assert read(study / f"differences.{kind}")[1:] == [difference]
     caption = (study / "summary.md").read_text().split("\n")[0]
     assert "95 % t intervals" in caption and "n scenes" in caption and "warm cache" in caption
-    assert r"95 \% t intervals" in (study / "summary.tex").read_text()
+    assert r"95~\% t intervals" in (study / "summary.tex").read_text()
