@@ -317,7 +317,7 @@ def _tex(text: str) -> str:
 def latex_table(cells: Sequence[Sequence[str]], caption: str, label: str) -> str:
     """A table for LaTeX with the package booktabs. The first row of `cells` is the head."""
     head, *rows = [" & ".join(map(_tex, row)) + r" \\" for row in cells]
-    lines = [r"% \usepackage{booktabs}", r"\begin{table}", r"\centering", r"\footnotesize"]
+    lines = [r"% \usepackage{booktabs}", r"\begin{table}", r"\centering\footnotesize\setlength{\tabcolsep}{4pt}"]
     lines += [rf"\caption{{{_tex(caption)}}}", rf"\label{{{label}}}"]
     lines += [rf"\begin{{tabular}}{{ll{'r' * (len(cells[0]) - 2)}}}", r"\toprule", head]
     return "\n".join([*lines, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
