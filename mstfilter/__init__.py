@@ -9,7 +9,10 @@
 recordings and hypotheses.
 """
 
+import logging
+
 from mstfilter.lazy import attach
 
+logging.getLogger("mstfilter").addHandler(logging.NullHandler())  # the application decides what is shown
 __version__ = "0.1.0"
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import logging
 import os
 import platform
 import sys
@@ -44,6 +45,21 @@ def environment(**variables: str) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def log_lines(level: int = logging.INFO) -> Iterator[None]:
+    """Write messages of the logger "mstfilter" to standard error in the block, one line per message."""
+    logger, handler = logging.getLogger("mstfilter"), logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s  %(message)s", "%H:%M:%S"))
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def check_main_guard(what: str) -> None:

@@ -21,6 +21,7 @@ from mstfilter.errors import (
     missing_library,
     place_in_user_file,
 )
+from mstfilter.processes import log_lines
 
 _WITHOUT_TYPER = """Usage: mstfilter list [KIND]
 
@@ -30,10 +31,10 @@ Without typer, only `list`, --help and --version are available. For all commands
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line. Invalid input is reported as one ``error:`` line and exit code 2."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    debug = "--debug" in given
-    given = [a for a in given if a != "--debug"]
+    debug, verbose = "--debug" in given, "--verbose" in given
+    given = [a for a in given if a not in ("--debug", "--verbose")]
     try:
-        with _warnings_as_lines():
+        with _warnings_as_lines(), log_lines() if verbose else contextlib.nullcontext():
             _execute(given)
     except SystemExit as end:
         if end.code == 130:  # Ctrl-C

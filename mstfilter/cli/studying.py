@@ -39,7 +39,7 @@ def study(
         result = run_study(wanted, folder, Local(workers, folder / "logs"), overrides or (), progress=progress)
     print(f"study       {folder}")
     print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
-    _print_summary(result.folder.summary())
+    _print_tables(result.folder)
     for name, outcome in result.failed:
         print(f"failed      {name}: {outcome.error}")
         for hint in outcome.hints:
@@ -49,27 +49,18 @@ def study(
         raise typer.Exit(1)
 
 
-def _print_summary(summary: Any) -> None:
-    """Print the primary endpoints of each method by scene family, and the differences from the reference."""
+def _print_tables(folder: Any) -> None:
+    """Print the main tables of a study folder."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    from mstfilter.study import ENDPOINTS, title_of
-
-    table = Table("metric, t >= 1", "family", "arm", "n", "mean", "95 %", f"arm - {summary.reference}", "95 %")
-    compared = {(one.metric, one.family, one.arm): one.difference for one in summary.differences}
-    for one in (one for name in ENDPOINTS for one in summary.metrics if one.name == name):
-        d = compared.get((one.name, one.family, one.arm))
-        cells = ["", ""] if d is None else [f"{d.mean:+.3f}", _range(d.low, d.high, "+")]
-        numbers = str(len(one.by_scene)), f"{one.mean:.3f}", _range(*one.interval)
-        table.add_row(title_of(one.name), one.family, one.arm, *numbers, *cells)
-    if table.row_count:
-        Console(width=None if sys.stdout.isatty() else 180).print(table)
-
-
-def _range(low: float, high: float, sign: str = "") -> str:
-    """The text of an interval; a dash for NaN."""
-    return "–" if low != low else f"{low:{sign}.3f} .. {high:{sign}.3f}"
+    for caption, (head, *rows) in folder.main_tables().values():
+        table = Table(*head, caption=caption, caption_justify="left")
+        for row in rows:
+            table.add_row(*(Text(cell, overflow="fold") for cell in row))
+        if rows:
+            Console(width=None if sys.stdout.isatty() else 180).print(table)
 
 
 @app.command()

@@ -57,6 +57,15 @@ def assign_identities(run: RunFolder) -> Identities:
     return Identities(assignment.table)
 
 
+def match_runs(runs: Sequence[RunFolder], t: int) -> list[Identities]:
+    """Identities of pause `t` of each run of one recording. Matching objects have the same identity in all runs."""
+    assignment, hypotheses = _Assignment(), [run.hypotheses(t) for run in runs]
+    weights = [weight for run in runs for weight in run.info(t)["weights"]]
+    assignment.add(t, [h for of_run in hypotheses for h in of_run], weights, None, runs[0].truth(t))
+    first = [sum(map(len, hypotheses[:k])) for k in range(len(runs))]
+    return [Identities({(i, j - n * (j >= 0)): of for (i, j), of in assignment.table.items()}) for n in first]
+
+
 def match_objects(hypotheses: Sequence[Hypothesis], weights: Sequence[float]) -> list[dict[int, Colour]]:
     """Colours of the objects of each hypothesis at one pause. Matching objects have the same colour."""
     assignment = _Assignment()

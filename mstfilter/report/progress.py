@@ -9,8 +9,12 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
+
+from mstfilter.processes import log_lines
 
 
 @contextlib.contextmanager
@@ -49,7 +53,17 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Progress bars for a study. Yields a function of a `StudyProgress`. Failed jobs are printed above the bars."""
+    """Progress bars for a study. Yields a function of a `StudyProgress`. Failed jobs are printed above the bars.
+
+    If standard error is not a terminal, or if messages are shown, each finished job is a line of the log instead.
+    """
+    from rich import get_console
+
+    shown = logging.getLogger("mstfilter").isEnabledFor(logging.INFO)
+    if shown or not (sys.stderr.isatty() or get_console().is_jupyter):
+        with contextlib.nullcontext() if shown else log_lines():
+            yield lambda p: None
+        return
     tasks: dict[str, Any] = {}
     with _bars() as bars:
 

@@ -18,23 +18,14 @@ import numpy as np
 
 from mstfilter.belief import Belief
 from mstfilter.report.figures import quality_figure, reliability_figure
-from mstfilter.report.page import (
-    fill_template,
-    flatten,
-    note_rows,
-    seconds_text,
-    short_text,
-    write_page,
-)
+from mstfilter.report.page import fill_template, flatten, note_rows, seconds_text, short_text, write_page
 from mstfilter.report.pictures import PALETTE, close_up, data_uri, jpeg_bytes, png_bytes, shade_layer, viewpoint
 from mstfilter.report.run_numbers import SLOT_TITLES, RunNumbers, read_numbers
-from mstfilter.report.scenes import ShownHypothesis, scenes_of_run
+from mstfilter.report.scenes import ShownHypothesis, ShownPause, scenes_of_run
 from mstfilter.report.viewer import run_page
 from mstfilter.runs import RunFolder
-from mstfilter.scene import Camera, project
-from mstfilter.scoring import (
-    forecast_table,
-)
+from mstfilter.scene import Camera, Hypothesis, project
+from mstfilter.scoring import forecast_table
 
 _MOST_BORDERS = 6  # with numbers, in the picture of a pause
 
@@ -77,23 +68,25 @@ def _pauses(run: RunFolder, numbers: RunNumbers) -> list[dict[str, Any]]:
     pauses = []
     for t, (step, scene) in enumerate(zip(numbers.steps, scenes, strict=True)):
         population = run.state(t).population
-        assert scene.camera is not None and scene.image is not None and view is not None and population is not None
-        cards = [_card(one, scene.camera, view) for one in scene.views]
-        pauses.append(
-            {
-                "t": t,
-                "step": step,
-                "photo": data_uri(jpeg_bytes(scene.image), "jpeg"),
-                "width": scene.camera.width,
-                "height": scene.camera.height,
-                "close_up": close_up(volumes, scene.camera),
-                "doubt": _doubt(Belief(population), scene.camera),
-                "cards": [card for card in cards if card["weight"] is not None],
-                "hidden": scene.hidden,
-                "further": [card for card in cards if card["weight"] is None],
-            }
-        )
+        assert scene.camera is not None and view is not None and population is not None
+        doubt = _doubt(Belief(population), scene.camera)
+        pauses.append({"t": t, "step": step, "doubt": doubt, **scene_content(scene, volumes, view)})
     return pauses
+
+
+def scene_content(scene: ShownPause, volumes: Sequence[Hypothesis], view: Camera) -> dict[str, Any]:
+    """Image and hypotheses of a pause, for the template. The close-up shows all `volumes`, `view` is a viewpoint."""
+    assert scene.camera is not None and scene.image is not None
+    cards = [_card(one, scene.camera, view) for one in scene.views]
+    return {
+        "photo": data_uri(jpeg_bytes(scene.image), "jpeg"),
+        "width": scene.camera.width,
+        "height": scene.camera.height,
+        "close_up": close_up(volumes, scene.camera),
+        "cards": [card for card in cards if card["weight"] is not None],
+        "hidden": scene.hidden,
+        "further": [card for card in cards if card["weight"] is None],
+    }
 
 
 def _card(one: ShownHypothesis, camera: Camera, view: Camera) -> dict[str, Any]:

@@ -10,12 +10,12 @@ Each hypothesis has a name, weight, quality and the colours of its objects (`mst
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from mstfilter.report.identities import TRUTH, assign_identities, names_of, weigh_distinct
+from mstfilter.report.identities import TRUTH, Identities, assign_identities, names_of, weigh_distinct
 from mstfilter.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
 from mstfilter.runs import RunFolder
 from mstfilter.scene import Camera, Frame, Hypothesis, Recording, VoxelGrid, project
@@ -34,6 +34,7 @@ class ShownHypothesis:
     weight: float | None = None  #: None for the truth
     colours: Mapping[int, Colour] = field(default_factory=dict)  #: used instead of the colours of the identities
     quality: float | None = None
+    members: Sequence[int] = ()  #: indices of identical hypotheses
 
     def colour(self, label: int) -> Colour:
         """Colour of an object."""
@@ -71,30 +72,33 @@ class ShownPause:
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
     """The pauses of a run, each with at most twelve distinct hypotheses, the most probable first, and the truth."""
-    identities, times = assign_identities(run), run.description["recording"]["times"]
-    scenes: list[ShownPause] = []
+    identities, scenes = assign_identities(run), []
     view_of: dict[int, int] = {}
     for t in range(run.n_pauses):
-        info, hypotheses, earlier = run.info(t), run.hypotheses(t), view_of
-        views, view_of = [], {}
-        groups = weigh_distinct(hypotheses, info["weights"])
-        for v, (members, weight) in enumerate(groups[:_MOST_VIEWS]):
-            k = members[0]
-            quality = None if info["quality"] is None else info["quality"]["objects"][k]
-            text = f"weight {weight:.2f}" + ("" if quality is None else f", quality {quality:.2f}")
-            identity = identities.of(t, k)
-            views.append(ShownHypothesis(names_of(members), text, hypotheses[k], identity, weight, quality=quality))
-            view_of |= dict.fromkeys(members, v)
-        parents = enumerate(info["parents"].get("previous") or ())
+        earlier, scene = view_of, scene_of_run(run, t, identities)
+        view_of = {k: v for v, view in enumerate(scene.views) for k in view.members}
+        parents = enumerate(run.info(t)["parents"].get("previous") or ())
         links = {(earlier[p], view_of[k]) for k, p in parents if p in earlier and k in view_of}
-        truth = run.truth(t)
-        if truth is not None:
-            known = Hypothesis.from_labels(truth, hypotheses[0].grid)
-            views.append(ShownHypothesis("truth", "", known, identities.of(t, TRUTH)))
-        hidden = float(sum(weight for _, weight in groups[_MOST_VIEWS:]))
-        named = f"pause {t}", views, float(times[t])
-        scenes.append(ShownPause(*named, run.rgb(t), run.camera(t), sorted(links), hidden))
+        scenes.append(replace(scene, links=sorted(links)))
     return scenes
+
+
+def scene_of_run(run: RunFolder, t: int, identities: Identities, n_views: int = _MOST_VIEWS) -> ShownPause:
+    """A pause of a run with at most `n_views` distinct hypotheses, the most probable first, and the truth."""
+    info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
+    views, groups = [], weigh_distinct(hypotheses, info["weights"])
+    for members, weight in groups[:n_views]:
+        k = members[0]
+        quality = None if info["quality"] is None else info["quality"]["objects"][k]
+        text = f"weight {weight:.2f}" + ("" if quality is None else f", quality {quality:.2f}")
+        shown = names_of(members), text, hypotheses[k], identities.of(t, k), weight
+        views.append(ShownHypothesis(*shown, quality=quality, members=members))
+    if truth is not None:
+        known = Hypothesis.from_labels(truth, hypotheses[0].grid)
+        views.append(ShownHypothesis("truth", "", known, identities.of(t, TRUTH)))
+    hidden = float(sum(weight for _, weight in groups[n_views:]))
+    time = float(run.description["recording"]["times"][t])
+    return ShownPause(f"pause {t}", views, time, run.rgb(t), run.camera(t), hidden=hidden)
 
 
 def scenes_of_recording(recording: Recording) -> list[ShownPause]:

@@ -13,47 +13,19 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mstfilter.report.figures import differences_figure, figure_groups, reliability_figure, time_figure
-from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
-from mstfilter.scoring import LOG_LOSS
-from mstfilter.statistics import CLAIM
-from mstfilter.study import ENDPOINTS, SLOPES, StudyFolder, Summary, title_of
+import numpy as np
 
-# Columns of the tables of results: name in the study, heading.
-_TABLES = {
-    "Quality": (
-        ("quality", "quality"),
-        (SLOPES["quality"], "slope"),
-        ("quality_top", "most probable"),
-        ("quality_best", "best of n"),
-        ("quality_estimate", "estimate"),
-        ("quality_visible", "visible objects"),
-        ("quality_hidden", "hidden, seen before"),
-        ("quality_unseen", "never seen"),
-        ("quality_one_blob", "baseline: one blob"),
-        ("quality_components", "baseline: components"),
-    ),
-    "Log loss": (
-        (LOG_LOSS, "recalibrated"),
-        (SLOPES[LOG_LOSS], "slope"),
-        ("log_loss", "as it comes"),
-        ("calibration_error", "calibration error"),
-        ("brier", "Brier"),
-        ("diversity", "diversity"),
-    ),
-    "Objects and volume": (
-        ("object_f", "object F"),
-        ("split", "split"),
-        ("merged", "merged"),
-        ("missed", "missed"),
-        ("invented", "invented"),
-        ("occupancy", "occupancy IoU"),
-        ("volume_missed", "missed volume"),
-        ("volume_invented", "invented volume"),
-        ("quality_authors", "quality, authors' form"),
-        ("quality_paper", "quality, paper's form"),
-    ),
-}
+from mstfilter.report.figures import differences_figure, figure_groups, reliability_figure, time_figure
+from mstfilter.report.identities import match_runs
+from mstfilter.report.page import fill_template, flatten, seconds_text, short_text, write_page
+from mstfilter.report.pictures import viewpoint
+from mstfilter.report.run_report import scene_content
+from mstfilter.report.scenes import scene_of_run
+from mstfilter.runs import RunFolder
+from mstfilter.statistics import CLAIM
+from mstfilter.study import ENDPOINTS, StudyFolder, Summary, interval_text, number_text, title_of
+
+_MOST_ROWS, _MOST_PICTURES = 3, 4  # pauses with large differences: of each arm and endpoint, with pictures
 
 
 def write_study_report(study: StudyFolder | str | Path, out: str | Path | None = None) -> Path:
@@ -72,9 +44,8 @@ def _page(study: StudyFolder) -> str:
     filters: dict[str, Callable[..., str]] = {
         "metric_title": title_of,
         "seconds": seconds_text,
-        "number": _number,
-        "signed": lambda x: _number(x, "+"),
-        "range": _range,
+        "number": number_text,
+        "interval": interval_text,
     }
     records, failures = study.records(), study.failures()
     summary = study.summary(records)
@@ -90,21 +61,14 @@ def _page(study: StudyFolder) -> str:
         simulated=any("family" in scene["source"] for scene in study.description["scenes"]),
         scenes=scenes,
         claim=CLAIM,
+        endpoints=ENDPOINTS,
         compared=[one for name in ENDPOINTS for one in summary.compared(name) if one.difference.n],
-        better=[
-            f"{summary.reference} is better than {arm} on {family}."
-            for family in summary.families
-            for arm in summary.arms
-            if summary.is_better(family, arm)
-        ],
-        tables={
-            title: chosen
-            for title, columns in _TABLES.items()
-            if (chosen := [(name, heading) for name, heading in columns if name in summary.names])
-        },
+        values={(one.family, one.arm, one.name): one.by_scene for one in summary.metrics if one.name in ENDPOINTS},
+        extremes=(extremes := _extremes(study, records, summary)),
+        pictures=_pictures(study, extremes),
         figures=_drawn(records, summary, study.reported_only),
         reliability=_reliability(study, summary),
-        costs=_costs(summary),
+        stages=[name for name in summary.names if name.startswith("seconds_")],
         arms=_arms(study.description),
         truth_users=study.truth_users,
         failures=failures,
@@ -127,14 +91,46 @@ def _reliability(study: StudyFolder, summary: Summary) -> list[Any]:
     return figures
 
 
-def _number(value: float | None, sign: str = "") -> str:
-    """A number with three decimals; a dash for an unknown value."""
-    return "–" if value is None or value != value else f"{value:{sign}.3f}"
+def _extremes(study: StudyFolder, records: Sequence[Mapping[str, Any]], summary: Summary) -> list[dict[str, Any]]:
+    """The pauses at which the mean over seeds of an endpoint differs most between an arm and the reference."""
+    values = {
+        (name, row["arm"], row["scene"], row["pause"], row["seed"]): row[name]
+        for row in records
+        for name in ENDPOINTS
+        if row["pause"] >= 1 and row.get(name) is not None
+    }
+    pairs: dict[Any, list[tuple[float, ...]]] = defaultdict(list)
+    for (name, arm, *place, seed), value in values.items():
+        ours = values.get((name, summary.reference, *place, seed))
+        if ours is not None and arm not in (summary.reference, *study.reported_only):
+            pairs[arm, name, *place].append((value - ours, value, ours, seed))
+    found: dict[Any, list[dict[str, Any]]] = defaultdict(list)
+    for (arm, name, scene, pause), of in pairs.items():
+        means = zip(("difference", "value", "reference"), np.mean(of, axis=0).tolist(), strict=False)
+        seed = max(of, key=lambda one: abs(one[0]))[-1]
+        found[arm, name].append(
+            {"arm": arm, "metric": name, "scene": scene, "pause": pause, "seed": seed, **dict(means)}
+        )
+    largest = [sorted(rows, key=lambda row: -abs(row["difference"]))[:_MOST_ROWS] for rows in found.values()]
+    return [{**row, "rank": rank} for rows in largest for rank, row in enumerate(rows)]
 
 
-def _range(ends: tuple[float, float], sign: str = "") -> str:
-    """An interval as text; a dash for an unknown interval."""
-    return "–" if ends[0] != ends[0] else f"{ends[0]:{sign}.3f} to {ends[1]:{sign}.3f}"
+def _pictures(study: StudyFolder, extremes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Hypotheses of both arms at a few of the `extremes` whose runs have been kept, the largest of each arm first."""
+    folders = {(r["arm"], r["scene"], r["seed"]): study.run(r["folder"]) for r in study.description["runs"]}
+    found: dict[Any, dict[str, Any]] = {}
+    for row in sorted(extremes, key=lambda row: row["rank"]):
+        t, arms = row["pause"], (study.description["reference"], row["arm"])
+        key = row["arm"], row["scene"], t
+        runs = [RunFolder(folders[arm, row["scene"], row["seed"]]) for arm in arms]
+        if len(found) == _MOST_PICTURES or key in found or not all(run.pause(t).is_dir() for run in runs):
+            continue
+        scenes = [scene_of_run(*one, 3) for one in zip(runs, (t, t), match_runs(runs, t), strict=True)]
+        volumes = [one.hypothesis for scene in scenes for one in scene.views]
+        view = viewpoint(volumes, scenes[0].camera, 480, 360)
+        both = [scene_content(scene, volumes, view) for scene in scenes]
+        found[key] = {**row, **both[0], "t": len(found), "arms": list(zip(arms, both, strict=True))}
+    return list(found.values())
 
 
 def _drawn(
@@ -168,24 +164,6 @@ def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str,
         if of_row and of_row[0] is not None:
             values[row["family"]][row["arm"]][row["pause"]] += of_row
     return values
-
-
-def _costs(summary: Summary) -> dict[str, Any]:
-    """Seconds of each stage, core seconds and memory, by family and arm, as means over pauses."""
-    stages = [n.removeprefix("seconds_") for n in summary.names if n.startswith("seconds_")]
-    rows: list[dict[str, Any]] = []
-    per = ("seconds_", "peak_mb")
-    for family in summary.families:
-        for arm in summary.arms:
-            cells = {
-                name: metric.mean
-                for name in ("seconds", "core_seconds", *(n for n in summary.names if n.startswith(per)))
-                if (metric := summary.metric(family, arm, name)) is not None
-            }
-            if cells:
-                rows.append({"family": family, "arm": arm, **cells})
-    most = max((sum(float(r.get(f"seconds_{s}", 0.0)) for s in stages) for r in rows), default=1.0)
-    return {"stages": stages, "rows": rows, "most": most or 1.0}
 
 
 def _arms(description: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

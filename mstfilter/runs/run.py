@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import platform
 from collections import defaultdict
@@ -31,6 +32,7 @@ from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, r
 from mstfilter.scoring import ask
 from mstfilter.smc import ParticleFilter
 
+_LOGGER = logging.getLogger(__name__)
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp", "torch")
 
 
@@ -119,6 +121,8 @@ def filter_recording(
                         doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
                         report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
                     scene_cache.forget()
+                    seconds = sum(info.seconds.values())
+                    _LOGGER.info("%s: pause %d filtered in %.2f s", recording.name, clip.index, seconds)
                     advance(clip.index + 1, len(clips))
             except BaseException as error:
                 if folder is not None:

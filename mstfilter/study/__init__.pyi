@@ -27,6 +27,8 @@ from mstfilter.study.summary import (
     SLOPES as SLOPES,
     Compared as Compared,
     Summary as Summary,
+    interval_text as interval_text,
+    number_text as number_text,
     summarise as summarise,
     title_of as title_of,
 )

@@ -4,26 +4,7 @@
 >>> study.arms[0].preset, study.scenes[0].family
 >>> [arm.name for arm in expand_arms(study)]
 
-The file::
-
-    description = "does a faster resampler lower the quality?"
-    seeds = "0-2"                          # of the filter; the same for all arms
-
-    [[scenes]]
-    family = "demo"                        # simulated, made if it is missing
-    seeds = "0-4"
-    set = { width = 160, height = 120 }    # changes to the family
-
-    [[scenes]]
-    recordings = "recordings/table-*"      # folders, relative to this file
-    group = "kitchen"
-
-    [[arms]]
-    preset = "mst, paper"                  # a comma makes a grid
-    set = ["resampler=systematic,residual", "n=5"]
-
-    [smoke]                                # replaces entries above under --smoke
-    seeds = [0]
+``docs/studies.md`` has an example of a file.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ job, the death of a worker or an exceeded time limit does not stop the other job
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import sys
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter.fields import Bounded, NonNegativeInt
-from mstfilter.processes import available_cores, environment
+from mstfilter.processes import available_cores, environment, log_lines
 from mstfilter.study.jobs import perform
 from mstfilter.study.results import Job, JobOutcome
 
@@ -176,6 +177,8 @@ class _Worker:
 
 # In the worker process:
 
+_OPEN = contextlib.ExitStack()  # until the process ends
+
 
 def _initialise(log: str) -> None:
     """Prepare a worker process: write output to the log, use one thread, and exit when the study ends."""
@@ -187,6 +190,7 @@ def _initialise(log: str) -> None:
     os.dup2(target, 2)
     os.close(target)
     cv2.setNumThreads(1)
+    _OPEN.enter_context(log_lines())
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 

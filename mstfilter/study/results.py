@@ -11,6 +11,8 @@ runs/NAME/        one `RunFolder` per run; result.json: its metrics, or why it f
 runs.csv          one row per pause and run: metrics first, time and memory last
 summary.csv       one row per family, arm and metric: mean over scenes and its interval
 differences.csv   every arm minus the reference: paired differences, intervals, p values, conclusions
+summary.tex, .md  means of the primary endpoints and times, for a text in LaTeX or Markdown
+differences.tex   differences of the primary endpoints, also differences.md
 failures.csv      runs that failed, and why
 logs/             output of the workers
 ================  =====================================================================================
@@ -18,8 +20,10 @@ logs/             output of the workers
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,12 +33,13 @@ import numpy as np
 from pydantic import BaseModel, Field, model_validator
 
 from mstfilter.errors import InputError
-from mstfilter.files import write_csv
+from mstfilter.files import write_csv, write_text
 from mstfilter.forecasts import ForecastTable
 from mstfilter.reading import read_arrays, read_model
 from mstfilter.runs import write_json
 from mstfilter.scoring import LOG_LOSS, NO_COUNTS, forecast_table, leave_one_out
-from mstfilter.study.summary import Summary, summarise
+from mstfilter.statistics import compare
+from mstfilter.study.summary import ENDPOINTS, ArmMetric, Summary, interval_text, number_text, summarise
 
 STUDY_FORMAT = 2
 RESULT = "result.json"  # in a run's folder
@@ -173,12 +178,6 @@ class StudyFolder:
         """Path of the folder of a run, from the name of the folder."""
         return self.path / "runs" / folder
 
-    def write_failure(self, folder: str, identity: str, outcome: JobOutcome) -> None:
-        """Record why a run failed."""
-        record = {"identity": identity, "status": "failed", "error": outcome.error, "hints": outcome.hints}
-        self.run(folder).mkdir(parents=True, exist_ok=True)
-        write_result(self.run(folder), {**record, "tries": outcome.tries, "trace": outcome.trace})
-
     def failures(self) -> list[dict[str, Any]]:
         """Runs of this study that failed: name, error, hints, tries, folder, trace."""
         found = []
@@ -263,6 +262,72 @@ class StudyFolder:
             ("failures", failed, _FAILURE_COLUMNS),
         ):
             write_csv(self.path / f"{name}.csv", table, names, float_format=".6g")
+        for name, (caption, cells) in self.main_tables(found).items():
+            write_text(self.path / f"{name}.tex", latex_table(cells, caption, f"tab:{name}"))
+            write_text(self.path / f"{name}.md", f"{caption}\n\n{markdown_table(cells)}")
+
+    def main_tables(self, found: Summary | None = None) -> dict[str, tuple[str, list[list[str]]]]:
+        """Caption and cells (first row: head) of the tables of the primary endpoints, "summary" and "differences"."""
+        found = found or self.summary()
+        means = [["family", "method", "n", "quality", "log loss (nats)", "time per step (s)"]]
+        differences = [["family", "method", "n", "quality", "p", "log loss (nats)", "p"]]
+        pairs = {(one.family, one.arm, one.metric): one.difference for one in found.differences}
+        for family, arm in itertools.product(found.families, found.arms):
+            start = [family, f"{arm} *" if arm in self.truth_users else arm]
+            values = [found.metric(family, arm, name) or ArmMetric(family, arm, name, {}) for name in ENDPOINTS]
+            if n := _numbers(len(one.by_scene) for one in values):
+                seconds = found.metric(family, arm, "seconds")
+                texts = [_estimate(one.mean, *one.interval) for one in values]
+                means.append([*start, n, *texts, "–" if seconds is None else f"{seconds.mean:.2f}"])
+            of_arm = [pairs.get((family, arm, name), compare({}, {})) for name in ENDPOINTS]
+            if n := _numbers(d.n for d in of_arm):
+                p = [number_text(d.p_holm).replace("0.000", "<0.001") for d in of_arm]
+                texts = [_estimate(d.mean, d.low, d.high, "+") for d in of_arm]
+                differences.append([*start, n, *itertools.chain(*zip(texts, p, strict=True))])
+        how = "over pauses (without the first), filter seeds and n scenes, with 95 % t intervals. Quality is from "
+        how += "0 to 1 (higher is better). Log loss is recalibrated (lower is better)."
+        how += " * uses the ground truth." if self.truth_users else ""
+        time = "with a warm cache" if found.warm else "and shared work counts for the first method that needs it"
+        pair = f"{found.reference} (method minus {found.reference}), paired by scene: means"
+        return {
+            "summary": (f"Means {how} Time is wall time, {time}.", means),
+            "differences": (f"Differences from {pair} {how} p is adjusted by Holm's method.", differences),
+        }
+
+
+def _numbers(of_endpoints: Iterable[int]) -> str:
+    """Numbers of scenes as text, one number if they are equal."""
+    return " / ".join(dict.fromkeys(str(n) for n in of_endpoints if n))
+
+
+def _estimate(mean: float, low: float, high: float, sign: str = "") -> str:
+    return f"{number_text(mean, sign)} {interval_text(low, high, sign)}".replace(" –", "")
+
+
+_TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
+_TEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
+
+
+def _tex(text: str) -> str:
+    """Text for LaTeX, with signs of numbers in math mode."""
+    escaped = "".join(_TEX.get(c, f"\\{c}" if c in "&%$#_{}" else c) for c in text)
+    return re.sub(r"(?<![\w.])[-+](?=\d+\.\d)", r"$\g<0>$", escaped).replace(r" \%", r"~\%")
+
+
+def latex_table(cells: Sequence[Sequence[str]], caption: str, label: str) -> str:
+    """A table for LaTeX with the package booktabs. The first row of `cells` is the head."""
+    head, *rows = [" & ".join(map(_tex, row)) + r" \\" for row in cells]
+    lines = [r"% \usepackage{booktabs}", r"\begin{table}", r"\centering\footnotesize\setlength{\tabcolsep}{4pt}"]
+    lines += [rf"\caption{{{_tex(caption)}}}", rf"\label{{{label}}}"]
+    lines += [rf"\begin{{tabular}}{{ll{'r' * (len(cells[0]) - 2)}}}", r"\toprule", head]
+    return "\n".join([*lines, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+
+
+def markdown_table(cells: Sequence[Sequence[str]]) -> str:
+    """A table for Markdown. The first row of `cells` is the head."""
+    head, *rows = [[re.sub(r"[\\`*_<>|]", r"\\\g<0>", cell) for cell in row] for row in cells]
+    rule = ["---"] * 2 + ["---:"] * (len(head) - 2)
+    return "".join(f"| {' | '.join(row)} |\n" for row in (head, rule, *rows))
 
 
 def _sum_by_scene(counts: Mapping[tuple[str, Any], np.ndarray]) -> dict[str, np.ndarray]:

@@ -10,6 +10,8 @@ repeated. An interruption does not change the metrics.
 from __future__ import annotations
 
 import contextlib
+import logging
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,7 +26,9 @@ from mstfilter.runs import library_versions, write_json
 from mstfilter.study.config import StudyConfig
 from mstfilter.study.executors import Executor, Local, Tell
 from mstfilter.study.plan import Plan, StudyRun, StudyScene, make_plan
-from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result
+from mstfilter.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result, write_result
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ def run_study(
     cache : Path, optional
         Folder of simulated recordings and intermediate results. The default is the user's cache folder.
     progress : bool or callable
-        True shows progress bars. A function is called with a `StudyProgress` when a job ends or loses its worker.
+        True shows progress bars, or lines of the log if standard error is not a terminal. A function is called with
+        a `StudyProgress` when a job ends or loses its worker.
 
     Raises
     ------
@@ -176,13 +181,21 @@ class _Call:
         return self._job("run", run.name, run.scene, more)
 
     def _counter(self, what: str, jobs: Sequence[Job], done: int, total: int, failed: int) -> Tell:
-        """A function that reports the outcome of each job as a `StudyProgress`."""
+        """A function that reports the outcome of each job as a `StudyProgress` and to the log, with the time left."""
+        begun, earlier = time.monotonic(), done + failed
 
         def count(k: int, outcome: JobOutcome | None) -> None:
             nonlocal done, failed
-            if outcome is not None:
+            if outcome is None:
+                _LOGGER.warning("a worker died in %s", jobs[k]["name"])
+            else:
                 done += outcome.status == "done"
                 failed += outcome.status != "done"
+                n = done + failed
+                seconds = (time.monotonic() - begun) / (n - earlier) * (total - n)
+                left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+                text = f"{n}/{total} {what}{f', {failed} failed' if failed else ''}, {left} left: {jobs[k]['name']}"
+                _LOGGER.info("%s%s", text, f" failed: {outcome.error}" if outcome.status != "done" else "")
             self.report(StudyProgress(what, jobs[k]["name"], outcome, done, failed, total))
 
         self.report(StudyProgress(what, "", None, done, failed, total))
@@ -240,7 +253,8 @@ def _is_done(run: StudyRun, folder: StudyFolder) -> bool:
 def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
     """Record the reason of a failed run. If the disk is full, nothing is written."""
     with contextlib.suppress(OSError):
-        folder.write_failure(run.folder, run.identity, outcome)
+        folder.run(run.folder).mkdir(parents=True, exist_ok=True)
+        write_result(folder.run(run.folder), {"identity": run.identity, **asdict(outcome)})
 
 
 def _is_recorded(source: dict[str, Any], recordings: Path) -> bool:

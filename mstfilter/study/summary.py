@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,21 +41,24 @@ def bounds_of(metric: str) -> tuple[float, float]:
     return 0.0, 1.0 if metric.startswith(_SHARES) else np.inf
 
 
+def number_text(value: float | None, sign: str = "") -> str:
+    """A number with three decimals; a dash for an unknown value. `sign` is "+" to write the sign of all numbers."""
+    return "–" if value is None or value != value else f"{value:{sign}.3f}"
+
+
+def interval_text(low: float, high: float, sign: str = "") -> str:
+    """An interval as text; a dash for an unknown interval."""
+    return "–" if low != low else f"[{low:{sign}.3f}, {high:{sign}.3f}]"
+
+
 @dataclass(frozen=True)
 class ArmMetric:
-    """A metric of an arm on the scenes of a family.
-
-    Parameters
-    ----------
-    family, arm, name : str
-    by_scene : mapping
-        Scene -> mean over filter seeds. Scenes in which the metric is not defined are omitted.
-    """
+    """A metric of an arm on the scenes of a family."""
 
     family: str
     arm: str
     name: str
-    by_scene: Mapping[str, float]
+    by_scene: Mapping[str, float]  #: scene -> mean over filter seeds, without scenes that do not define the metric
 
     @property
     def mean(self) -> float:
@@ -72,23 +75,15 @@ class ArmMetric:
 
 @dataclass(frozen=True)
 class Compared:
-    """Difference (arm minus reference) of a metric on a family.
-
-    Parameters
-    ----------
-    family, arm, reference, metric : str
-    difference : Difference
-        For the primary endpoints, `p_holm` is `p_claim` adjusted over both endpoints, all families and all arms.
-    reported_only : bool
-        Whether the arm is left out of the conclusions and of the adjustment of p values.
-    """
+    """Difference (arm minus reference) of a metric on a family."""
 
     family: str
     arm: str
     reference: str
     metric: str
+    #: For the primary endpoints, `p_holm` is `p_claim` adjusted over both endpoints, all families and all arms.
     difference: Difference
-    reported_only: bool = False
+    reported_only: bool = False  #: the arm is left out of the conclusions and of the adjustment of p values
 
     @property
     def adjusted(self) -> bool:
@@ -105,24 +100,15 @@ class Compared:
 
 @dataclass(frozen=True)
 class Summary:
-    """Means and differences of a study.
-
-    Parameters
-    ----------
-    families, arms, names : tuple of str
-        Families, arms and names of metrics, in the order of the study.
-    reference : str
-    metrics : tuple of ArmMetric
-    differences : tuple of Compared
-        Primary endpoints first, then their slopes, then all other metrics.
-    """
+    """Means and differences of a study. Families, arms and names of metrics are in the order of the study."""
 
     families: tuple[str, ...]
     arms: tuple[str, ...]
     names: tuple[str, ...]
     reference: str
+    warm: bool  #: all times are of runs that found shared work in the cache (the first seed of each arm is omitted)
     metrics: tuple[ArmMetric, ...]
-    differences: tuple[Compared, ...]
+    differences: tuple[Compared, ...]  #: primary endpoints first, then their slopes, then all other metrics
 
     def metric(self, family: str, arm: str, name: str = "quality") -> ArmMetric | None:
         """The value of a metric; None if the arm has no value for this family."""
@@ -154,24 +140,20 @@ class Summary:
 
     def metric_rows(self) -> list[dict[str, Any]]:
         """Rows of summary.csv."""
-        rows = []
-        for one in self.metrics:
-            low, high = one.interval
-            named = {"family": one.family, "arm": one.arm, "metric": one.name}
-            rows.append({**named, "n": len(one.by_scene), "mean": one.mean, "low": low, "high": high})
-        return rows
+        return [
+            {"family": one.family, "arm": one.arm, "metric": one.name, "n": len(one.by_scene), "mean": one.mean}
+            | dict(zip(("low", "high"), one.interval, strict=True))
+            for one in self.metrics
+        ]
 
     def difference_rows(self) -> list[dict[str, Any]]:
         """Rows of differences.csv."""
         rows = []
         for one in self.differences:
-            d = one.difference
-            row = {"family": one.family, "arm": one.arm, "reference": one.reference, "metric": one.metric, "n": d.n}
-            row |= {"mean": d.mean, "low": d.low, "high": d.high, "p": d.p}
-            row["p_holm"] = d.p_holm if one.adjusted else None
-            row |= {"low_bootstrap": d.low_bootstrap, "high_bootstrap": d.high_bootstrap}
-            row |= {"p_bootstrap": d.p_bootstrap, "skewness": d.skewness}
-            rows.append({**row, "conclusion": one.words if one.adjusted else ""})
+            row = {"family": one.family, "arm": one.arm, "reference": one.reference, "metric": one.metric}
+            row |= asdict(one.difference)
+            adjusted = {"conclusion": one.words} if one.adjusted else {"conclusion": "", "p_holm": None}
+            rows.append({**row, **adjusted})
         return rows
 
 
@@ -233,7 +215,7 @@ def summarise(
         for arm in arms
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
     ]
-    return Summary(families, arms, names, reference, metrics, _adjust(differences))
+    return Summary(families, arms, names, reference, set(seeds) == set(filling), metrics, _adjust(differences))
 
 
 def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:

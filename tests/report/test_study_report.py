@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
+import shutil
 from importlib.resources import files
 
 import numpy as np
@@ -14,6 +16,8 @@ from mstfilter.report.figures import SERIES
 from mstfilter.report.study_report import write_study_report
 from mstfilter.study import RESULT, StudyFolder, summarise
 from mstfilter.study.summary import ArmMetric
+from tests.report.pages import Page
+from tests.report.runs import make_run
 from tests.test_cli import call
 
 
@@ -187,3 +191,82 @@ def test_nothing_in_a_figure_is_cut_off(tmp_path):
             long = 0.5 * float(size) * len(words)
             before = {"start": 0.0, "middle": 0.5, "end": 1.0}[anchor] * long
             assert float(x) - before >= -2 and float(x) - before + long <= width + 2, words
+
+
+def results(study):
+    """Rows of all runs from the files: arm, scene, seed, pause, quality."""
+    for run in json.loads((study / "study.json").read_text())["runs"]:
+        for row in json.loads((study / "runs" / run["folder"] / RESULT).read_text()).get("rows", ()):
+            yield run["arm"], run["scene"], run["seed"], row["pause"], row["quality"]
+
+
+def section(text, title):
+    """The cells of the tables of a section, without the heads."""
+    part = text[text.index(f"<h2>{title}</h2>") :]
+    part = part[: part.index("</section>")]
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr.*?</tr>", part)]
+    return [[html.unescape(re.sub("<.*?>", "", cell)) for cell in row] for row in rows if row]
+
+
+def test_each_scene_has_the_mean_of_each_arm(tmp_path):
+    study = make_study(tmp_path)
+    found = section(write_study_report(study).read_text(), "Each scene")
+    values = list(results(study))
+    expected = []
+    for scene in [f"{g}-{k}" for g in ("s1", "s2") for k in range(4)]:
+        row = [scene]
+        for arm in ("ours", "<theirs>"):
+            seeds = [
+                np.mean([q for a, s, i, t, q in values if (a, s, i) == (arm, scene, seed) and t > 0])
+                for seed in (0, 1)
+                if any((a, s, i) == (arm, scene, seed) for a, s, i, _, _ in values)  # one run failed
+            ]
+            row.append(f"{np.mean(seeds):.3f}")
+        expected.append(row)
+    assert found == expected
+
+
+def test_the_largest_differences_are_paired_by_seed(tmp_path):
+    study = make_study(tmp_path, arms=("ours", "theirs", "floor"), reported_only=("floor",))
+    of = {key: q for *key, q in results(study) for key in [tuple(key)]}
+    differences = {}
+    for (arm, scene, seed, t), q in of.items():
+        if arm == "theirs" and t > 0:
+            differences.setdefault((scene, t), []).append(q - of["ours", scene, seed, t])
+    ranked = sorted(((np.mean(d), place) for place, d in differences.items()), key=lambda one: -abs(one[0]))[:3]
+    found = section(write_study_report(study).read_text(), "Where methods differ most")
+    assert [(row[0], row[1], row[2], row[3], row[-1]) for row in found] == [
+        ("quality", "theirs", scene, str(t), f"{d:+.3f}") for d, (scene, t) in ranked
+    ]
+
+
+def test_pictures_of_the_largest_differences(tmp_path):
+    """Of runs that were kept: image, truth and hypotheses of both arms; matching objects have the same number."""
+    study = make_study(tmp_path / "study", n_scenes=2, groups=("s1",), fail=False)
+    assert "<image" not in write_study_report(study).read_text()
+    run = make_run(tmp_path / "run")
+    for folder in (study / "runs").iterdir():
+        if "s1-0" in folder.name:
+            shutil.copytree(run.path, folder, dirs_exist_ok=True)
+    text = write_study_report(study).read_text()
+    assert all(link.startswith(("data:", "#")) for link in Page(text).links)
+    titles = re.findall(r"<h3>(s1-\d, pause \d): &lt;theirs&gt;", text)
+    places = [tuple(row[2:4]) for row in section(text, "Where methods differ most")]
+    assert titles == [f"{scene}, pause {t}" for scene, t in places if scene == "s1-0"] and titles
+    for k, part in enumerate(text.split("<h3>s1-0, pause")[1:]):
+        assert part.count(f'href="#photo-{k}"') >= 4  # image, truth, hypotheses of both
+        assert re.findall(r"<h4>(.*?)</h4>", part) == ["ours", "&lt;theirs&gt;"]
+        # Both arms have the same hypotheses here, so colours and numbers are the same.
+        first, second = part.split("<h4>")[1:3]
+        pictures = [re.findall(r'<image href="(.*?)"', one) for one in (first, second)]
+        assert pictures[0] == pictures[1] and pictures[0]
+
+
+def test_times_say_whether_the_cache_was_warm(tmp_path):
+    study = make_study(tmp_path, groups=("s1",), fail=False)
+    text = write_study_report(study).read_text()
+    assert "All times are with a warm cache" in text and "step, warm cache" in text
+    for folder in (study / "runs").glob("*_1"):
+        (folder / RESULT).unlink()
+    text = write_study_report(study).read_text()
+    assert "not with equally warm caches" in text and "step, warm cache" not in text

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 
 import pytest
 
+from mstfilter.formats import open_recording
+from mstfilter.presets import load_config
+from mstfilter.runs import filter_recording
 from tests.study.scenes import slide
-from tests.study.test_failures import hanging_study, wait_for
+from tests.study.test_failures import BROKEN, FAST, hanging_study, wait_for
 from tests.test_cli import HEAVY, call, python
 
 
@@ -32,11 +36,45 @@ def test_it_prints_where_and_what(config, tmp_path, capsys):
     assert code == 0, error
     assert "study       studies/mine-smoke" in out
     assert "2 done, 0 of them earlier" in out
-    assert "mst transition=identity update.n_views=2" in out and "metric, t >= 1" in out
+    assert "mst transition=identity update.n_views=2" in out and "time per step (s)" in out
+    assert "method minus mst transition=identity update.n_views=1), paired by scene" in " ".join(out.split())
     code, out, _ = call("study", config, "--smoke", "update.n_views=1,2", capsys=capsys)
     assert "2 done, 2 of them earlier" in out
     code, _, error = call("study", config, "--smoke", "colour=1", capsys=capsys)
     assert code == 2 and error.startswith("error: arm 'mst transition=identity': a filter has no field 'colour'")
+
+
+def test_without_a_terminal_each_finished_run_is_a_line(config, tmp_path, monkeypatch):
+    """Also if a variable asks for colours. The run that fails is named with its error."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    own = f'[[arms]]\nset = ["transition={BROKEN}:Breaks", "transition.how=raise"]\nname = "broken"\n'
+    config.write_text(f'seeds = "0-1"\nscenes = [{{recordings = "slide"}}]\n[[arms]]\npreset = "{FAST}"\n{own}')
+    command = [sys.executable, "-m", "mstfilter", "study", str(config), "--workers", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 1
+    lines = [line.split("  ", 1)[1] for line in done.stderr.splitlines() if re.match(r"\d\d:\d\d:\d\d  ", line)]
+    assert len(lines) == 4
+    for k, line in enumerate(lines, 1):
+        assert re.match(rf"{k}/4 runs(, \d failed)?, \d+ (s|min) left: \S+ on slide, seed \d", line), line
+    assert sum("failed: RuntimeError: the component broke" in line for line in lines) == 2, lines
+    assert lines[-1].startswith("4/4 runs, 2 failed, 0 s left")
+    assert all(c.isprintable() or c == "\n" for c in done.stderr)
+    assert "slide: pause 1 filtered" in (tmp_path / "studies" / "mine" / "logs" / "worker-0.log").read_text()
+
+
+def test_messages_go_to_the_log(config, tmp_path, caplog, capsys):
+    """Nothing is printed unless a handler is set; `--verbose` sets one."""
+    recording = open_recording(tmp_path / "slide")
+    filter_recording(recording, load_config(FAST), tmp_path / "quiet")
+    assert capsys.readouterr() == ("", "")
+    with caplog.at_level("INFO", "mstfilter"):
+        filter_recording(recording, load_config(FAST), tmp_path / "logged")
+    assert [r.getMessage().split(" filtered")[0] for r in caplog.records] == ["slide: pause 0", "slide: pause 1"]
+    run = "run", tmp_path / "slide", "--preset", FAST, "--out"
+    code, out, error = call(*run, tmp_path / "a", "--verbose", capsys=capsys)
+    assert code == 0 and "slide: pause 1 filtered in" in error and "filtered in" not in out
+    code, out, error = call(*run, tmp_path / "b", capsys=capsys)
+    assert code == 0 and "filtered in" not in out + error
 
 
 def test_an_unknown_component_is_answered_before_heavy_imports(tmp_path):

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import re
+
 import numpy as np
 import pytest
+from scipy import stats
 
 from mstfilter.scoring import LOG_LOSS
 from mstfilter.statistics import compare
+from mstfilter.study import StudyFolder
 from mstfilter.study.summary import summarise
+from tests.report.test_study_report import make_study, results
 
 
 def rows():
@@ -97,3 +103,66 @@ def test_a_filter_is_better_only_with_enough_scenes(n_scenes, better):
         for arm, lag in (("ours", 0.0), ("theirs", 0.1))
     ]  # fmt: skip
     assert summarise(table, "ours").is_better("f", "theirs") is better
+
+
+STRANGE = r"50% a_b & c#1 {x}~^\d|<e> $"  # every character that LaTeX or Markdown reads as a command
+LATEX = {"textbackslash{}": "\\", "textasciitilde{}": "~", "textasciicircum{}": "^"}
+LATEX |= {"textless{}": "<", "textgreater{}": ">", "textbar{}": "|"}
+
+
+def latex_rows(path):
+    """Cells of a LaTeX table, read by an independent parser of the commands that the table may use."""
+    text = path.read_text()
+    assert re.fullmatch(r"% .*\n\\begin\{table\}(.*\n)*\\end\{table\}\n", text)
+    assert [text.count(rf"\{rule}") for rule in ("toprule", "midrule", "bottomrule", "hline")] == [1, 1, 1, 0]
+    body = text[text.index(r"\toprule") + 8 : text.index(r"\bottomrule")].replace("\\midrule", "")
+    rows = []
+    for line in filter(None, map(str.strip, body.split("\n"))):
+        assert line.endswith(r" \\")
+        cells = []
+        for cell in re.split(r" (?<!\\)& ", line[:-3]):
+            cell = re.sub(r"\$([+-])\$", r"\1", cell)
+            assert not re.search(r"(?<!\\)[&%$#_]", cell), cell
+            cells.append(re.sub(r"\\(text\w+\{\}|.)", lambda m: LATEX.get(m[1], m[1]), cell).replace("--", "–"))
+        rows.append(cells)
+    columns = re.search(r"\\begin\{tabular\}\{(\w+)\}", text)[1]
+    assert {len(row) for row in rows} == {len(columns)}
+    return rows
+
+
+def markdown_rows(path):
+    lines = path.read_text().split("\n\n", 1)[1].splitlines()
+    rows = [re.split(r" (?<!\\)\| ", line.removeprefix("| ").removesuffix(" |")) for line in lines]
+    assert set("".join(rows.pop(1))) == set("-:")
+    return [[re.sub(r"\\(.)", r"\1", cell) for cell in row] for row in rows]
+
+
+def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
+    """Against means and t intervals that scipy computes from the files of the runs."""
+    study = make_study(tmp_path, n_scenes=5, arms=("ours", STRANGE), groups=("s1",), fail=True)
+    StudyFolder.open(study).write_tables()
+    of_scene = {}
+    for arm in ("ours", STRANGE):
+        for scene in (f"s1-{k}" for k in range(5)):
+            seeds = {}
+            for a, s, seed, t, q in results(study):
+                if (a, s) == (arm, scene) and t > 0:
+                    seeds.setdefault(seed, []).append(q)
+            of_scene[arm, scene] = np.mean([np.mean(q) for q in seeds.values()])
+    ours, theirs = ([of_scene[arm, f"s1-{k}"] for k in range(5)] for arm in ("ours", STRANGE))
+
+    def estimate(values, sign=""):
+        low, high = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
+        return f"{np.mean(values):{sign}.3f} [{low:{sign}.3f}, {high:{sign}.3f}]"
+
+    head = ["family", "method", "n", "quality", "log loss (nats)", "time per step (s)"]
+    means = [["s1", arm, "5", estimate(q), "–", "2.00"] for arm, q in (("ours", ours), (STRANGE, theirs))]
+    with (study / "differences.csv").open(newline="", encoding="utf-8") as file:
+        p = next(row["p_holm"] for row in csv.DictReader(file) if row["metric"] == "quality")
+    difference = ["s1", STRANGE, "5", estimate(np.subtract(theirs, ours), "+"), f"{float(p):.3f}", "–", "–"]
+    for read, kind in ((latex_rows, "tex"), (markdown_rows, "md")):
+        assert read(study / f"summary.{kind}") == [head, *means]
+        assert read(study / f"differences.{kind}")[1:] == [difference]
+    caption = (study / "summary.md").read_text().split("\n")[0]
+    assert "95 % t intervals" in caption and "n scenes" in caption and "warm cache" in caption
+    assert r"95~\% t intervals" in (study / "summary.tex").read_text()
