@@ -1,7 +1,11 @@
-"""Every command of docs/own-data.md runs on data of its layout, and every wrong input gives its message."""
+"""Every command of the pages on own data runs on data of its layout, every wrong input gives its message.
+
+The settings of docs/troubleshooting.md exist.
+"""
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shlex
@@ -11,6 +15,7 @@ import warnings
 import numpy as np
 import pytest
 
+import mstfilter
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, open_recording
 from mstfilter.scene import (
@@ -33,7 +38,9 @@ from tests.scene.test_recording import write
 from tests.test_cli import call
 from tests.wrong_inputs import WRONG, right
 
-PAGE = (REPOSITORY / "docs" / "own-data.md").read_text()
+NAMES = ("own-data", "formats", "scores", "real-images", "troubleshooting")
+PAGES = {name: (REPOSITORY / "docs" / f"{name}.md").read_text() for name in NAMES}
+PAGE = "\n".join(PAGES.values())
 COMMANDS = [
     line.partition("  #")[0].strip()
     for block in re.findall(r"```sh\n(.*?)```", PAGE, flags=re.DOTALL)
@@ -109,7 +116,7 @@ def test_point_clouds_of_the_data_set_become_pairs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for k in (17, 18):
         (tmp_path / f"learn{k}.pcd").write_bytes(header.encode() + np.stack(columns, axis=-1).tobytes())
-    exec(compile(example.replace("range(17, 25)", "range(17, 19)"), "own-data.md", "exec"), {})
+    exec(compile(example.replace("range(17, 25)", "range(17, 19)"), "real-images.md", "exec"), {})
     assert (read_rgb(tmp_path / "osd/learn18_rgb.png") == rgb).all()
     assert np.nanmax(np.abs(read_depth(tmp_path / "osd/learn18_depth.png", 0.001) - z)) < 0.00051
     expected = np.select([label == 0, label < 10, label < 30], [0, 1, 2], 3)
@@ -117,7 +124,7 @@ def test_point_clouds_of_the_data_set_become_pairs(tmp_path, monkeypatch):
 
 
 def test_every_format_has_a_command():
-    """Data of each registered format is converted or run by a command of the page."""
+    """Data of each registered format is converted or run by a command of the pages."""
     from mstfilter import formats
 
     data = {"recording": "table-7", "pairs": "frames", "tum": "rgbd_dataset"}
@@ -126,7 +133,7 @@ def test_every_format_has_a_command():
     assert all(any(name in command.split() for command in COMMANDS) for name in data.values())
 
 
-TABLE = PAGE.partition("## When the input is wrong")[2]
+TABLE = PAGES["troubleshooting"].partition("## When the input is wrong")[2]
 ROWS = re.findall(r"^\| ([^|]+) \| (error|warning) \| `([^|]+)` \|$", TABLE, flags=re.MULTILINE)
 
 
@@ -178,3 +185,12 @@ def test_right_real_recordings_are_silent(name, shared_data):
         warnings.simplefilter("error")
         recording = PairedImages(frames=frames).open(path) if name != "jack" else open_recording(path)
         recording.clips()
+
+
+@pytest.mark.parametrize("setting", sorted(set(re.findall(r"`([\w.]+=[\w.-]+)`", PAGES["troubleshooting"]))))
+def test_the_settings_of_the_page_exist(setting):
+    name = setting.partition("=")[0]
+    if name == "threads":
+        assert name in inspect.signature(mstfilter.Stream).parameters
+    else:
+        assert mstfilter.preset("mst", setting) != mstfilter.preset("mst")

@@ -1,4 +1,4 @@
-"""The wrong inputs of docs/own-data.md: each makes a recording that is examined, from one that is right.
+"""The wrong inputs of docs/troubleshooting.md: each makes a recording that is examined, from one that is right.
 
 A case takes the arguments of `Recording.from_arrays` of a right recording and changes them; it may return hypotheses
 instead, which are examined as those of the first step.

@@ -39,7 +39,7 @@ def test_the_table_is_up_to_date():
 def test_figures_of_the_front_page_name_the_version_of_their_study():
     """Each item of the results that cites a study states the commit of the record of this study."""
     page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    results = page[page.index("**Results.**") : page.index("## How it works")]
+    results = page[page.index("## Results") : page.index("## How it works")]
     for item in re.split(r"\n(?=\d\. )", results)[1:]:
         for name in record.cited(item):
             assert f"commit {STUDIES[name].record()['commit']}" in " ".join(item.split()), item

@@ -143,6 +143,14 @@ def test_readme_picture(tmp_path):
     assert read_rgb(tmp_path / "differences.png").shape[1] >= 840
 
 
+def test_pictures_of_changes(tmp_path):
+    run_script("readme_picture/changes.py", "--smoke", "--out", tmp_path)
+    pictures = sorted(tmp_path.glob("changes-*.png"))
+    page = (EXPERIMENTS.parent / "docs" / "changes.md").read_text()
+    assert all(f"(images/{path.name})" in page and read_rgb(path).std() > 10 for path in pictures)
+    assert len(pictures) == page.count("](images/")
+
+
 def test_segmentation_fit(tmp_path):
     assert "misclassified" in run_script("segmentation_fit/run.py", "--smoke", "--out", tmp_path / "weights.json")
     made, _ = LearnedTree(weights=str(tmp_path / "weights.json")).model()
