@@ -4,7 +4,7 @@
     python experiments/readme_picture/make.py --smoke --out FOLDER    # a small scene: shows only that it works
 
 Columns are the pause before, a pause at which the object is hidden, and the pause at which it is seen again. Rows are
-the image, the true voxels, and the voxels of the most probable hypothesis of two methods.
+the image, the true voxels, and the voxels of hypotheses of `mst` and of the published method.
 """
 
 from __future__ import annotations
@@ -29,11 +29,18 @@ FAMILY, SEED = "s3", 42
 HIDDEN, SHOWN, VOXELS = 0.2, 0.5, 300  # largest visible share if hidden, least if seen, least volume
 SMALL = {"width": 160, "height": 120, "n_actions": 2, "frames_per_clip": 8, "voxel_size": 0.02}
 PICTURES = Path("docs/images")
-METHODS = {"mst": "mst, the default", "paper": "published method"}
+METHODS = ("mst", "paper")
+#: Method, whether the hypothesis with the largest overlap is shown instead of the most probable, name of the row.
+ROWS = (
+    ("mst", False, "mst,\nmost probable"),
+    ("mst", True, "mst,\nbest of all"),
+    ("paper", True, "published,\nbest of all"),
+)
+BEHIND = {"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 1.5}  # text on a picture
 MARKED: Colour = (213, 60, 0)  # the colour of the object; the other objects are pale
 REACH = 0.22  # metres around the object that the pictures of voxels show
-CELL = (390, 300)  # pixels
-Marked = tuple[np.ndarray, np.ndarray]  # picture, mask of the object in it
+CELL = (405, 264)  # pixels
+Marked = tuple[np.ndarray, np.ndarray]  # a picture, and the mask of the object in it
 
 
 def visible_shares(recording: Recording) -> dict[int, np.ndarray]:
@@ -76,7 +83,9 @@ class Scene:
             points = recording.grid.centre_of(np.argwhere(labels > 0))
             own = recording.grid.centre_of(np.argwhere(labels == label)).mean(axis=0)
             near = np.zeros_like(labels)
-            near[labels > 0] = np.where(np.linalg.norm((points - own)[:, :2], axis=1) < REACH / 2, labels[labels > 0], 0)
+            near[labels > 0] = np.where(
+                np.linalg.norm((points - own)[:, :2], axis=1) < REACH / 2, labels[labels > 0], 0
+            )
             self.near.append((near, recording.grid))
         # The azimuth from which most of the object is seen at the pause at which it is hidden in the image.
         turns = np.radians(np.arange(0, 360, 15))
@@ -92,19 +101,32 @@ class Scene:
         eye = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ camera.position
         return viewpoint(self.near, camera.at(look_at(eye, eye * 0)), *CELL)
 
-    def voxels(self, name: str, t: int, view: Camera, *, truth: bool = False) -> tuple[np.ndarray, np.ndarray, float]:
-        """Picture of the truth or of the most probable hypothesis, mask of the object, and overlap with the truth."""
-        run, identities = self.runs[name], self.identities[name]
-        true, best = run.truth(t), TRUTH if truth else int(np.argmax(run.info(t)["weights"]))
-        assert true is not None
-        marked, found = identities.of(t, TRUTH)[self.label], identities.of(t, best)
-        h = run.hypotheses(t)[max(best, 0)]
-        labels, grid = true if truth else h.labels, h.grid
-        colours = {k: MARKED if i == marked else pale(colour(i)) for k, i in found.items()}
-        own = next((k for k, i in found.items() if i == marked), -1)
-        a, b = labels == own, true == self.label
-        picture = voxel_picture(labels, grid, view, colours)
-        return picture, silhouette(labels, grid, own, view), float((a & b).sum() / (a | b).sum())
+    def overlaps(self, name: str, t: int) -> list[float]:
+        """Overlap (intersection over union) of the marked object with the truth in each hypothesis; 0 if absent."""
+        truth = self.recording.truth(t)
+        assert truth is not None
+        true, found = truth == self.label, []
+        for k, h in enumerate(self.runs[name].hypotheses(t)):
+            own = h.labels == self.label_in(name, t, k)
+            found.append(float((own & true).sum() / (own | true).sum()))
+        return found
+
+    def label_in(self, name: str, t: int, k: int) -> int:
+        """Label of the marked object in hypothesis `k` (or `TRUTH`); -1 if absent."""
+        marked = self.identities[name].of(t, TRUTH)[self.label]
+        return next((label for label, i in self.identities[name].of(t, k).items() if i == marked), -1)
+
+    def voxels(self, name: str, t: int, k: int, view: Camera) -> Marked:
+        """Picture of hypothesis `k` (or of the truth, `TRUTH`), and the silhouette of the marked object."""
+        h, own = self.runs[name].hypotheses(t)[max(k, 0)], self.label_in(name, t, k)
+        labels = self.recording.truth(t) if k == TRUTH else h.labels
+        assert labels is not None
+        colours = {x: MARKED if x == own else pale(colour(i)) for x, i in self.identities[name].of(t, k).items()}
+        return voxel_picture(labels, h.grid, view, colours), silhouette(labels, h.grid, own, view)
+
+    def most_probable(self, name: str, t: int) -> int:
+        """The heaviest hypothesis; the first, if several have the same weight."""
+        return int(np.argmax(self.runs[name].info(t)["weights"]))
 
     def window(self, margin: float) -> tuple[slice, slice]:
         """Rows and columns of the image around the object at the three pauses, with the proportions of a cell."""
@@ -156,21 +178,22 @@ def new_figure(width: float, height: float, rows: int, columns: int) -> tuple[An
 
 def draw(scene: Scene, out: Path) -> None:
     """Draw the three pauses."""
-    figure, cells = new_figure(8.75, 8.3, 2 + len(scene.runs), 3)
-    box, view, frames = scene.window(2.6), scene.view(scene.turn), scene.recording
+    figure, cells = new_figure(8.75, 9.3, len(ROWS) + 2, 3)
+    box, view, video = scene.window(2.6), scene.view(scene.turn), scene.recording
     for column, (t, head) in enumerate(zip(scene.pauses, ("seen", "hidden", "seen again"), strict=True)):
-        index = frames.pauses[t]
-        cells[0, column].set_title(f"{head} (pause {t}, {frames.times[index]:.0f} s)", fontsize=12.5)
-        show(cells[0, column], frames.frames[index].rgb[box], scene.silhouette(t)[box], "--")
-        for row, name in enumerate(("truth", *scene.runs), 1):
-            picture, mask, overlap = scene.voxels(name if name in scene.runs else "mst", t, view, truth=name == "truth")
-            show(cells[row, column], picture, mask)
-            if name in scene.runs:
-                text = f"overlap {overlap:.2f}" if mask.any() else "lost: overlap 0"
-                cells[row, column].text(0.02, 0.03, text, transform=cells[row, column].transAxes, fontsize=11.5)
-    for row, text in enumerate(("image", "true voxels", *(METHODS[name] for name in scene.runs))):
+        index = video.pauses[t]
+        cells[0, column].set_title(f"{head} (pause {t}, {video.times[index]:.0f} s)", fontsize=12.5)
+        show(cells[0, column], video.frames[index].rgb[box], scene.silhouette(t)[box], "--")
+        show(cells[1, column], *scene.voxels("mst", t, TRUTH, view))
+        for axes, (name, best, _) in zip(cells[2:, column], ROWS, strict=True):
+            overlaps = scene.overlaps(name, t)
+            k = int(np.argmax(overlaps)) if best else scene.most_probable(name, t)
+            show(axes, *scene.voxels(name, t, k, view))
+            text = f"overlap {overlaps[k]:.2f}" if overlaps[k] else "not found"
+            axes.text(0.02, 0.04, text, transform=axes.transAxes, fontsize=12.5, bbox=BEHIND)
+    for row, text in enumerate(("image", "true voxels", *(text for *_, text in ROWS))):
         cells[row, 0].set_ylabel(text, fontsize=12.5, color="#1d2126")
-    figure.savefig(out, dpi=150, metadata={"Software": None})
+    figure.savefig(out, dpi=125, metadata={"Software": None})
 
 
 def animate(scene: Scene, out: Path) -> None:
@@ -182,12 +205,12 @@ def animate(scene: Scene, out: Path) -> None:
         for index, frame in enumerate(scene.recording.frames):
             t = sum(p <= index for p in scene.recording.pauses) - 1
             phase = 2 * np.pi * index / len(scene.recording)
-            picture, mask, _ = scene.voxels("mst", t, scene.view(scene.turn + 0.3 * np.sin(phase)))
+            k, view = scene.most_probable("mst", t), scene.view(scene.turn + 0.3 * np.sin(phase))
             instance = scene.recording.instance(index)
             assert instance is not None
             figure, ((left, right),) = new_figure(8.0, 3.3, 1, 2)
             show(left, frame.rgb[box], (instance == scene.label)[box])
-            show(right, picture, mask)
+            show(right, *scene.voxels("mst", t, k, view))
             left.set_title(f"camera, {scene.recording.times[index]:.1f} s", fontsize=12.5)
             right.set_title(f"mst, after the image of pause {t}", fontsize=12.5)
             figure.set_dpi(100)
@@ -205,7 +228,9 @@ def main(out: Path, work: Path, smoke: bool) -> None:
 
     source = work / "recording"
     family = replace(scene_family("demo"), **SMALL) if smoke else scene_family(FAMILY)
-    recording = open_recording(source) if source.is_dir() else simulate_recording(family, 0 if smoke else SEED, source)
+    recording = (
+        open_recording(source) if source.is_dir() else simulate_recording(family, 0 if smoke else SEED, source)
+    )
     label, pauses = (1, (0, 1, 2)) if smoke else find_hidden(recording)
     runs = {name: filter_recording(recording, load_config(name), work / name, seed=0) for name in METHODS}
     scene = Scene(recording, runs, label, pauses)
