@@ -106,7 +106,8 @@ def test_empty_margins_of_registered_depth_are_no_objects():
     frame = frame_of(TWO, width=640, noise=0.3)
     rows, columns = np.indices(SEEN.shape)
     top, at = np.argwhere(SEEN > 0)[0]
-    margin = (columns < 15) | (rows < top + (columns - at) / 30)  # the image is turned, and an object is at its margin
+    slanted = rows < top + (columns - at) / 30  # the image is turned, and an object is at its margin
+    margin = (columns < 15) | slanted
     assert not foreground(without(frame, margin, (10, 10, 10)), GRID).pixels[margin & (SEEN == 0)].any()
 
 
