@@ -70,7 +70,7 @@ class Scene:
     def __init__(self, clip: Clip, truth: Sequence[Hypothesis]) -> None:
         self.clip, self.truth = clip, truth
         self.frame = clip.after
-        self.part = window([project(h, self.frame.camera) > 0 for h in truth], self.frame.depth.shape)
+        self.part = window([project(h, self.frame.camera) > 0 for h in truth], 1.25)
 
     def colours(self, hypotheses: Sequence[Hypothesis]) -> list[dict]:
         """Colours of the objects of each hypothesis."""

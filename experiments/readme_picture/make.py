@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,9 +77,12 @@ class Scene:
         self.recording, self.runs, self.label, self.pauses = recording, runs, label, pauses
         self.identities = {name: assign_identities(run) for name, run in runs.items()}
         self.near = []  # true voxels near the object at the pauses
+        self.silhouettes = []  # of the object in the images of the pauses
         for t in pauses:
             labels = recording.truth(t)
             assert labels is not None
+            camera = recording.frames[recording.pauses[t]].camera
+            self.silhouettes.append(silhouette(labels, recording.grid, label, camera))
             points = recording.grid.centre_of(np.argwhere(labels > 0))
             own = recording.grid.centre_of(np.argwhere(labels == label)).mean(axis=0)
             near = np.zeros_like(labels)
@@ -128,23 +131,18 @@ class Scene:
         """The heaviest hypothesis; the first, if several have the same weight."""
         return int(np.argmax(self.runs[name].info(t)["weights"]))
 
-    def window(self, margin: float) -> tuple[slice, slice]:
-        """Rows and columns of the image around the object at the three pauses, with the proportions of a cell."""
-        masks = [self.silhouette(t) for t in self.pauses]
-        rows, columns = np.nonzero(np.any(masks, axis=0))
-        size = np.array([CELL[1], CELL[0]])
-        spans = np.array([np.ptp(rows), np.ptp(columns)])
-        shape = np.array(masks[0].shape)
-        size = np.minimum(size * (margin * (spans / size).max()), size * (shape / size).min()).astype(int)
-        low = np.clip((np.array([rows.mean(), columns.mean()]) - size / 2).astype(int), 0, shape - size)
-        return slice(low[0], low[0] + size[0]), slice(low[1], low[1] + size[1])
 
-    def silhouette(self, t: int) -> np.ndarray:
-        """True silhouette of the object in the image of a pause."""
-        labels = self.recording.truth(t)
-        assert labels is not None
-        camera = self.recording.frames[self.recording.pauses[t]].camera
-        return silhouette(labels, self.recording.grid, self.label, camera)
+def window(masks: Sequence[np.ndarray], margin: float) -> tuple[slice, slice]:
+    """Rows and columns of the image around all masks (H, W) bool, with the proportions of a cell.
+
+    The window is `margin` times as large as the masks need, but not larger than the image.
+    """
+    rows, columns = np.nonzero(np.any(masks, axis=0))
+    cell, shape = np.array([CELL[1], CELL[0]]), np.array(masks[0].shape)
+    spans = np.array([np.ptp(rows), np.ptp(columns)])
+    size = (cell * min(margin * (spans / cell).max(), (shape / cell).min())).astype(int)
+    low = np.clip((np.array([rows.mean(), columns.mean()]) - size / 2).astype(int), 0, shape - size)
+    return slice(low[0], low[0] + size[0]), slice(low[1], low[1] + size[1])
 
 
 def pale(rgb: Colour) -> Colour:
@@ -179,11 +177,12 @@ def new_figure(width: float, height: float, rows: int, columns: int) -> tuple[An
 def draw(scene: Scene, out: Path) -> None:
     """Draw the three pauses."""
     figure, cells = new_figure(8.75, 9.3, len(ROWS) + 2, 3)
-    box, view, video = scene.window(2.6), scene.view(scene.turn), scene.recording
-    for column, (t, head) in enumerate(zip(scene.pauses, ("seen", "hidden", "seen again"), strict=True)):
+    box, view, video = window(scene.silhouettes, 2.6), scene.view(scene.turn), scene.recording
+    columns = zip(scene.pauses, ("seen", "hidden", "seen again"), scene.silhouettes, strict=True)
+    for column, (t, head, true) in enumerate(columns):
         index = video.pauses[t]
         cells[0, column].set_title(f"{head} (pause {t}, {video.times[index]:.0f} s)", fontsize=12.5)
-        show(cells[0, column], video.frames[index].rgb[box], scene.silhouette(t)[box], "--")
+        show(cells[0, column], video.frames[index].rgb[box], true[box], "--")
         show(cells[1, column], *scene.voxels("mst", t, TRUTH, view))
         for axes, (name, best, _) in zip(cells[2:, column], ROWS, strict=True):
             overlaps = scene.overlaps(name, t)
@@ -201,7 +200,7 @@ def animate(scene: Scene, out: Path) -> None:
     from PIL import Image
 
     def pictures() -> Iterator[Image.Image]:
-        box = scene.window(3.6)
+        box = window(scene.silhouettes, 3.6)
         for index, frame in enumerate(scene.recording.frames):
             t = sum(p <= index for p in scene.recording.pauses) - 1
             phase = 2 * np.pi * index / len(scene.recording)

@@ -347,10 +347,10 @@ def _segments(proposed: Population, readings: Readings, raised: np.ndarray) -> l
     border, a pixel of one object can measure the depth of another object. Any other reading belongs to the segment
     of its voxel, or to the table if the voxel contains a reading above the table.
     """
-    beside = readings.share_voxel(raised)
+    beside, voxels = readings.share_voxel(raised), tuple(readings.voxels.T)
 
     def labels(h: Hypothesis) -> np.ndarray:
-        return np.where(raised, readings.labels(h.labels, 1.0), np.where(beside, 0, readings.labels(h.labels, 0.0)))
+        return np.where(raised, readings.labels(h.labels, 1.0), np.where(beside, 0, h.labels[voxels]))
 
     found = {id(h): labels(h) for h in {id(h): h for h in proposed.particles}.values()}
     return [found[id(h)] for h in proposed.particles]
