@@ -27,7 +27,8 @@ from scipy.special import expit
 
 from mstfilter.completion import Completer, Completion
 from mstfilter.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
-from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid
+from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid, memo
+from mstfilter.scene.support import Foreground
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
 
 OWN, FREE, BEHIND, OTHER, HIDDEN = range(5)  # what an observation shows of a cell; a view has the first three
@@ -203,6 +204,9 @@ class RowUpdate(Update):
         present = predicted if predicted is not None else proposed
         assert present is not None
         clip = RowClip(RowImage(observation, present.particles[0].grid))
+        image: Any = clip.after
+        # There is no table, so every reading belongs to an object. The update finds this result in the cache.
+        memo("foreground", (image.key, clip.grid.key), lambda: Foreground(image.valid, image))
         return self.partition.update(rng, predicted, proposed, clip)  # type: ignore[arg-type]
 
 
