@@ -10,8 +10,8 @@ have one to three earlier views of the whole object (`mstfilter.completion.obser
 moved: from other cameras, with a small error of the motion since then, and some of them without some other objects.
 
 The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
-point lies in the mask. So a whole object gets all its voxels, the masks of two halves share them, and a mask of two
-objects gets both.
+point lies in the mask or within two pixels of it. So a whole object gets all its voxels, also where the border of its
+mask is displaced, the masks of two halves share them, and a mask of two objects gets both.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -210,9 +211,9 @@ def _sample(
     if not now.surface.any():
         return None
     box = tuple(slice(int(o), int(o) + n) for o, n in zip(offset, seen.surface.shape, strict=True))
-    shape = np.zeros(seen.surface.shape, bool)
+    shape, near = np.zeros(seen.surface.shape, bool), ndimage.binary_dilation(mask, np.ones((3, 3)), 2)
     for k in found:
-        shape |= _claimed(frame, instance == k, mask, truth[box] == k, offset)
+        shape |= _claimed(frame, instance == k, near, truth[box] == k, offset)
     index = 2 if len(found) > 1 else int(counts[main] < _WHOLE * whole[main])
     bits, signed = (_padded(one) for one in encode_box(seen))
     return index, bits, signed, _padded(shape), main

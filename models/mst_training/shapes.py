@@ -139,6 +139,54 @@ def _hook(rng: np.random.Generator) -> list[Piece]:
     return [capsule(a, b, thick * r) for a, b, r in zip(path, path[1:], (ends, 0.9, 1, 1, 0.9, ends), strict=False)]
 
 
+def _carton(rng: np.random.Generator) -> list[Piece]:
+    return [box((_length(rng, 0.012, 0.035), _length(rng, 0.03, 0.085), _length(rng, 0.05, 0.12)))]
+
+
+def _tile(rng: np.random.Generator) -> list[Piece]:
+    """A book, a keyboard, or another flat box."""
+    return [box((_length(rng, 0.025, 0.11), _length(rng, 0.04, 0.14), _length(rng, 0.005, 0.016)))]
+
+
+def _rod(rng: np.random.Generator) -> list[Piece]:
+    return [cylinder(_length(rng, 0.006, 0.016), _length(rng, 0.035, 0.11))]
+
+
+def _tool(rng: np.random.Generator) -> list[Piece]:
+    """A grip with a head at its end: a hammer, a brush, or a flat pan."""
+    grip, thick = _length(rng, 0.04, 0.1), _length(rng, 0.007, 0.016)
+    head = np.array([_length(rng, 0.012, 0.05), _length(rng, 0.012, 0.05), rng.uniform(0.8, 1.6) * thick])
+    round_head = rng.uniform() < 0.3
+    end = cylinder(head[0], head[2], (grip + head[0], 0, 0)) if round_head else box(head, (grip + head[0], 0, 0))
+    return [capsule((-grip, 0, 0), (grip, 0, 0), thick), end]
+
+
+def _vase(rng: np.random.Generator) -> list[Piece]:
+    """A vessel with a thin wall and a random profile."""
+    height, wide = _length(rng, 0.05, 0.2), _length(rng, 0.025, 0.075)
+    wall = rng.uniform(0.006, 0.012)
+    radii = np.maximum(wide * rng.uniform(0.6, 1.0, 4), 2 * wall)
+    levels = height * np.array([0.0, rng.uniform(0.2, 0.4), rng.uniform(0.55, 0.8), 1.0])
+    walls = ring([(r - wall, r, z) for r, z in zip(radii.tolist(), levels.tolist(), strict=True)], 14)
+    return [cylinder(radii[0] - 0.5 * wall, wall / 2, (0, 0, wall / 2)), *walls]
+
+
+def _jug(rng: np.random.Generator) -> list[Piece]:
+    """A large mug or a filled vessel, with a handle."""
+    radius, height = _length(rng, 0.035, 0.075), _length(rng, 0.08, 0.2)
+    wall, upper = rng.uniform(0.006, 0.012), radius * rng.uniform(0.6, 1.2)
+    if rng.uniform() < 0.5:
+        pieces = [frustum((radius, 0.0), (upper, height))]
+    else:
+        pieces = ring([(radius - wall, radius, 0.0), (upper - wall, upper, height)], 14)
+        pieces.append(cylinder(radius - 0.5 * wall, wall / 2, (0, 0, wall / 2)))
+    reach, tall, thick = rng.uniform(0.025, 0.05), rng.uniform(0.2, 0.4) * height, _length(rng, 0.006, 0.012)
+    start, middle = min(radius, upper) - 0.003, rng.uniform(0.45, 0.6) * height
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 6)
+    path = [(start + reach * np.cos(a), 0.0, middle + tall * np.sin(a)) for a in turn]
+    return pieces + [capsule(a, b, thick) for a, b in pairwise(path)]
+
+
 def _wedge(rng: np.random.Generator) -> list[Piece]:
     """A triangular prism."""
     long, wide, high = (_length(rng, 0.03, 0.14) for _ in range(3))
@@ -170,6 +218,12 @@ _KINDS: dict[str, tuple[Callable[[np.random.Generator], list[Piece]], tuple[tupl
     "mug": (_mug, ((3, 0.7), (-3, 0.15), (1, 0.15)), 1.0),
     "tube": (_tube, ((3, 0.6), (1, 0.4)), 0.6),
     "hook": (_hook, ((3, 1.0),), 0.7),
+    "carton": (_carton, ((3, 0.6), (2, 0.2), (1, 0.2)), 2.0),
+    "tile": (_tile, ((3, 0.85), (2, 0.1), (1, 0.05)), 1.2),
+    "rod": (_rod, ((1, 0.8), (3, 0.2)), 0.7),
+    "tool": (_tool, ((3, 1.0),), 0.8),
+    "vase": (_vase, _UPRIGHT, 1.0),
+    "jug": (_jug, _UPRIGHT, 1.0),
     "wedge": (_wedge, _ANY_SIDE, 1.0),
     "tee": (_tee, _ANY_SIDE, 1.0),
 }

@@ -13,12 +13,12 @@ that shares most readings with the segment. An object that is the main object of
 A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
 
 1. The first rule considers only segments whose main object is the predicted object. A considered segment continues
-   the object if it has more than 80 % of those readings of the object that lie in considered segments. The first rule
+   the object if it has more than half of those readings of the object that lie in considered segments. The first rule
    ignores readings at which another object now occludes the predicted object.
-2. The second rule considers all segments. A segment continues the object if it has more than 80 % of those readings
+2. The second rule considers all segments. A segment continues the object if it has more than half of those readings
    of the object that lie in any segment.
 
-In a component of one segment and one object, the share is 50 % instead of 80 %. The rules have consequences:
+The rules have consequences:
 
 - If a predicted object is *split* and no segment has enough readings of the object, no segment continues the object.
   The track of a split object then ends, its views are deleted, and the segments are new objects.
@@ -46,8 +46,7 @@ from scipy.optimize import linear_sum_assignment
 from mstfilter.scene import ObjectRecord, ObjectView
 
 _CONFLICT = 0.1  # a segment and an object are in conflict if they share more than this share of the smaller one
-_SAME = 0.5  # share of an object's readings in the segment that continues it, if both have no other conflict
-_CONTAINED = 0.8  # the same, if they have other conflicts
+_CONTINUED = 0.5  # a segment continues an object if it has more than this share of the object's readings
 
 
 _ALIKE = 0.5  # with less, the same object is less probable than another object (simulated scenes)
@@ -132,23 +131,21 @@ class Overlaps:
         """The predicted objects that each segment of a component continues, by decreasing number of readings."""
         continued: dict[int, list[int]] = {segment: [] for segment in component.segments}
         for predicted in component.objects:
-            segment = self.continued_by(predicted, component)
+            segment = self.continued_by(predicted)
             if segment:
                 continued[segment].append(predicted)
         return {a: sorted(objects, key=lambda k: -self.shared[a, k]) for a, objects in continued.items()}
 
-    def continued_by(self, predicted: int, component: ConflictComponent) -> int:
-        """The segment of a component that continues a predicted object; 0 if there is none."""
-        no_other_conflict = len(component.segments) == len(component.objects) == 1
-        share = _SAME if no_other_conflict else _CONTAINED
+    def continued_by(self, predicted: int) -> int:
+        """The segment that continues a predicted object; 0 if there is none."""
         mainly_it = self.main_object == predicted
-        return self._holder(predicted, mainly_it, share) or self._holder(predicted, np.ones_like(mainly_it), share)
+        return self._holder(predicted, mainly_it) or self._holder(predicted, np.ones_like(mainly_it))
 
-    def _holder(self, predicted: int, segments: np.ndarray, share: float) -> int:
-        """The segment that is in conflict with an object and has more than a `share` of the object's readings, or 0.
+    def _holder(self, predicted: int, segments: np.ndarray) -> int:
+        """The segment that is in conflict with an object and has more than half of the object's readings, or 0.
 
         Only readings in the segments that `segments` (segments + 1,) bool selects are counted.
         """
         readings = np.where(segments, self.shared[:, predicted], 0)
-        enough = self.in_conflict[:, predicted] & (readings > share * readings.sum())
+        enough = self.in_conflict[:, predicted] & (readings > _CONTINUED * readings.sum())
         return int(enough.argmax())
