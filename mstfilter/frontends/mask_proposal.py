@@ -89,8 +89,9 @@ class MaskProposal(Proposal, UsesFiles):
                         pixels[numbers[node]] = mask
                     chosen[row].append(numbers[node])
         samples = [np.array(row, dtype=np.int64) for row in chosen]
+        mended = Clip((self.objects.foreground(frame, grid).frame,), grid, observation.index)
         particles, counts = complete_segments(
-            rng, observation, samples, pixels.__getitem__, self.completer, self.threshold
+            rng, mended, samples, pixels.__getitem__, self.completer, self.threshold
         )
         alternatives = np.bincount(drawn, minlength=len(masks.weights)).tolist()
         notes = {"masks": masks.key.hex(), "alternatives": alternatives, **counts}

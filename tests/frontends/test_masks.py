@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from mstfilter.frontends import (
     write_masks,
 )
 from mstfilter.presets import preset
-from mstfilter.scene import render, scene_cache, write_image
+from mstfilter.scene import project, render, scene_cache, write_image
 from mstfilter.segmentation import ExactCuts, ObjectRule
 from mstfilter.smc.testing import ProposalContract
 from mstfilter.testing import scene_example
@@ -344,3 +345,18 @@ def test_writing_replaces_what_was_there_or_changes_nothing(tmp_path):
             write_masks(tmp_path, 0, alternatives, weights)
     assert (read_masks(tmp_path, 0, SHAPE).trees[0].leaves == SHOWN).all()
     assert [path.name for path in tmp_path.iterdir()] == ["000000"]
+
+
+def test_a_surface_without_readings_is_estimated_as_by_the_other_proposals(tmp_path):
+    frame, mask = CLIP.after, BOX[0]
+    rows, columns = np.nonzero(mask)
+    hole = mask & (np.indices(SHAPE)[1] > columns.min() + 4) & (np.indices(SHAPE)[0] > rows.min() + 4)
+    rgb = np.where(mask[..., None], np.array([200, 30, 30], np.uint8), np.full((*SHAPE, 3), 120, np.uint8))
+    dark = replace(CLIP, frames=(replace(frame, rgb=rgb, depth=np.where(hole, np.nan, frame.depth)),))
+    write_masks(tmp_path / "masks", 0, [stack(mask)])
+    covered = []
+    for mend in (False, True):
+        proposal = MaskProposal(str(tmp_path / "masks"), objects=ObjectRule(mend=mend))
+        (hypothesis,) = proposal.sample(np.random.default_rng(0), dark, 1).particles
+        covered.append((project(hypothesis, frame.camera)[hole] > 0).mean())
+    assert covered[0] < 0.8 and covered[1] > 0.95, covered
