@@ -55,7 +55,7 @@ class NetworkCompleter(Completer, UsesFiles):
 
     weights: str = "completion"
     least_surface: Share = 2 / 3
-    log_odds: Annotated[float, Bounds()] = 0.6
+    log_odds: Annotated[float, Bounds()] = 0.3
     architecture: Architecture | None = None
 
     @property

@@ -35,7 +35,7 @@ SMALL = CompletionTraining(
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> list[Path]:
     """Two files of one scene each, made by two processes."""
-    return CompletionSamples.write(tmp_path_factory.mktemp("samples"), 6, 2, workers=2, per_file=1)
+    return CompletionSamples.write(tmp_path_factory.mktemp("samples"), 8, 2, workers=2, per_file=1)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def samples(files) -> CompletionSamples:
 
 def test_a_sample_depends_on_its_scene_alone(samples):
     """On the seed and the number of the scene, not on the process that makes it."""
-    again, first = CompletionSamples.of_scene(6, 1), int((samples.scene == 0).sum())
+    again, first = CompletionSamples.of_scene(8, 1), int((samples.scene == 0).sum())
     for name, values in samples.columns().items():
         assert np.array_equal(values[first:], again.columns()[name]), name
     assert set(samples.scene.tolist()) == {0, 1} and len(samples) > 20
@@ -67,7 +67,7 @@ def test_parts_of_an_object_share_its_voxels(samples):
     """Parts get less than whole objects in proportion to what is visible of them."""
     volume, surface = samples.truth.sum(axis=(1, 2, 3)), (samples.bits & 1).sum(axis=(1, 2, 3))
     whole, part = (volume[samples.mask == k].sum() / surface[samples.mask == k].sum() for k in (0, 1))
-    assert 0.4 < part / whole < 1.6
+    assert 0.4 < part / whole < 2.2  # 1.3 over 300 scenes; 4 or more if each part got the whole object
     assert volume[samples.mask == 1].mean() < volume[samples.mask == 0].mean()
 
 
