@@ -8,7 +8,7 @@
 
 `studies.toml` lists the commands of each study, and the files on which its results depend. A study is *current* if
 its results were made with the present state of these files and of its folder. The hash of the state ignores comments,
-docstrings, the format of the code, and the packages that change no result.
+docstrings, the format of the code, the version number, and the packages that change no result.
 
 After a run, `record.json` in the folder of the study has the hash of the program, the commit, the commands, the
 machine, the libraries, the date and the processor time. A record without the hash is older than the program.
@@ -138,7 +138,7 @@ def _files(place: str) -> Iterator[str]:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file; of Python code, the syntax tree without docstrings."""
+    """The bytes of a file; of Python code, the syntax tree without docstrings and version number."""
     return _syntax(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
 
 
@@ -148,7 +148,13 @@ def _syntax(code: bytes) -> bytes:
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
             del node.body[0]
+    tree.body = [node for node in tree.body if not _is_version(node)]
     return ast.dump(tree).encode()
+
+
+def _is_version(node: ast.stmt) -> bool:
+    """Whether a statement sets the version number: a release alone makes no result older."""
+    return isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__version__"
 
 
 def _read(path: Path) -> dict[str, Any]:

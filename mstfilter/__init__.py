@@ -14,5 +14,5 @@ import logging
 from mstfilter.lazy import attach
 
 logging.getLogger("mstfilter").addHandler(logging.NullHandler())  # the application decides what is shown
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

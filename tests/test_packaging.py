@@ -49,11 +49,12 @@ def wheel(tmp_path_factory):
 
 
 def test_versions_agree():
-    """The places that a release changes."""
+    """The places that a release changes: version and date."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    citation = re.search(r"^version: (\S+)$", (REPOSITORY / "CITATION.cff").read_text(), flags=re.MULTILINE)
-    assert project["version"] == mstfilter.__version__ == citation[1]
-    assert f"## [{project['version']}]" in (REPOSITORY / "CHANGELOG.md").read_text()
+    citation = dict(re.findall(r"^(version|date-released): (\S+)$", (REPOSITORY / "CITATION.cff").read_text(), re.M))
+    assert project["version"] == mstfilter.__version__ == citation["version"]
+    notes = re.findall(r"^## \[(\S+)\] - (\S+)$", (REPOSITORY / "CHANGELOG.md").read_text(), re.M)
+    assert notes[0] in {(project["version"], citation["date-released"]), (project["version"], "unreleased")}
 
 
 def test_in_a_wheel(wheel, tmp_path):

@@ -155,7 +155,7 @@ def _rod(rng: np.random.Generator) -> list[Piece]:
 def _tool(rng: np.random.Generator) -> list[Piece]:
     """A grip with a head at its end: a hammer, a brush, or a flat pan."""
     grip, thick = _length(rng, 0.04, 0.1), _length(rng, 0.007, 0.016)
-    head = np.array([_length(rng, 0.012, 0.05), _length(rng, 0.012, 0.05), rng.uniform(0.8, 1.6) * thick])
+    head = _length(rng, 0.012, 0.05), _length(rng, 0.012, 0.05), rng.uniform(0.8, 1.6) * thick
     round_head = rng.uniform() < 0.3
     end = cylinder(head[0], head[2], (grip + head[0], 0, 0)) if round_head else box(head, (grip + head[0], 0, 0))
     return [capsule((-grip, 0, 0), (grip, 0, 0), thick), end]

@@ -90,15 +90,15 @@ def _warnings_as_lines() -> Iterator[None]:
     with warnings.catch_warnings():
         show_other, shown = warnings.showwarning, set()
         warnings.simplefilter("always", InputWarning)
+        # uv does not compile: the first import of higra in Python 3.12 gives 65 warnings about its docstrings
+        warnings.filterwarnings("ignore", category=SyntaxWarning, module=r".*\bhigra\b")
 
         def show(message: Warning | str, *place: Any, **named: Any) -> None:
             if not isinstance(message, InputWarning):
                 show_other(message, *place, **named)
-                return
-            if message.message in shown:
-                return
-            shown.add(message.message)
-            _print("warning", message.message, *message.hints)
+            elif message.message not in shown:
+                shown.add(message.message)
+                _print("warning", message.message, *message.hints)
 
         warnings.showwarning = show
         yield

@@ -68,6 +68,7 @@ def study(tmp_path, monkeypatch):
     "name, text, same",
     [
         ("mstfilter/a.py", '"""Another docstring."""\n\n# a comment\nx = 1\n', True),
+        ("mstfilter/a.py", '"""A."""\n__version__ = "0.2.0"\nx = 1\n', True),
         ("mstfilter/a.py", '"""A."""\nx = 2\n', False),
         ("mstfilter/cli/b.py", "y = 2\n", True),
         ("models/mst.toml", "n = 6\n", False),
