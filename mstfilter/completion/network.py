@@ -55,7 +55,7 @@ class NetworkCompleter(Completer, UsesFiles):
 
     weights: str = "completion"
     least_surface: Share = 2 / 3
-    log_odds: Annotated[float, Bounds()] = 0.3
+    log_odds: Annotated[float, Bounds()] = 0.2
     architecture: Architecture | None = None
 
     @property
