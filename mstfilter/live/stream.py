@@ -41,6 +41,7 @@ from mstfilter.scene import (
     check_depth,
     examine,
     find_world,
+    render_hypothesis,
     report_findings,
     rigid_from_matrix,
     scene_cache,
@@ -346,5 +347,8 @@ class Stream:
             self.last = Pause(clip.index, clip, numbers, self._state, info, latency, dict(self.counts))
             if self._on_pause is not None:
                 self._on_pause(self.last)
+            if self._flows:
+                for hypothesis in self.hypotheses:  # cached, since the next step tracks what is visible now
+                    render_hypothesis(hypothesis, clip.after.camera)
         except BaseException as error:
             self._error = self._error or error

@@ -159,10 +159,9 @@ class Camera:
         Column and row are int64. Points that project outside the image have column 0 and row 0.
         """
         uv, z = self.project(points)
-        pixel = np.rint(np.where(np.isfinite(uv), uv, -1.0))
-        inside: np.ndarray = np.all((pixel >= 0) & (pixel < [self.width, self.height]), axis=-1)
-        u, v = np.moveaxis(np.where(inside[..., None], pixel, 0.0).astype(np.int64), -1, 0)
-        return u, v, z, inside
+        u, v = np.moveaxis(np.rint(np.where(np.isfinite(uv), uv, -1.0)), -1, 0)
+        inside: np.ndarray = (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+        return np.where(inside, u, 0).astype(np.int64), np.where(inside, v, 0).astype(np.int64), z, inside
 
     def scaled(self, factor: float) -> Camera:
         """The camera for images resized by `factor`. The corner (-0.5, -0.5) of the first pixel does not move."""

@@ -70,8 +70,11 @@ def _exposure(frame: Frame, reference: Frame) -> tuple[np.ndarray, np.ndarray]:
             error = np.abs(y - (g * x + o))
             keep = error <= max(2.5 * float(np.median(error)), 1.0)
             mx, my = x[keep].mean(), y[keep].mean()
+            before = g, o
             g = (((x[keep] - mx) * (y[keep] - my)).mean() + _PRIOR_VARIANCE) / (x[keep].var() + _PRIOR_VARIANCE)
             o = my - g * mx
+            if (g, o) == before:
+                break
         if 0.4 < g < 2.5:
             gain[c], offset[c] = g, o
     return gain.astype(np.float32), offset.astype(np.float32)

@@ -76,13 +76,15 @@ class MotionResidual:
         counted = inside & after.valid[v, u]
         behind = z - measured
         scale = _DEPTH_SCALE * np.sqrt(2.0) * depth_sigma(measured)
-        colour = np.linalg.norm(track.colour_after[v, u] - colours, axis=-1)
+        red, green, blue = np.moveaxis(track.colour_after[v, u] - colours, -1, 0)
+        colour = np.sqrt(red**2 + green**2 + blue**2)  # faster than a reduction over three elements
         with np.errstate(invalid="ignore"):
             hidden = behind > _OCCLUDED_MARGIN
             cost = np.minimum(np.abs(behind) / scale, _CAP) ** 2
             cost = cost + np.minimum(colour / _COLOUR_SCALE, _CAP) ** 2
         cost = np.where(hidden, _OCCLUDED_COST, cost)
-        counted &= ~(hidden & _facing_away(track, motions, moved, n_points))
+        candidates = counted & hidden
+        counted[candidates] = ~_facing_away(track, motions, moved, n_points, candidates)
         n_outside = (~inside).sum(axis=-1)
         n = n_outside + counted.sum(axis=-1)
         total = np.where(counted, cost, 0.0).sum(axis=-1) + OUTSIDE_COST * n_outside
@@ -99,12 +101,12 @@ class MotionResidual:
         return np.where(supported & (n >= max(_MIN_COUNTED * len(points), 1)), mean, np.inf)
 
 
-def _facing_away(track: Track, motions: np.ndarray, moved: np.ndarray, n: int) -> np.ndarray:
-    """Whether the surface at the moved points (K, N, 3) of `Track.sample` faces away from the camera, (K, N) bool."""
+def _facing_away(track: Track, motions: np.ndarray, moved: np.ndarray, n: int, at: np.ndarray) -> np.ndarray:
+    """Whether the surface faces away from the camera at the moved points (K, N, 3) that `at` (K, N) selects."""
     normal = normals(track.clip.before).reshape(-1, 3)[track.sampled(n)] @ np.swapaxes(motions[:, :3, :3], -1, -2)
-    ray = moved - track.clip.after.camera.position
+    ray = moved[at] - track.clip.after.camera.position
     with np.errstate(invalid="ignore"):
-        return np.einsum("kni,kni->kn", normal, ray) > _FACING_AWAY * np.linalg.norm(ray, axis=-1)
+        return np.einsum("ni,ni->n", normal[at], ray) > _FACING_AWAY * np.linalg.norm(ray, axis=-1)
 
 
 def _unexplained(track: Track, motions: np.ndarray, n: int) -> np.ndarray:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mstfilter.scene import Clip, Frame
-from mstfilter.tracking.flow import DenseFlow
+from mstfilter.tracking.flow import DenseFlow, _changed
 from tests.tracking.scenes import Box, Scene, at, iou, slide
 
 
@@ -60,12 +60,13 @@ def test_the_robot_is_never_followed(textured):
     assert (tracks.warp(everything)[clip.after.robot_mask] == 0).all()
 
 
-def test_points_end_where_the_surface_went():
+@pytest.mark.parametrize("region", ["changed", "image"])
+def test_points_end_where_the_surface_went(region):
     scene = Scene(
         [Box((0.14, 0.12, 0.08), texture=0.6)], [[p] for p in slide(at(-0.05, 0, 0.04), at(0.04, 0.03, 0.04, 12), 6)]
     )
     clip = scene.clip(0)
-    tracks = DenseFlow().track(clip)
+    tracks = DenseFlow(region=region).track(clip)
     ids = scene.trace(scene.poses[0])[1]
     chosen = tracks.points_in(ids == 1)
     u, v = tracks.start[chosen].T
@@ -75,6 +76,29 @@ def test_points_end_where_the_surface_went():
     error = np.linalg.norm(tracks.end[chosen] - truth, axis=1)
     assert len(chosen) > 100
     assert np.nanmedian(error) < 2.0
+
+
+def test_the_flow_of_the_changed_region_follows_masks_as_well_as_that_of_the_image(textured):
+    scene, clip = textured
+    before, after = label_images(scene)
+    quality = {}
+    for region in ("changed", "image"):
+        tracked = DenseFlow(region=region).track(clip).warp(before)
+        quality[region] = np.mean([iou(tracked == k, after == k) for k in MOVERS])
+    assert quality["changed"] > quality["image"] - 0.03
+
+
+def test_pixels_far_from_any_change_keep_their_position(textured):
+    _, clip = textured
+    a, b = clip.frames[0], clip.frames[-1]
+    (rows, columns), settled = _changed(a, b)
+    outside = np.ones(settled.shape, bool)
+    outside[rows, columns] = False
+    source = DenseFlow().track(Clip((a, b), clip.grid)).source
+    grid = np.arange(source.size, dtype=np.int32).reshape(source.shape)
+    assert (outside & settled).any()
+    np.testing.assert_array_equal(source[outside & settled], grid[outside & settled])
+    assert _changed(a, a)[0] == np.s_[0:0, 0:0]
 
 
 def test_colour_alone_is_enough():
