@@ -41,10 +41,8 @@ _FRAME_MOTION = 0.03
 _ROUND_TRIP = 1.0  # pixels, largest forward-backward error of a track
 _DEPTH_JUMP = 0.03  # metres, largest change of depth of a track between consecutive frames
 _COLOUR_JUMP = 30.0  # grey levels per channel, largest change of colour of a track between consecutive frames
-_CHANGE_SIGMAS, _COLOUR_CHANGE = (
-    5.7,
-    12.0,
-)  # smallest change of depth (noise of one reading) and colour that is motion
+_CHANGE_SIGMAS = 5.7  # smallest change of depth that is motion, in standard deviations of the noise of one reading
+_COLOUR_CHANGE = 12.0  # smallest change of colour that is motion, grey levels in any channel
 #: Pixels. Margin of the box beside the changed pixels. The corners of the box are multiples of the second number, so
 #: that the patches of DIS are those of the whole image.
 _MARGIN, _STEP = 24, 48
