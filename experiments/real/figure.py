@@ -23,7 +23,8 @@ METHODS = {  #: method -> label, marker, colour
     "mst": ("mst", "o", "#336fb9"),
     "mst, no past": ("mst, no earlier images", "s", "#7fb2e5"),
     "single_frame": ("best cut of the latest image", "^", "#2ca281"),
-    "floor_components": ("floor: connected components", "x", "#b0413e"),
+    "floor_image": ("floor: components in the image", "x", "#b0413e"),
+    "floor_components": ("floor: components of space", "+", "#b0413e"),
 }
 
 
@@ -31,7 +32,7 @@ def main(out: Path) -> None:
     """Draw a row for each labelled sequence."""
     rows = [row for row in read_csv(HERE / "results" / "sequences.csv") if row["source"] in ("hots", "osd")]
     names = list(dict.fromkeys(row["sequence"] for row in rows))
-    figure, axes = plt.subplots(figsize=(6.4, 0.32 * len(names) + 1.2), layout="constrained")
+    figure, axes = plt.subplots(figsize=(6.4, 0.32 * len(names) + 1.9), layout="constrained")
     for method, (label, marker, colour) in METHODS.items():
         found = {row["sequence"]: float(row["quality"]) for row in rows if row["method"] == method}
         axes.scatter(
@@ -43,7 +44,7 @@ def main(out: Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("quality in the image (higher is better)")
     axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="lower left", fontsize="small")
+    figure.legend(loc="outside upper center", ncols=2, fontsize="small")
     figure.savefig(out, dpi=110, metadata={"Software": None})
 
 
