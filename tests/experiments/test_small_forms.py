@@ -136,6 +136,12 @@ def test_full_size(tmp_path):
         assert sum(parts) == pytest.approx(float(r["step_s"]), abs=0.01)
 
 
+def test_latency(tmp_path):
+    assert "after the last frame" in run_script("full_size/latency.py", "--smoke", "--out", tmp_path)
+    (row,) = read_csv(tmp_path / "latency.csv")
+    assert row["pause"] == "1" and float(row["latency_s"]) > 0
+
+
 def test_readme_picture(tmp_path):
     run_script("readme_picture/make.py", "--smoke", "--out", tmp_path)
     assert read_rgb(tmp_path / "hidden.png").std() > 10 and (tmp_path / "hidden.webp").stat().st_size > 10_000
