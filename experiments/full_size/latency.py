@@ -3,9 +3,9 @@
     python experiments/full_size/latency.py                      # three scenes, about three minutes
     python experiments/full_size/latency.py --smoke --out DIR    # a small scene: shows only that it works
 
-Simulates one scene of each family at 640 x 480 pixels, and pushes the frames to a stream at 5 Hz. The end of each clip
-is announced. Writes results/latency.csv. The latency contains the time for the work that is left when the last frame
-arrives, so run the script on a machine without other work.
+Simulates one scene of each family at 640 x 480 pixels, and pushes the frames to a stream at 5 Hz. The end of each
+clip is announced. Writes results/latency.csv. The latency contains the time for the work that is left when the last
+frame arrives, so run the script on a machine without other work.
 """
 
 from __future__ import annotations
@@ -71,6 +71,8 @@ def main(out: Path, smoke: bool) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--smoke", action="store_true", help="a small scene; needs --out")
     arguments = parser.parse_args()
+    if arguments.smoke and arguments.out == parser.get_default("out"):
+        parser.error("--smoke would overwrite the results: name another folder with --out")
     main(arguments.out, arguments.smoke)
