@@ -11,9 +11,7 @@ frame arrives, so run the script on a machine without other work.
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -21,7 +19,7 @@ import torch
 import mstfilter
 from mstfilter.files import write_csv
 from mstfilter.scene import Recording
-from mstfilter.simulation import cached_recording, scene_family, simulate_recording
+from mstfilter.simulation import cached_recording
 
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 SEED = 41
@@ -52,14 +50,8 @@ def main(out: Path, smoke: bool) -> None:
     torch.set_num_threads(1)
     rows = []
     for family in ("demo",) if smoke else ("s1", "s2", "s3"):
-        with tempfile.TemporaryDirectory() as folder:
-            if smoke:
-                recording = simulate_recording(
-                    replace(scene_family(family), **SMALL), SEED, Path(folder) / "recording"
-                )
-            else:
-                recording = mstfilter.open_recording(cached_recording(family, SEED))
-            found = latencies(recording, 0.05 if smoke else 0.2)
+        recording = mstfilter.open_recording(cached_recording(family, SEED, **(SMALL if smoke else {})))
+        found = latencies(recording, 0.05 if smoke else 0.2)
         rows += [{"family": family, "pause": t, "latency_s": s} for t, s in enumerate(found, start=1)]
         print(
             f"{family}: {sum(found) / len(found):.2f} s after the last frame, largest {max(found):.2f} s", flush=True
