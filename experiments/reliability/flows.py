@@ -33,6 +33,8 @@ _TIMES = (
     "result.json",
     "runs.csv",
     "summary.csv",
+    "summary.md",
+    "summary.tex",
     "differences.csv",
     "report.html",
 )
