@@ -3,6 +3,7 @@
     python experiments/record.py                    # lists the studies: state, commit, date, core hours
     python experiments/record.py --run              # runs every study that is older than the program; resumable
     python experiments/record.py --run real main    # runs some studies, if they are older than the program
+    python experiments/record.py --same             # compares the program of older results with the present one
     python experiments/record.py --check            # exit status 1 if the front page cites an older study
     python experiments/record.py --table            # the table of experiments/README.md
 
@@ -11,10 +12,17 @@ its results were made with the present state of these files and of its folder. T
 docstrings, the format of the code, the version number, and the packages that change no result.
 
 After a run, `record.json` in the folder of the study has the hash of the program, the commit, the commands, the
-machine, the libraries, the date and the processor time. A record without the hash is older than the program.
+machine, the libraries, the date and the processor time, without that of interrupted calls. A record without the hash
+is older than the program.
 
 An interrupted study continues with the next call. If the program has changed in between, the study starts again. The
 former results, which git keeps, and the intermediate files are deleted first.
+
+A change of structure makes all results older. `--same` computes the hashes of `experiments/fingerprints` with the
+program of the results and with the present program. Where all agree, the results are current again, and `record.json`
+has the commit of the comparison as `equal`. A study whose own files have changed, or which depends on less than the
+whole program, has to run again. The hashes are of a few runs: a change that is meant to change results, even in a
+rare case, needs the study.
 """
 
 from __future__ import annotations
@@ -27,6 +35,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -61,12 +70,20 @@ class Study:
         """The content of record.json; empty if the study has not been recorded."""
         return _read(self.folder / "record.json")
 
-    def program(self) -> str:
-        """A hash of the files on which the results depend."""
-        digest = hashlib.sha256()
-        for name in sorted({name for place in (*self.depends, f"experiments/{self.name}") for name in _files(place)}):
-            digest.update(name.encode() + b"\0" + _content(REPOSITORY / name))
-        return digest.hexdigest()[:16]
+    def program(self, root: Path | None = None) -> str:
+        """A hash of the files on which the results depend, in the repository or in a copy of it."""
+        return _hash(root or REPOSITORY, *self.depends, f"experiments/{self.name}")
+
+    @property
+    def base(self) -> str:
+        """The last commit whose program is known to give the results."""
+        return str(self.record().get("equal", self.record().get("commit", "")))
+
+    def is_made_by(self, root: Path) -> bool:
+        """Whether the program in `root` made the results, with the present files of the study."""
+        script = f"experiments/{self.name}"
+        made = self.record().get("program") == self.program(root)
+        return made and self.depends == PROGRAM and _hash(root, script) == _hash(REPOSITORY, script)
 
     def is_current(self) -> bool:
         """Whether the present program made the results."""
@@ -79,6 +96,7 @@ class Study:
         if done.get("program") != self.program():
             self._clear()
             done = {"program": self.program(), "commands": [], "core_hours": 0.0}
+            write_json(state, done)
         for command in self.commands[len(done["commands"]) :]:
             print(f"{self.name}: {command}", flush=True)
             before = os.times()
@@ -91,8 +109,7 @@ class Study:
                 sys.exit(f"error: a command of the study {self.name} ended with exit status {code}: {command}")
         if self.program() != done["program"]:
             sys.exit(f"error: the program changed while the study {self.name} ran\nhint: run the study again")
-        commit = subprocess.check_output(["git", "rev-parse", "--short=8", "HEAD"], cwd=REPOSITORY, text=True).strip()
-        about = {"commit": commit, "date": date.today().isoformat(), "machine": machine()}
+        about = {"commit": _head(), "date": date.today().isoformat(), "machine": machine()}
         write_json(self.folder / "record.json", {**done, **about, "libraries": library_versions()})
         state.unlink()
 
@@ -112,6 +129,34 @@ def studies() -> dict[str, Study]:
     return {name: Study(name, one["commands"], tuple(one.get("depends", PROGRAM))) for name, one in found.items()}
 
 
+def compare(older: list[Study]) -> None:
+    """Record results as current where the fingerprints of their program agree with those of the present program."""
+    if _git("status", "--porcelain", "--", *PROGRAM):
+        sys.exit("error: the program has changes that are not committed\nhint: commit them, then compare again")
+    with tempfile.TemporaryDirectory() as folder:
+        for base in sorted({study.base for study in older} - {""}):
+            tree = Path(folder) / base
+            _git("worktree", "add", "--detach", str(tree), base)
+            try:
+                found = [study for study in older if study.base == base and study.is_made_by(tree)]
+                agree = bool(found) and _fingerprints_agree(tree, REPOSITORY, Path(folder))
+            finally:
+                _git("worktree", "remove", "--force", str(tree))
+            for study in found if agree else []:
+                equal = {"program": study.program(), "equal": _head()}
+                write_json(study.folder / "record.json", {**study.record(), **equal})
+
+
+def _fingerprints_agree(old: Path, new: Path, folder: Path) -> bool:
+    """Run the present script of the fingerprints with the packages of two copies of the repository."""
+    files, codes = [folder / "old.json", folder / "new.json"], []
+    for root, file, options in ((old, files[0], []), (new, files[1], ["--against", str(files[0])])):
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), str(root / "models")])}
+        command = [sys.executable, str(REPOSITORY / "experiments/fingerprints/run.py"), str(file), *options]
+        codes.append(subprocess.call(command, cwd=folder, env=environment))
+    return codes == [0, 0]
+
+
 def cited(text: str) -> set[str]:
     """The studies to which a text links."""
     return set(re.findall(r"experiments/(\w+)/README", text)) & studies().keys()
@@ -127,11 +172,26 @@ def table() -> str:
     return "\n".join(lines)
 
 
-def _files(place: str) -> Iterator[str]:
-    """The files of a place that change results."""
-    path = REPOSITORY / place
+def _git(*arguments: str) -> str:
+    return subprocess.check_output(["git", *arguments], cwd=REPOSITORY, text=True, stderr=subprocess.DEVNULL).strip()
+
+
+def _head() -> str:
+    return _git("rev-parse", "--short=8", "HEAD")
+
+
+def _hash(root: Path, *places: str) -> str:
+    """A hash of the files of some places that change results."""
+    digest = hashlib.sha256()
+    for name in sorted({name for place in places for name in _files(root, place)}):
+        digest.update(name.encode() + b"\0" + _content(root / name))
+    return digest.hexdigest()[:16]
+
+
+def _files(root: Path, place: str) -> Iterator[str]:
+    path = root / place
     for file in path.rglob("*") if path.is_dir() else [path]:
-        name = file.relative_to(REPOSITORY).as_posix()
+        name = file.relative_to(root).as_posix()
         is_code = file.suffix in (".py", ".toml", ".safetensors") or file.name == "weights.json"
         if is_code and not name.startswith(NO_RESULTS):
             yield name
@@ -165,6 +225,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs="*", metavar="STUDY", help="run these studies, or all, if they are older")
+    parser.add_argument("--same", nargs="*", metavar="STUDY", help="compare the program of older results")
     parser.add_argument("--check", action="store_true", help="fail if the front page cites an older study")
     parser.add_argument("--table", action="store_true", help="print the table of experiments/README.md")
     options = parser.parse_args()
@@ -175,6 +236,8 @@ def main() -> None:
         for name in options.run or found:
             if not found[name].is_current():
                 found[name].run()
+    if options.same is not None:
+        compare([found[name] for name in options.same or found if not found[name].is_current()])
     if options.check:
         page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
         older = sorted(name for name in cited(page) if not found[name].is_current())

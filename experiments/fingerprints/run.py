@@ -3,9 +3,11 @@
     python experiments/fingerprints/run.py before.json               # before the change
     python experiments/fingerprints/run.py after.json --against before.json
 
-There are hashes of the hypotheses (labels, weights, parents) for each preset, scene and pause. There are also hashes
-of the simulated images and true volumes, and of particles and log evidence of filters of `mstfilter.smc`. Hashes can
-be compared only on one machine with one set of library versions, so the repository stores no hashes.
+There are hashes of the hypotheses (labels, weights, parents) for each preset, scene and pause, and of their metrics.
+There are also hashes of the simulated images and true volumes, and of particles and log evidence of filters of
+`mstfilter.smc`. If the data of `experiments/real` are there, there are hashes of the hypotheses of `mst` at the first
+two pauses of each real sequence. Hashes can be compared only on one machine with one set of library versions, so the
+repository stores no hashes.
 """
 
 from __future__ import annotations
@@ -13,18 +15,23 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import mstfilter
-from mstfilter.presets import REGISTRY
+from mstfilter.presets import REGISTRY, load_config
 from mstfilter.resources import preset_names
+from mstfilter.runs import filter_recording
 from mstfilter.smc import Population, Proposal, Transition, Update
+from mstfilter.study.jobs import write_measures
 
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
 SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
@@ -75,15 +82,29 @@ def of_recording(recording: Any) -> dict[str, str]:
     }
 
 
-def of_run(recording: Any, preset: str, *overrides: str) -> dict[str, str]:
-    """Fingerprints of the hypotheses after every pause."""
-    found = {}
-    for state, info in mstfilter.preset(preset, *overrides).iterate(recording.clips(), 0):
-        labels = [hypothesis.labels for hypothesis in state.population.particles]
-        population = state.population
-        parents = [np.asarray(population.parents[name]) for name in sorted(population.parents) if name != "ancestor"]
-        found[f"pause {info.t}"] = digest(*labels, population.log_weights, *parents)
-    return found
+def of_population(population: Population) -> str:
+    """Fingerprint of hypotheses, their weights and their parents."""
+    labels = [hypothesis.labels for hypothesis in population.particles]
+    parents = [np.asarray(population.parents[name]) for name in sorted(population.parents) if name != "ancestor"]
+    return digest(*labels, population.log_weights, *parents)
+
+
+def of_run(recording: Any, preset: str) -> dict[str, str]:
+    """Fingerprints of the hypotheses after every pause, and of all metrics."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = filter_recording(recording, load_config(preset), Path(folder) / "run")
+        found = {f"pause {t}": of_population(run.state(t).population) for t in range(run.n_pauses)}
+        return {**found, "metrics": digest(json.dumps(write_measures(run, recording)))}
+
+
+def of_real(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Fingerprints of `mst` at the first two pauses of the real sequences."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "real"))
+    from sequences import sequences
+
+    for sequence in sequences(folder):
+        steps = islice(mstfilter.preset("mst").iterate(sequence.recording.clips(), 0), 2)
+        yield sequence.name, {f"pause {info.t}": of_population(state.population) for state, info in steps}
 
 
 def of_smc() -> dict[str, str]:
@@ -129,6 +150,9 @@ def main() -> int:
             for preset in options.presets or preset_names():
                 found[f"{family}-{seed} {preset}"] = of_run(recording, preset)
                 options.out.write_text(json.dumps(found, indent=1) + "\n")
+    real = Path(os.environ.get("MSTFILTER_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "real"
+    if real.is_dir():
+        found.update(of_real(real))
     options.out.write_text(json.dumps(found, indent=1) + "\n")
     if options.against is None:
         return 0

@@ -50,6 +50,7 @@ def study(tmp_path, monkeypatch):
     """A repository with one study, whose command counts its runs."""
     monkeypatch.setattr(record, "REPOSITORY", tmp_path)
     for name, text in {
+        "mstfilter/__init__.py": "",
         "mstfilter/a.py": '"""A."""\nx = 1\n',
         "mstfilter/cli/b.py": "y = 1\n",
         "models/mst.toml": "n = 5\n",
@@ -105,3 +106,56 @@ def test_a_stopped_study_resumes_and_starts_again_after_a_change(study, tmp_path
     stop.unlink()
     study.run()
     assert log.read_text().split() == ["first", "second", "second", "first", "second"] and study.is_current()
+
+
+def test_intermediate_files_survive_an_interruption_of_the_first_command(study, tmp_path, monkeypatch):
+    part = tmp_path / "studies/one/part.txt"
+
+    def interrupted(*args, **kwargs):
+        part.parent.mkdir(parents=True)
+        part.touch()
+        raise KeyboardInterrupt
+
+    study = record.Study("one", ["test -e studies/one/part.txt  # --out studies/one"])
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(record.subprocess, "call", interrupted)
+        study.run()
+    study.run()
+    assert part.exists() and study.is_current()
+
+
+FINGERPRINT = """
+import json, sys
+from pathlib import Path
+from mstfilter.a import x
+out = Path(sys.argv[1])
+out.write_text(json.dumps(x))
+sys.exit("--against" in sys.argv and out.read_text() != Path(sys.argv[3]).read_text())
+"""
+
+
+@pytest.mark.parametrize(
+    "name, text, same",
+    [
+        ("mstfilter/a.py", "x = 2 - 1\n", True),
+        ("mstfilter/a.py", "x = 2\n", False),
+        ("experiments/one/run.py", "print(2)\n", False),
+    ],
+)
+def test_equal_fingerprints_keep_the_results(study, tmp_path, name, text, same):
+    script = tmp_path / "experiments/fingerprints/run.py"
+    script.parent.mkdir()
+    script.write_text(FINGERPRINT)
+    study.run()
+    record.compare([study])
+    (tmp_path / name).write_text(text)
+    if name.startswith("mstfilter"):
+        with pytest.raises(SystemExit, match="not committed"):
+            record.compare([study])
+    for command in ("add mstfilter experiments/one/run.py", "-c user.name=a -c user.email=a@b.c commit -qm second"):
+        subprocess.run(["git", *command.split()], cwd=tmp_path, check=True)
+    made = study.record()["commit"]
+    record.compare([study])
+    assert study.is_current() is same and study.record()["commit"] == made
+    if same:  # a second change of structure is compared with the first
+        assert study.base == record._git("rev-parse", "--short=8", "HEAD") != made
