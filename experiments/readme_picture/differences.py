@@ -2,8 +2,8 @@
 
     python experiments/readme_picture/differences.py [--out docs/images/differences.png]
 
-The scenes are the sixty scenes of `experiments/information/update.toml`, which were not used for tuning. Differences
-are paired by scene over all families, with t intervals that are not adjusted for multiple comparisons.
+The scenes are the ninety scenes of `experiments/main/study.toml`, which were not used for tuning. Differences are
+paired by scene over all families, with t intervals that are not adjusted for multiple comparisons.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mstfilter.report import draw_forest
 from mstfilter.statistics import Difference, compare
 
 EXPERIMENTS = Path(__file__).parents[1]
-TABLE = EXPERIMENTS / "information/results/update/update_scenes.csv"
+TABLE = EXPERIMENTS / "main/results/main_scenes.csv"
 METHODS = {
     "paper": "the published method",
     "authors": "the authors' program",
@@ -28,10 +28,10 @@ METHODS = {
     "mst n = 1": "one hypothesis",
     "crossover": "the crossover of mst_rules",
 }
-#: Column of the committed table, which has the earlier name of the recalibrated log loss -> title.
+#: Column of the table -> title.
 MEASURES = {
     "quality": "Quality (higher is better)",
-    "information": "Log loss, nats (lower is better)",
+    "recalibrated_log_loss": "Log loss, nats (lower is better)",
 }
 BLUE, GREEN = "#336fb9", "#2ca281"
 

@@ -53,24 +53,20 @@ def test_studies_run_in_their_small_form(tmp_path, name):
         assert [row["arm"] for row in found[f"{name}_true_masks_differences"]] == beside[1:]
 
 
-def test_log_loss_of_a_study_in_its_small_form(tmp_path):
-    """Two scenes: each is scored with what the other one says."""
-    folder = run_small(tmp_path, EXPERIMENTS / "information/study.toml")
-    make_plan(load_study(EXPERIMENTS / "information/study.toml"))
+def test_number_of_hypotheses(tmp_path):
+    """Two scenes: the log loss of each is recalibrated by the other one."""
+    folder = run_small(tmp_path, EXPERIMENTS / "number/study.toml")
     rows = read_csv(folder / "runs.csv")
     assert all(0 < float(row[LOG_LOSS]) < 1 for row in rows)
     found = write_tables(folder, tmp_path / "tables")
-    endpoints = [(row["endpoint"], row["arm"]) for row in found["information_differences"]]
-    assert endpoints == [("quality", "single_frame"), (LOG_LOSS, "single_frame")]
-    pauses = write_tables(folder, tmp_path / "tables", "--pooled")["information_pooled_pauses"]
+    endpoints = [(row["endpoint"], row["arm"]) for row in found["number_differences"]]
+    assert endpoints == [("quality", "mst n = 1"), (LOG_LOSS, "mst n = 1")]
+    pauses = write_tables(folder, tmp_path / "tables", "--pooled")["number_pooled_pauses"]
     invented = {row["arm"]: row for row in pauses if row["metric"] == "volume_invented"}
-    own = [float(row["volume_invented"]) for row in rows if row["pause"] == "1" and row["arm"] == "mst"]
-    assert float(invented["mst"]["pause_1"]) == pytest.approx(sum(own) / len(own), abs=1e-4)
+    own = [float(row["volume_invented"]) for row in rows if row["pause"] == "1" and row["arm"] == "mst n = 5"]
+    assert float(invented["mst n = 5"]["pause_1"]) == pytest.approx(sum(own) / len(own), abs=1e-4)
 
-
-def test_number_of_hypotheses(tmp_path):
-    folder = run_small(tmp_path, EXPERIMENTS / "information/number.toml")
-    run_script("information/number.py", folder, "--out", tmp_path / "out")
+    run_script("number/tables.py", folder, "--out", tmp_path / "out")
     rows = read_csv(tmp_path / "out/number.csv")
     assert [row["n"] for row in rows] == ["1", "5"] and all(0 < float(row[LOG_LOSS]) < 1 for row in rows)
     difference = float(rows[1][LOG_LOSS]) - float(rows[0][LOG_LOSS])
@@ -100,8 +96,8 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
 @pytest.mark.parametrize(
     "name",
     [
-        *("ablations/study", "main/paper_best", "error_budget/study", "information/number"),
-        *("completion/study", "completion/tuning", "information/update"),
+        *("ablations/study", "main/paper_best", "error_budget/study", "number/study"),
+        *("completion/study", "completion/tuning"),
     ],
 )
 def test_tuning_studies_use_tuning_seeds(name):

@@ -1,6 +1,6 @@
 """Table and figure of a study of the number of hypotheses.
 
-    python experiments/information/number.py STUDY [--out experiments/information/results]
+    python experiments/number/tables.py STUDY [--out experiments/number/results]
 
 number.csv has one row per number of hypotheses, with means over the scenes that were run with all numbers. The
 columns have the recalibrated log loss (nats, lower is better) and its difference from the row above, paired by scene
