@@ -110,6 +110,7 @@ WRONG = {
     "principal point at the corner": K_times(1, 1, 0, 1, 1, 0, 1, 1, 1),
     "principal point off the centre": K_times(1, 1, 0.4, 1, 1, 1, 1, 1, 1),
     "K of images of another size": K_times(2, 1, 2, 1, 2, 2, 1, 1, 1),
+    "K of the images before a turn by 90 degrees": lambda: changed(K=right()[0]["K"][[1, 0, 2]][:, [1, 0, 2]]),
     "normalised K": K_times(1 / 320, 1, 1 / 320, 1, 1 / 240, 1 / 240, 1, 1, 1),
     "K transposed": lambda: changed(K=right()[0]["K"].T),
     "focal lengths that differ": K_times(1, 1, 1, 1, 1.5, 1, 1, 1, 1),

@@ -337,7 +337,7 @@ class RecordingFolder(RecordingFormat):
 
         with reading(path / "camera.json", "a recording"):
             camera = camera_file.camera
-            grid = None if camera_file.workspace is None else camera_file.workspace.grid
+            grid = 0.01 if camera_file.workspace is None else camera_file.workspace.grid
         times = tuple(e.time_s for e in entries)
         marked = tuple(e.index for e in entries if e.role == "static")
         if self.pauses is not None:
@@ -364,7 +364,7 @@ class RecordingFolder(RecordingFormat):
             robot = read_labels(robot_path) > 0 if robot_path.exists() else None
             return Frame(rgb, depth, view, robot)
 
-        if camera.T_world_camera is None or grid is None:
+        if camera.T_world_camera is None or not isinstance(grid, VoxelGrid):
             first = marked[0]
             camera, grid = find_world(read(first, camera.at(poses[first]) if first in poses else camera), grid)
 

@@ -106,7 +106,7 @@ class KnownWorld:
     #: tuple of 16 float: pose of the camera at the first pause, row by row: z up, table at z = 0, metres.
     T_world_camera: tuple[float, ...] = ()
     workspace: tuple[float, ...] = ()  #: tuple of 6 float: x, y, z of the lower, then of the upper corner, metres
-    voxel_size: float = 0.01  #: metres; used with `workspace`
+    voxel_size: float = 0.01  #: metres
 
     @cached_property
     def pose(self) -> RigidTransform | None:
@@ -118,10 +118,10 @@ class KnownWorld:
         return rigid_from_matrix(np.reshape(self.T_world_camera, (4, 4)), "world.T_world_camera")
 
     @cached_property
-    def grid(self) -> VoxelGrid | None:
-        """The given workspace, or None if no workspace is given."""
+    def grid(self) -> VoxelGrid | float:
+        """The given workspace, or its voxel size in metres if no workspace is given."""
         if not self.workspace:
-            return None
+            return self.voxel_size
         if len(self.workspace) != 6:
             raise InputError(
                 f"world.workspace has {len(self.workspace)} numbers, expected 6: x y z lower, x y z upper"

@@ -91,9 +91,9 @@ class Stream:
         The filter, or the name of a preset.
     pauses : Settled or None
         The rule that finds the pauses. If None, only frames that are pushed with ``pause=True`` are pauses.
-    grid : VoxelGrid, optional
-        Workspace. By default, the stream finds the workspace at the first pause, as for a recording. A camera without
-        a pose gets its pose from the support plane of the first pause.
+    grid : VoxelGrid or float
+        Workspace, or the size of its voxels in metres. With a size, the stream finds the workspace at the first
+        pause, as for a recording. A camera without a pose gets its pose from the support plane of the first pause.
     seed : int
         Seed of all random streams.
     on_pause : callable, optional
@@ -120,7 +120,7 @@ class Stream:
         filter: ParticleFilter | str = "mst",
         *,
         pauses: Settled | None = Settled(),  # noqa: B008
-        grid: VoxelGrid | None = None,
+        grid: VoxelGrid | float = 0.01,
         seed: int = 0,
         on_pause: Callable[[Pause], Any] | None = None,
         max_frames: int = 150,
@@ -130,6 +130,8 @@ class Stream:
         check_integer("max_frames", max_frames, at_least=4)
         check_integer("max_pixels", max_pixels, at_least=0)
         check_integer("threads", threads, at_least=1)
+        if not isinstance(pauses, Settled | None):
+            raise InputError(f"pauses of a stream are {pauses!r}, which needs later frames", "give Settled() or None")
         self._camera, self._grid = camera, grid
         self._filter = preset(filter) if isinstance(filter, str) else filter
         self._flows = [part for part in nested_components(self._filter) if isinstance(part, DenseFlow)]
@@ -322,7 +324,7 @@ class Stream:
             self._step.result()  # at most one complete clip waits
         items, trackers = tuple(self._clip), tuple(self._trackers)
         frames, times = tuple(item.frame for item in items), tuple(item.time for item in items)
-        assert self._grid is not None
+        assert isinstance(self._grid, VoxelGrid)
         clip = Clip(frames, self._grid, self._n_pauses, times)
         self._n_pauses += 1
         self._step = self._pool.submit(self._filter_clip, clip, items, trackers)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_number
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera
@@ -193,14 +193,15 @@ _MARGIN = 0.05  # metres of the workspace around the visible table
 _LEAST_SIDE, _LARGEST_SIDE = 1.0, 2.0  # metres
 
 
-def workspace(frame: Frame) -> VoxelGrid:
-    """A grid with voxels of 1 cm around the visible part of the table. The table is at z = 0.
+def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
+    """A grid with voxels of `voxel_size` metres around the visible part of the table. The table is at z = 0.
 
     The grid is .5 m high and 1 to 2 m long and wide. The grid covers as much of the table as possible. If the
     table is shorter or longer than the grid along an axis, the grid is shifted towards the depth readings that are
     more than 1 cm above the table. Readings outside the visible table, for example on a wall, are ignored.
     """
-    voxel_size, height = 0.01, 50
+    check_number("voxel size", voxel_size, above=0, at_most=0.5, unit="metres")
+    height = round(0.5 / voxel_size)
     points = frame.points[frame.valid]
     table = points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2]
     raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < height * voxel_size), :2]

@@ -208,6 +208,9 @@ def _intrinsics(camera: Camera) -> Iterator[Finding]:
         fits = f"K fits images of about {2 * cx:.0f} x {2 * cy:.0f} pixels"
         crop = "K is that of the whole image and these are a part? subtract the left and upper border from cx and cy"
         yield Finding(off > _OFF_CENTRE[1] or abs(x - y) < 0.03, text, (hint, fits, crop))
+    elif max(abs(cx / height - 0.5), abs(cy / width - 0.5)) < min(0.03, off / 2):
+        text = f"K fits images of {height} x {width} pixels, the images have {width} x {height}"
+        yield Finding(False, text, ("were the images turned by 90 degrees? turn K too: cx and cy change places",))
 
 
 def _voxels(grid: VoxelGrid) -> Iterator[Finding]:

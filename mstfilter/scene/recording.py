@@ -147,7 +147,7 @@ class Recording:
         *,
         pauses: Sequence[int] | str | PauseRule | None = None,
         T_world_camera: np.ndarray | RigidTransform | Sequence[RigidTransform] | None = None,
-        grid: VoxelGrid | None = None,
+        grid: VoxelGrid | float = 0.01,
         robot_masks: np.ndarray | None = None,
         times: Sequence[float] | None = None,
         name: str = "arrays",
@@ -169,8 +169,8 @@ class Recording:
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
             Pose of the camera, or one pose per frame if the camera moves. The table must be at z = 0. The default
             pose is computed from the support plane at the first pause.
-        grid : VoxelGrid, optional
-            Workspace. The default grid covers the visible table: sides of 1 to 2 m, height 0.5 m, voxels of 1 cm.
+        grid : VoxelGrid or float
+            Workspace, or the voxel size in metres of one that covers the table (sides of 1 to 2 m, height 0.5 m).
         robot_masks : (T, H, W) bool, optional
             Pixels that show the robot.
         times : sequence of float, optional
@@ -317,7 +317,7 @@ def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
     """The camera of each of `n` frames, from one pose, no pose, or one pose for each frame."""
     if poses is None:
         return [camera] * n
-    listed = list(poses) if np.ndim(poses) in (1, 3) else [poses]
+    listed = list(poses) if _stacked(poses, "the parts of T_world_camera").ndim in (1, 3) else [poses]
     if len(listed) not in (1, n):
         raise InputError(
             f"T_world_camera has {len(listed)} poses for {n} frames",
@@ -356,15 +356,14 @@ def check_depth(depth: np.ndarray, where: str) -> None:
         )
 
 
-def find_world(first: Frame, grid: VoxelGrid | None) -> tuple[Camera, VoxelGrid]:
-    """The camera with a pose, and the workspace. A missing pose or workspace is computed from the `first` frame."""
+def find_world(first: Frame, grid: VoxelGrid | float) -> tuple[Camera, VoxelGrid]:
+    """The camera with a pose, and the workspace. What is missing is computed from the `first` frame."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
-    if grid is None:
-        grid = workspace(Frame(first.rgb, first.depth, camera, first.robot_mask))
-    return camera, grid
+    posed = Frame(first.rgb, first.depth, camera, first.robot_mask)
+    return camera, grid if isinstance(grid, VoxelGrid) else workspace(posed, grid)
 
 
 def truth_reader(

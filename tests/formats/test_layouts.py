@@ -87,6 +87,16 @@ def test_the_pose_is_found_and_lists_of_other_lengths_are_refused(tmp_path):
             Tum(K=K, world=wrong).open(path)
 
 
+def test_the_voxel_size_holds_without_a_workspace(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    fine, coarse = (Tum(K=K, world=KnownWorld(voxel_size=size)).open(path).grid for size in (0.01, 0.02))
+    assert coarse.voxel_size == 0.02 and coarse.shape[2] == 25
+    np.testing.assert_allclose(coarse.upper - coarse.origin, fine.upper - fine.origin, atol=0.021)
+    for wrong in (0.0, -0.01, float("nan"), 1.0):
+        with pytest.raises(InputError, match="voxel size"):
+            Tum(K=K, world=KnownWorld(voxel_size=wrong)).open(path)
+
+
 def camera_to_world(k):
     """The pose at frame k of a trajectory in another world than that of the table.
 

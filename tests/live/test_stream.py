@@ -137,6 +137,9 @@ def test_errors_of_frames_and_threads_reach_the_caller():
     ):
         with pytest.raises(InputError, match=message):
             mstfilter.Stream(CAMERA, FAST, pauses=None).push(rgb, depth, when)
+    for rule in ("settled", Still()):
+        with pytest.raises(InputError, match="pauses of a stream"):
+            mstfilter.Stream(CAMERA, FAST, pauses=rule)
     stream.push(RGB[0], DEPTH[0], pause=True)
     with pytest.raises(RuntimeError, match="callback"):
         stream.wait()

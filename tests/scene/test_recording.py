@@ -197,6 +197,7 @@ INVALID_ARRAYS = {
     "K of zeros": ({"K": np.zeros((3, 3))}, "not invertible"),
     "a pause after the end": ({"pauses": [3]}, "pauses"),
     "a pause from the end": ({"pauses": [0, -1]}, "from the end or in seconds as text"),
+    "a rotation and a translation": ({"T_world_camera": (np.eye(3), np.zeros(3))}, "parts of T_world_camera have"),
     "ragged images": ({"rgb": [RGB[0], RGB[0][1:]]}, "colour images of arrays have different shapes"),
     "a pose of NaN": ({"T_world_camera": np.full((4, 4), np.nan)}, "NaN"),
 }
