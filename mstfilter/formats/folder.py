@@ -33,7 +33,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mstfilter.errors import InputError, naming
+from mstfilter.errors import InputError, check_choice, naming
 from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat, check_images
 from mstfilter.reading import read_arrays, read_json, read_model
@@ -131,8 +131,15 @@ class RecordingWriter:
         4x4 T_world_object. Further keyword arguments are stored in the entry of the frame in manifest.json.
         """
         index = len(self._frames)
+        check_choice(f"role of frame {index}", role, ("static", "action"))
+        depth = np.ma.filled(depth, 0)
         units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
         units[(units < 0) | (units > 65535)] = 0  # out of range: no reading
+        if not units.any() and np.any(np.isfinite(depth) & (depth > 0)):
+            raise InputError(
+                f"depth image of frame {index} has only readings beyond {65535 * self._scale:g} m",
+                "depth is in metres: multiply raw readings by the depth scale",
+            )
         images: dict[str, np.ndarray | None] = {
             "rgb": rgb,
             "depth": units.astype(np.uint16),

@@ -211,7 +211,14 @@ def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()
             f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
             "name them 000000, 000001, ..., or by time in seconds",
         )
-    return sorted(files, key=_number)
+    ordered = sorted(files, key=_number)
+    for before, after in zip(ordered, sorted(files, key=_numbers), strict=True):
+        if before != after:
+            raise InputError(
+                f"{folder}: the order is not clear: {after.name} or {before.name} first",
+                "name the images 000000, 000001, ..., or by time in seconds, as in 1700000000.250",
+            )
+    return ordered
 
 
 def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Path]]) -> list[tuple[Path, Path]]:
@@ -226,10 +233,14 @@ def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Pat
     return pairs[:-1]
 
 
+def _numbers(file: Path) -> list[Decimal]:
+    """The numbers in a file name."""
+    return [Decimal(number) for number in re.findall(r"\d+(?:\.\d+)?", file.stem)]
+
+
 def _number(file: Path) -> Decimal:
     """The last number in a file name, or -1 for a name without numbers."""
-    found = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return Decimal(found[-1] if found else -1)
+    return (_numbers(file) or [Decimal(-1)])[-1]
 
 
 def _paired(

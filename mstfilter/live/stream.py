@@ -187,15 +187,18 @@ class Stream:
         Raises
         ------
         InputError
-            If the images are invalid, or a thread of the stream has failed.
+            If the images are invalid, the stream is closed, or a thread of the stream has failed.
         """
         arrived = clock.perf_counter()
         self._check()
+        if not self._watcher.is_alive():
+            raise InputError("the stream is closed", "make a new Stream")
         number, time = self.counts["pushed"], arrived if time is None else float(time)
         self.counts["pushed"] += 1
         if not np.isfinite(time):
             raise InputError(f"time of frame {number} is {time}, expected seconds")
-        if depth is None or not np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
+        depth = None if depth is None else np.ma.filled(depth, 0)
+        if depth is None or not np.any(np.isfinite(depth) & (depth > 0)):
             return self._dropped("no depth")
         if time <= self._last_time:
             return self._dropped("late")

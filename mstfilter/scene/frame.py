@@ -216,7 +216,7 @@ class Frame:
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
-        rgb, depth = np.asarray(self.rgb), np.asarray(self.depth)
+        rgb, depth = np.asarray(self.rgb), np.ma.filled(self.depth, 0)
         if rgb.shape != (*shape, 3) or rgb.dtype != np.uint8:
             raise InputError(
                 f"colour image has shape {rgb.shape} and type {rgb.dtype}, expected {(*shape, 3)} uint8",

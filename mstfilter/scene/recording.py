@@ -188,6 +188,7 @@ class Recording:
                 "depth is None: hypotheses in 3-D need a depth image for every colour image",
                 "record with an RGB-D camera, or estimate depth in metres with a program of your choice",
             )
+        depth = [np.ma.filled(d, 0) for d in depth] if isinstance(depth, list | tuple) else np.ma.filled(depth, 0)
         rgb, depth = _stacked(rgb, f"colour images of {name}"), _stacked(depth, f"depth images of {name}")
         if rgb.ndim == 3 and depth.ndim == 2:
             rgb, depth = rgb[None], depth[None]

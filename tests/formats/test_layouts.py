@@ -87,6 +87,22 @@ def test_the_pose_is_found_and_lists_of_other_lengths_are_refused(tmp_path):
             Tum(K=K, world=wrong).open(path)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("1700000000_950000000", "1700000001_050000000"),  # seconds and nanoseconds
+        ("2023-11-14T22-13-59.850", "2023-11-14T22-14-00.101"),
+    ],
+)
+def test_names_whose_order_is_not_clear_are_refused(tmp_path, names):
+    path = write_redwood(tmp_path / "data", SHIFTS[:2])
+    for part in ("color", "depth"):
+        for k, name in enumerate(names):
+            (path / part / f"{k:05d}.png").rename(path / part / f"{name}.png")
+    with pytest.raises(InputError, match=f"{names[0]}.png or {names[1]}.png first"):
+        Redwood(K=K).open(path)
+
+
 def test_the_voxel_size_holds_without_a_workspace(tmp_path):
     path = write_tum(tmp_path / "tum")
     fine, coarse = (Tum(K=K, world=KnownWorld(voxel_size=size)).open(path).grid for size in (0.01, 0.02))

@@ -140,6 +140,10 @@ def test_errors_of_frames_and_threads_reach_the_caller():
     for rule in ("settled", Still()):
         with pytest.raises(InputError, match="pauses of a stream"):
             mstfilter.Stream(CAMERA, FAST, pauses=rule)
+    closed = mstfilter.Stream(CAMERA, FAST, pauses=None)
+    closed.close()
+    with pytest.raises(InputError, match="closed"):
+        closed.push(RGB[0], DEPTH[0])
     stream.push(RGB[0], DEPTH[0], pause=True)
     with pytest.raises(RuntimeError, match="callback"):
         stream.wait()

@@ -183,6 +183,24 @@ def test_arrays_without_pose_find_table_and_workspace():
     assert bare.grid.contains(bare.grid.index_of(object_points + [0, 0, 1e-3])).mean() > 0.97
 
 
+@pytest.mark.parametrize("several", [np.ma.stack, list])
+def test_masked_depth_is_no_reading(several):
+    rgb, depth = (np.stack([image] * 2) for image in table_scene()[:2])
+    masked = [np.ma.masked_array(image, np.arange(image.size).reshape(image.shape) % 3 == 0) for image in depth]
+    for frame in Recording.from_arrays(rgb, several(masked), CAMERA.K).frames:
+        assert np.isnan(frame.depth.ravel()[::3]).all() and not np.isnan(frame.depth.ravel()[1::3]).all()
+
+
+def test_raw_depth_is_not_written(tmp_path):
+    rgb, depth, _ = table_scene()
+    with RecordingWriter(tmp_path / "raw", CAMERA, GRID) as writer:
+        with pytest.raises(InputError, match="only readings beyond 65.535 m"):
+            writer.add_frame(rgb, np.nan_to_num(1000 * depth).astype(np.uint16), 0.0, "static")
+        with pytest.raises(InputError, match="role of frame 0"):
+            writer.add_frame(rgb, depth, 0.0, "pause")
+        writer.add_frame(rgb, depth, 0.0, "static")
+
+
 def labels_of(depth):
     return render(table_scene()[2], GRID, CAMERA).labels
 
