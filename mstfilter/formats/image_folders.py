@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import time
+import warnings
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, check_number
+from mstfilter.errors import InputError, InputWarning, check_number
 from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
@@ -95,6 +96,7 @@ _STILL = "remove the file if the camera stands still"
 _POLL_S = 0.02
 _WRITTEN_S = 0.3  # age of the last files after which they are complete
 _INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
+_UNREAD = {"D", "coeffs", "dist_coeffs", "distortion_coefficients", "extrinsics", "T_world_camera"}
 
 
 @dataclass(frozen=True)
@@ -285,13 +287,17 @@ def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
         stored = read_json(file, kind)
         if not isinstance(stored, dict):
             raise TypeError(f"it holds a {type(stored).__name__}, expected an object with the entry K")
+    if unread := sorted(_UNREAD & stored.keys()):
+        hint = "the lens is read from the entry distortion (k1, k2, p1, p2, ...), the pose from world.T_world_camera"
+        warnings.warn(InputWarning(f"{file}: {unread[0]} is not read", hint), stacklevel=2)
     return file, stored
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
     """The number `name` in the intrinsics file (at least 1), or `default`."""
     value = stored.get(name, default)
-    check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
+    hints = ("the file has units per metre, the option metres per unit",) if name == "depth_scale" else ()
+    check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", *hints, at_least=1)
     return float(value)
 
 

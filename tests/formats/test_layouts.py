@@ -87,6 +87,14 @@ def test_the_pose_is_found_and_lists_of_other_lengths_are_refused(tmp_path):
             Tum(K=K, world=wrong).open(path)
 
 
+def test_entries_of_the_intrinsics_that_are_not_read_are_named(tmp_path):
+    path = write_redwood(tmp_path / "data")
+    stored = json.loads((path / "intrinsic.json").read_text())
+    (path / "intrinsic.json").write_text(json.dumps({**stored, "dist_coeffs": [0.1, 0, 0, 0]}))
+    with pytest.warns(InputWarning, match="dist_coeffs is not read"):
+        Redwood().open(path)
+
+
 @pytest.mark.parametrize(
     "names",
     [
