@@ -92,7 +92,7 @@ def test_entries_of_the_intrinsics_that_are_not_read_are_named(tmp_path):
     stored = json.loads((path / "intrinsic.json").read_text())
     (path / "intrinsic.json").write_text(json.dumps({**stored, "dist_coeffs": [0.1, 0, 0, 0]}))
     with pytest.warns(InputWarning, match="dist_coeffs is not read"):
-        Redwood().open(path)
+        Redwood(fps=FPS).open(path)
 
 
 @pytest.mark.parametrize(
