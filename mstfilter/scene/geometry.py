@@ -200,7 +200,7 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     table is shorter or longer than the grid along an axis, the grid is shifted towards the depth readings that are
     more than 1 cm above the table. Readings outside the visible table, for example on a wall, are ignored.
     """
-    check_number("voxel size", voxel_size, above=0, at_most=0.5, unit="metres")
+    check_number("voxel size", voxel_size, above=0, at_most=0.5, unit="number of metres")
     height = round(0.5 / voxel_size)
     points = frame.points[frame.valid]
     table = points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2]

@@ -147,7 +147,7 @@ class Recording:
         *,
         pauses: Sequence[int] | str | PauseRule | None = None,
         T_world_camera: np.ndarray | RigidTransform | Sequence[RigidTransform] | None = None,
-        grid: VoxelGrid | float = 0.01,
+        grid: VoxelGrid | float | None = 0.01,
         robot_masks: np.ndarray | None = None,
         times: Sequence[float] | None = None,
         name: str = "arrays",
@@ -357,14 +357,14 @@ def check_depth(depth: np.ndarray, where: str) -> None:
         )
 
 
-def find_world(first: Frame, grid: VoxelGrid | float) -> tuple[Camera, VoxelGrid]:
+def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid]:
     """The camera with a pose, and the workspace. What is missing is computed from the `first` frame."""
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
     posed = Frame(first.rgb, first.depth, camera, first.robot_mask)
-    return camera, grid if isinstance(grid, VoxelGrid) else workspace(posed, grid)
+    return camera, grid if isinstance(grid, VoxelGrid) else workspace(posed, 0.01 if grid is None else grid)
 
 
 def truth_reader(
