@@ -134,12 +134,14 @@ def compare(older: list[Study]) -> None:
     if _git("status", "--porcelain", "--", *PROGRAM):
         sys.exit("error: the program has changes that are not committed\nhint: commit them, then compare again")
     with tempfile.TemporaryDirectory() as folder:
+        present = Path(folder) / "present.json"
         for base in sorted({study.base for study in older} - {""}):
             tree = Path(folder) / base
             _git("worktree", "add", "--detach", str(tree), base)
             try:
                 found = [study for study in older if study.base == base and study.is_made_by(tree)]
-                agree = bool(found) and _fingerprints_agree(tree, REPOSITORY, Path(folder))
+                known = bool(found) and (present.exists() or _fingerprints(REPOSITORY, present))
+                agree = known and _fingerprints(tree, Path(folder) / f"{base}.json", "--against", str(present))
             finally:
                 _git("worktree", "remove", "--force", str(tree))
             for study in found if agree else []:
@@ -147,14 +149,11 @@ def compare(older: list[Study]) -> None:
                 write_json(study.folder / "record.json", {**study.record(), **equal})
 
 
-def _fingerprints_agree(old: Path, new: Path, folder: Path) -> bool:
-    """Run the present script of the fingerprints with the packages of two copies of the repository."""
-    files, codes = [folder / "old.json", folder / "new.json"], []
-    for root, file, options in ((old, files[0], []), (new, files[1], ["--against", str(files[0])])):
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), str(root / "models")])}
-        command = [sys.executable, str(REPOSITORY / "experiments/fingerprints/run.py"), str(file), *options]
-        codes.append(subprocess.call(command, cwd=folder, env=environment))
-    return codes == [0, 0]
+def _fingerprints(root: Path, *arguments: Path | str) -> bool:
+    """Run the present script of the fingerprints with the packages of a copy of the repository."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), str(root / "models")])}
+    command = [sys.executable, str(REPOSITORY / "experiments/fingerprints/run.py"), *map(str, arguments)]
+    return subprocess.call(command, env=environment) == 0
 
 
 def cited(text: str) -> set[str]:

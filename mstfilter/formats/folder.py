@@ -132,10 +132,9 @@ class RecordingWriter:
         """
         index = len(self._frames)
         check_choice(f"role of frame {index}", role, ("static", "action"))
-        depth = np.ma.filled(depth, 0)
-        units = np.rint(np.nan_to_num(np.asarray(depth, dtype=np.float64) / self._scale, nan=0.0, posinf=0.0))
+        units = np.rint(np.nan_to_num(np.ma.filled(depth, 0).astype(np.float64) / self._scale, nan=0.0, posinf=0.0))
         units[(units < 0) | (units > 65535)] = 0  # out of range: no reading
-        if not units.any() and np.any(np.isfinite(depth) & (depth > 0)):
+        if not units.any() and np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
             raise InputError(
                 f"depth image of frame {index} has only readings beyond {65535 * self._scale:g} m",
                 "depth is in metres: multiply raw readings by the depth scale",

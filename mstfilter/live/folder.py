@@ -11,7 +11,7 @@ from typing import Any
 
 from mstfilter.errors import InputError
 from mstfilter.files import locked
-from mstfilter.formats import RecordingFormat, Redwood
+from mstfilter.formats import RecordingFormat, Redwood, Settled
 from mstfilter.live.stream import Pause, Stream
 from mstfilter.presets import build_filter
 from mstfilter.runs import RunFolder, check_run_folder, describe_run, first_pause
@@ -58,6 +58,9 @@ def filter_folder(
     if not isinstance(reader, Redwood):
         name = type(reader).__name__
         raise InputError(f"a live run cannot read {name}", "it reads folders color/ and depth/ (format redwood)")
+    if not isinstance(reader.pauses, Settled):
+        name = type(reader.pauses).__name__
+        raise InputError(f"a live run cannot find pauses by {name}, which needs later frames", "--pauses settled")
     check_run_folder(path, replace)
     if not replace and (path / "run.json").is_file():
         raise InputError(f"run folder {path} exists", "choose another folder, or remove this one: --replace")
@@ -90,10 +93,10 @@ def filter_folder(
         if frame is None:
             raise InputError(f"no image arrived in {source}")
         camera = frame.camera if reader.world.pose is None else frame.camera.at(reader.world.pose)
-        settings: Any = {"grid": reader.world.grid, "seed": seed, "threads": n_threads}
-        settings |= {"pauses": reader.pauses, "max_pixels": reader.max_pixels}
+        settings: dict[str, Any] = {"grid": reader.world.grid, "seed": seed, "threads": n_threads}
+        settings["max_pixels"] = reader.max_pixels
         try:
-            with Stream(camera, filter, on_pause=write, **settings) as stream:
+            with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
                 stream.push(frame.rgb, frame.depth, time)
                 for time, frame in frames:
                     stream.push(frame.rgb, frame.depth, time)

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.belief import Belief
-from mstfilter.errors import InputError, check_integer
+from mstfilter.errors import InputError, check_component, check_integer
 from mstfilter.formats import Settled
 from mstfilter.presets import preset
 from mstfilter.processes import parallel
@@ -130,8 +130,7 @@ class Stream:
         check_integer("max_frames", max_frames, at_least=4)
         check_integer("max_pixels", max_pixels, at_least=0)
         check_integer("threads", threads, at_least=1)
-        if not isinstance(pauses, Settled | None):
-            raise InputError(f"pauses of a stream are {pauses!r}, which needs later frames", "give Settled() or None")
+        check_component("pauses of a stream", pauses, Settled, optional=True)
         self._camera, self._grid = camera, grid
         self._filter = preset(filter) if isinstance(filter, str) else filter
         self._flows = [part for part in nested_components(self._filter) if isinstance(part, DenseFlow)]
@@ -197,8 +196,7 @@ class Stream:
         self.counts["pushed"] += 1
         if not np.isfinite(time):
             raise InputError(f"time of frame {number} is {time}, expected seconds")
-        depth = None if depth is None else np.ma.filled(depth, 0)
-        if depth is None or not np.any(np.isfinite(depth) & (depth > 0)):
+        if depth is None or not np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
             return self._dropped("no depth")
         if time <= self._last_time:
             return self._dropped("late")

@@ -190,7 +190,7 @@ _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an 
 
 _BORDER = 0.03  # metres: a wall may stand at the border of the visible table
 _MARGIN = 0.05  # metres of the workspace around the visible table
-_LEAST_SIDE, _LARGEST_SIDE = 1.0, 2.0  # metres
+_LEAST_SIDE, _LARGEST_SIDE, _HEIGHT = 1.0, 2.0, 0.5  # metres
 
 
 def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
@@ -201,10 +201,9 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     more than 1 cm above the table. Readings outside the visible table, for example on a wall, are ignored.
     """
     check_number("voxel size", voxel_size, above=0, at_most=0.5, unit="number of metres")
-    height = round(0.5 / voxel_size)
     points = frame.points[frame.valid]
     table = points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2]
-    raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < height * voxel_size), :2]
+    raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < _HEIGHT), :2]
     if len(table):
         low, high = np.percentile(table, (1, 99), axis=0)
         raised = raised[((raised > low + _BORDER) & (raised < high - _BORDER)).all(axis=1)]
@@ -220,5 +219,5 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     side = np.clip(np.ceil((high - low + 2 * _MARGIN) * 10) / 10, _LEAST_SIDE, _LARGEST_SIDE)
     reach = np.sort([low - _MARGIN + side / 2, high + _MARGIN - side / 2], axis=0)  # of the centre
     centre = np.clip(np.percentile(chosen, (2, 98), axis=0).mean(axis=0), *reach)
-    origin = np.round((centre - side / 2) / voxel_size) * voxel_size
-    return VoxelGrid(np.append(origin, 0.0), voxel_size, (*np.round(side / voxel_size).astype(int).tolist(), height))
+    origin = np.append(np.round((centre - side / 2) / voxel_size) * voxel_size, 0.0)
+    return VoxelGrid(origin, voxel_size, (*map(round, side / voxel_size), round(_HEIGHT / voxel_size)))

@@ -363,8 +363,9 @@ def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, Vo
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
-    posed = Frame(first.rgb, first.depth, camera, first.robot_mask)
-    return camera, grid if isinstance(grid, VoxelGrid) else workspace(posed, 0.01 if grid is None else grid)
+    if not isinstance(grid, VoxelGrid):
+        grid = workspace(Frame(first.rgb, first.depth, camera, first.robot_mask), 0.01 if grid is None else grid)
+    return camera, grid
 
 
 def truth_reader(
