@@ -94,7 +94,7 @@ def test_past(tmp_path):
     rows = {(row["score"], row["family"], row["arm"]): row for row in read_csv(tmp_path / "past.csv")}
     arms, most = (
         ("samples", "mst", "again", "stranger", "shuffled", "frozen"),
-        {"quality": 1, "information": math.log(2)},
+        {"quality": 1, "log_loss": math.log(2)},
     )
     assert set(rows) == {(score, family, arm) for score in most for family in ("all", "s1") for arm in arms}
     mean = {key: float(row["mean"]) for key, row in rows.items()}
