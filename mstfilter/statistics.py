@@ -29,8 +29,9 @@ from mstfilter.errors import InputError
 LEVEL = 0.95
 CLAIM = 20  # fewest units for a claim
 EXACT = 13  # most units for which all sign flips are enumerated
-N_FLIPS = 9999
-N_BOOTSTRAP = 4999
+N_RESAMPLES = 9999
+N_ADJUSTED = 99_999  # of p values that are adjusted for many comparisons
+MOST_DRAWS = 20_000_000  # limits memory and time for many units
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Difference:
 Values = Mapping[Any, float] | Sequence[float] | np.ndarray
 
 
-def compare(first: Values, second: Values) -> Difference:
+def compare(first: Values, second: Values, adjusted: bool = False) -> Difference:
     """The paired difference `first` minus `second`, over the units that have values in both.
 
     Parameters
@@ -95,6 +96,8 @@ def compare(first: Values, second: Values) -> Difference:
     first, second : mapping, or (n,) array_like
         A mapping from units to values, or arrays of values with the same order of units. Units without a finite
         value, such as the seeds of runs in which all weights became zero, are omitted.
+    adjusted : bool
+        The p value will be adjusted for many comparisons, so 99,999 instead of 9,999 resamples are drawn.
 
     Raises
     ------
@@ -115,9 +118,11 @@ def compare(first: Values, second: Values) -> Difference:
     if len(d) == 0:
         nan = float("nan")
         return Difference(nan, nan, nan, nan, nan, nan, 0)
-    low, high, p = studentised_bootstrap(d)
+    n_resamples = min(N_ADJUSTED, max(N_RESAMPLES, MOST_DRAWS // len(d))) if adjusted else N_RESAMPLES
+    low, high, p = studentised_bootstrap(d, n_resamples)
+    flipped = sign_flip(d, n_resamples)
     found = Difference(
-        float(d.mean()), *interval(d), low, high, sign_flip(d), len(d), p_bootstrap=p, skewness=_skewness(d)
+        float(d.mean()), *interval(d), low, high, flipped, len(d), p_bootstrap=p, skewness=_skewness(d)
     )
     return replace(found, p_holm=found.p_claim)
 
@@ -133,7 +138,7 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean() - half), float(values.mean() + half)
 
 
-def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_BOOTSTRAP) -> tuple[float, float, float]:
+def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_RESAMPLES) -> tuple[float, float, float]:
     """Studentised bootstrap: interval of the mean, and two-sided p value of a zero mean.
 
     The results are NaN for fewer than five values. The seed is fixed, so results can be repeated. A resample of equal
@@ -180,8 +185,8 @@ def _skewness(values: np.ndarray) -> float:
     return 0.0 if _all_equal(values) else float((centred**3).mean() / values.std() ** 3)
 
 
-def sign_flip(values: np.ndarray) -> float:
-    """Two-sided p value of the sign-flip test of a zero mean: exact up to 13 values, else 9999 random flips."""
+def sign_flip(values: np.ndarray, n_resamples: int = N_RESAMPLES) -> float:
+    """Two-sided p value of the sign-flip test of a zero mean: exact up to 13 values, else with random flips."""
     from scipy.stats import permutation_test
 
     n = len(values)
@@ -189,7 +194,7 @@ def sign_flip(values: np.ndarray) -> float:
         return float("nan")
     if not values.any():
         return 1.0
-    draws = 2**n if n <= EXACT else N_FLIPS
+    draws = 2**n if n <= EXACT else n_resamples
     found = permutation_test(
         (values,),
         lambda x, axis: x.mean(axis=axis),
@@ -231,7 +236,7 @@ def compare_arms(table: Mapping[str, Values], reference: str) -> dict[str, Diffe
     """
     if reference not in table:
         raise InputError(f"there is no arm {reference!r}", f"there are: {', '.join(table) or 'no arms'}")
-    found = {arm: compare(values, table[reference]) for arm, values in table.items() if arm != reference}
+    found = {arm: compare(values, table[reference], True) for arm, values in table.items() if arm != reference}
     p = holm([d.p_claim for d in found.values()])
     return {arm: replace(d, p_holm=float(q)) for (arm, d), q in zip(found.items(), p, strict=True)}
 

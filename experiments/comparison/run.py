@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from mstfilter.files import write_csv
-from mstfilter.statistics import N_BOOTSTRAP
+from mstfilter.statistics import N_RESAMPLES
 
 HERE = Path(__file__).parent
 UNITS = (10, 20, 30, 60)
@@ -67,7 +67,7 @@ def _by_flips(x: np.ndarray) -> np.ndarray:
 def _by_bootstrap(x: np.ndarray) -> np.ndarray:
     """The p value of `studentised_bootstrap` of each column, with the same resamples."""
     n, mean, sd = len(x), x.mean(axis=0), x.std(axis=0, ddof=1)
-    drawn = np.random.default_rng(20210).integers(0, n, (N_BOOTSTRAP, n))
+    drawn = np.random.default_rng(20210).integers(0, n, (N_RESAMPLES, n))
     counts = np.stack([(drawn == k).sum(axis=1) for k in range(n)], axis=1) / n
     centred = x - mean
     away = counts @ centred
@@ -76,7 +76,7 @@ def _by_bootstrap(x: np.ndarray) -> np.ndarray:
     observed = mean / sd
     tail = np.minimum((ratios >= observed).sum(axis=0), (ratios <= observed).sum(axis=0))
     both = (np.abs(ratios) >= np.abs(observed)).sum(axis=0)
-    return np.asarray(np.minimum(1, np.maximum(2 + 2 * tail, 1 + both) / (1 + N_BOOTSTRAP)))
+    return np.asarray(np.minimum(1, np.maximum(2 + 2 * tail, 1 + both) / (1 + N_RESAMPLES)))
 
 
 def claims(x: np.ndarray, arms: int) -> dict[str, float]:

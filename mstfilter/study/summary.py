@@ -202,16 +202,10 @@ def summarise(
     first = [*ENDPOINTS, *SLOPES.values()]
     order = [name for name in first if name in measured] + [name for name in measured if name not in first]
     differences = [
-        Compared(
-            family,
-            arm,
-            reference,
-            name,
-            compare(of_arm, values.get((family, reference, name), {})),
-            arm in reported_only,
-        )
+        Compared(family, arm, reference, name, compare(of_arm, of_reference, name in ENDPOINTS), arm in reported_only)
         for name in order
         for family in families
+        for of_reference in [values.get((family, reference, name), {})]
         for arm in arms
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
     ]

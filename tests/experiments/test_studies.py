@@ -30,7 +30,7 @@ def run_small(tmp_path, config, *overrides):
 
 def write_tables(folder, out, *more):
     """The tables that the script writes of a study, by the name of the file."""
-    run_script("main/tables.py", folder, out, *more)
+    run_script("tables.py", folder, out, *more)
     return {path.stem: read_csv(path) for path in out.iterdir()}
 
 

@@ -1,6 +1,6 @@
 """Write the small tables of a study from the folder that `mstfilter study` wrote.
 
-    python experiments/main/tables.py STUDY experiments/main/results [--reference "true masks: mst"] [--pooled]
+    python experiments/tables.py studies/NAME experiments/NAME/results [--reference "true masks: mst"] [--pooled]
 
 The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
 scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
@@ -17,6 +17,7 @@ the change from pause 1 to the last pause with its 95 % interval over scenes.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -101,7 +102,8 @@ def differences(found: Summary, metrics: Iterable[str] = ENDPOINTS) -> list[dict
                 "mean": f"{d.mean:.4f}",
             }
             row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
-            lines.append(row | {"p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"})
+            row |= {name: f"{getattr(d, name):.4g}" for name in ("p", "p_bootstrap", "skewness", "p_holm")}
+            lines.append(row | {"conclusion": c.words if c.adjusted else ""})
     return lines
 
 
@@ -201,6 +203,10 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
         tables |= {f"{name}_cases": cases(rows), f"{name}_time": times(rows)}
     tables[f"{name}_differences"] = differences(found)
+    for c in found.compared("quality"):
+        n, of_reference = c.difference.n, found.metric(c.family, c.reference)
+        if of_reference and n < len(of_reference.by_scene):
+            print(f"warning: {c.arm} on {c.family} has {n} of {len(of_reference.by_scene)} scenes", file=sys.stderr)
     for table, lines in tables.items():
         write_csv(out / f"{table}.csv", lines)
     for endpoint in ENDPOINTS:
