@@ -23,7 +23,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"
 SMALL = "simulate demo demo/recording n_actions=1 n_objects_min=2 n_objects_max=2 supersample=false"
 REMOVE = "import shutil; shutil.rmtree('demo/recording'); print('removed')"
-NOTEBOOKS = ("tutorial", "own-component", "comparing", "beliefs")
+NOTEBOOKS = ("tutorial", "own-component", "comparing", "beliefs", "inputs")
 #: What the documentation says that a command prints.
 SHOWN = {
     "demo": r"report +demo/report.html",
@@ -39,14 +39,37 @@ SHOWN = {
     "list": r"presets:\n +authors",
     "python": r"\S",
 }
+#: The commands of docs/own-data.md that follow the conversion of a recording.
+AFTER_CONVERT = ("mstfilter view table-7", "mstfilter run table-7")
+#: The output of this program shows that the stream filtered two pauses.
+COUNTS = "print(stream.counts['pushed'], 'frames,', 1 + stream.last.index, 'pauses')"
 #: Own arrays: the first example of the README, with the arrays of the demo's recording.
 ARRAYS = """
 import numpy as np
 from mstfilter import open_recording
-frames = open_recording("demo/recording").frames
+demo = open_recording("demo/recording")
+frames = demo.frames
 rgb, depth = np.stack([frame.rgb for frame in frames]), np.stack([frame.depth for frame in frames])
 K = frames[0].camera.K
 """
+#: Own folder: the demo's recording, in the layout of the recorders of Open3D.
+OWN_FOLDER = (
+    ARRAYS
+    + """
+import json, os
+import cv2
+for part in ("color", "depth"):
+    os.makedirs(f"bedroom/{part}")
+order = [k for k in range(len(rgb)) for _ in range(16 if k in demo.pauses else 1)]  # at rest for half a second
+for i, k in enumerate(order):
+    cv2.imwrite(f"bedroom/color/{i:06d}.jpg", rgb[k][..., ::-1])
+    cv2.imwrite(f"bedroom/depth/{i:06d}.png", np.nan_to_num(1000 * depth[k]).round().astype(np.uint16))
+size = {"width": rgb.shape[2], "height": rgb.shape[1]}
+with open("bedroom/camera_intrinsic.json", "w") as file:
+    json.dump({**size, "intrinsic_matrix": K.T.ravel().tolist()}, file)
+print(os.listdir("bedroom"))
+"""
+)
 #: A notebook: the cells of a page, executed by Jupyter.
 NOTEBOOK = """
 import re, sys
@@ -69,9 +92,16 @@ class Step(NamedTuple):
     text: str  #: the command as the documentation shows it
 
 
+def first_example(page: Path) -> str:
+    """The first Python example of a page."""
+    found = re.search(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
 def commands(page: str) -> list[str]:
     """The mstfilter commands of the shell blocks of a page."""
-    blocks = re.findall(r"^```bash\n(.*?)```", (DOCS / page).read_text(), flags=re.DOTALL | re.MULTILINE)
+    blocks = re.findall(r"^```(?:ba)?sh\n(.*?)```", (DOCS / page).read_text(), flags=re.DOTALL | re.MULTILINE)
     lines = [line.partition(" #")[0].strip() for block in blocks for line in block.splitlines()]
     return [line for line in lines if line.startswith("mstfilter ")]
 
@@ -85,9 +115,14 @@ def steps(smoke: bool) -> list[Step]:
 
     demo = f"mstfilter {SMALL}" if smoke else "mstfilter demo --out demo"
     found = [plan("demo", demo), plan("demo", "mstfilter list")]
-    first = re.search(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), flags=re.DOTALL)
-    assert first is not None
-    found.append(Step("own arrays", ["-c", ARRAYS + first[1]], "README.md, first example"))
+    readme, live = (first_example(page) for page in (REPOSITORY / "README.md", DOCS / "live.md"))
+    found.append(Step("own arrays", ["-c", ARRAYS + readme], "README.md, first example"))
+    found.append(Step("live stream", ["-c", ARRAYS + live + COUNTS], "docs/live.md, first example"))
+    found.append(Step("own folder", ["-c", OWN_FOLDER], "write the folder bedroom in the layout of Open3D"))
+    folder = [text for text in commands("formats.md") if "bedroom" in text]
+    folder += [text.replace("-7", "-3") for text in commands("own-data.md") if text.startswith(AFTER_CONVERT)]
+    found += [plan("own folder", text) for text in folder]
+    found.append(plan("live stream", "mstfilter run bedroom --live 3 --out run-live"))
     own = commands("own-component.md")
     found += [plan("own component", text) for text in own if "two" not in text]
     found += [plan("study", text) for text in own if "two" in text]
