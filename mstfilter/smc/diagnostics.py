@@ -24,7 +24,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.smoothing import known_parents
-from mstfilter.smc.wrapped_resampling import ResamplerWrapper
+from mstfilter.smc.wrapped_resampling import Coalesced, ResamplerWrapper
 
 
 def energy_distance(
@@ -115,7 +115,7 @@ def run_variance(
     Parameters
     ----------
     filter : ParticleFilter
-        A properly weighted filter with at least 2 particles.
+        A properly weighted filter with at least 2 particles. `Coalesced` is not supported.
     observations : iterable
     seed : int
     lag : int, optional
@@ -135,6 +135,13 @@ def run_variance(
         raise InputError("a filter that is not properly weighted reports no evidence, and so has no variance of it")
     if filter.n < 2:
         raise InputError(f"n is {filter.n}, expected at least 2 particles to estimate a variance")
+    scheme: Any = filter.resampler
+    while scheme is not None:
+        if isinstance(scheme, Coalesced):
+            raise InputError(
+                "Coalesced merges particles, so ancestors do not show the variance of a run", "use its inner scheme"
+            )
+        scheme = getattr(scheme, "scheme", None)
     watched = _Watched(filter.resampler)
     ancestry = _Ancestry(lag)
     rows: list[tuple[Any, ...]] = []

@@ -27,8 +27,8 @@ Three functions invert the cumulative weights: `inverse_cdf` takes one point in 
 `independent_draws` takes n independent points, and `draw_rows` takes one point for each row of a matrix. The `select`
 method of your own `WeightResampler` can use these functions.
 
-Of several particles with equal weights, `LargestWeights`, `coalesce` and `leader_clusters` take the first. Random
-schemes do not compare weights.
+Of several particles with equal weights, `LargestWeights` and `leader_clusters` take the first. Random schemes do not
+compare weights.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).

@@ -11,6 +11,7 @@ from scipy import stats
 from mstfilter.errors import InputError
 from mstfilter.smc import (
     Branching,
+    Coalesced,
     Dynamics,
     EssBelow,
     FearnheadClifford,
@@ -19,6 +20,7 @@ from mstfilter.smc import (
     Multinomial,
     Never,
     Population,
+    Shuffled,
     Systematic,
     bootstrap,
     energy_distance,
@@ -114,6 +116,8 @@ def test_wrong_calls_are_named():
         (lambda: run_variance(bootstrap(AR1, 10), YS, lag=0), "lag is 0"),
         (lambda: run_variance(bootstrap(AR1, 1), YS), "at least 2 particles"),
         (lambda: run_variance(bootstrap(AR1, 10, KeepWeights()), YS), "not properly weighted"),
+        (lambda: run_variance(bootstrap(hmm("vector"), 10, Coalesced()), [0, 2]), "Coalesced merges particles"),
+        (lambda: run_variance(bootstrap(AR1, 10, Shuffled(Coalesced())), YS), "Coalesced merges particles"),
         (lambda: run_variance(bootstrap(AR1, 10), YS, function=lambda p: p.mean()), "one row per particle"),
     ):
         with pytest.raises(InputError, match=message):
