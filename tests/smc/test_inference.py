@@ -219,7 +219,6 @@ def filter_of(theta, n=30):
 
 
 def kalman(rho):
-    pytest.importorskip("filterpy.kalman")
     return kalman_filter([[rho]], [[SIGMA**2]], [[1.0]], [[TAU**2]], [0.0], [[SD0**2]], YS).log_evidence[-1]
 
 

@@ -113,7 +113,7 @@ class ResamplerContract(ScaleContract):
 
     @statistical
     def test_carried_weight_of_equal_particles(self) -> None:
-        """Each of two equal particles carries its weight on average. A scheme that merges them draws one by weight."""
+        """Each of two equal particles carries its weight on average. A scheme that merges them draws one."""
         component = skip_unless_properly_weighted(self.make())
         for seed, case in enumerate(self.cases[:4]):
             sample = self._carried(component, case, seed, repeats=2)
