@@ -264,7 +264,7 @@ class _Sweep:
 
     def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
         """Raise an error if the batch and the single run give different results for a run."""
-        found = _difference(ours, alone)
+        found = difference(ours, alone)
         if found is None or (found[0] and self.rounding):
             return
         if found[0]:
@@ -393,12 +393,12 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
     return component.update(rng, population, None, y)
 
 
-def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
+def difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
     """Whether the first difference of two arrays (or mappings) is rounding, and the two values; None if identical."""
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)
-        found = [d for d in (_difference(ours[name], other[name]) for name in ours) if d is not None]
+        found = [d for d in (difference(ours[name], other[name]) for name in ours) if d is not None]
         return min(found, key=lambda d: d[0], default=None)
     a, b = np.asarray(ours), np.asarray(other)
     if a.shape != b.shape or a.dtype != b.dtype:

@@ -306,7 +306,7 @@ def particle_gibbs(
     thetas, paths, moved = np.empty((n_iterations, 1, len(theta))), [], 0
     for i in range(n_iterations):
         streams, old = key.child(i), theta
-        theta = np.asarray(draw(streams.child("theta").generator(), theta, path), np.float64)
+        theta = np.array(draw(streams.child("theta").generator(), theta.copy(), path), np.float64)
         if theta.shape != old.shape:
             raise InputError(f"draw returned parameters of shape {theta.shape}, expected {old.shape}")
         path = conditional_path(filter_of(theta), observations, streams, path)
