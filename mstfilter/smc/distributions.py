@@ -161,6 +161,8 @@ def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
             shape = shape or other
             continue
         try:
+            if shape[0] > 1 and (shape == (*other, 1) or other == (*shape, 1)):
+                raise ValueError("numpy would make (n, n) of (n,) and (n, 1)")
             shape = np.broadcast_shapes(shape, other)
         except ValueError:
             raise InputError(

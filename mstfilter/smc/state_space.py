@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -101,7 +102,8 @@ class StateSpaceModel(AtStep):
                 )
 
         def sample(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
-            return as_distribution(transition(x, **step)).sample(rng, count_particles(x))
+            new = as_distribution(transition(x, **step)).sample(rng, count_particles(x))
+            return _of_shape("transition", new, x)
 
         def log_density(previous: Any, new: Any, **step: Any) -> np.ndarray:
             return as_distribution(transition(previous, **step)).log_prob(new)
@@ -114,7 +116,7 @@ class StateSpaceModel(AtStep):
             first.sample,
             with_step(sample, moves),
             with_step(log_likelihood, observes),
-            first.log_prob,
+            partial(_log_initial, first),
             with_step(log_density, moves),
             batched=None,
         )
@@ -131,6 +133,23 @@ class StateSpaceModel(AtStep):
                 "give StateSpaceModel its log densities, or use .of(); a singular covariance has none",
             )
         return found
+
+
+def _of_shape(what: str, new: np.ndarray, old: Any) -> np.ndarray:
+    """The new particles. Raises InputError if their shape differs, because numpy might broadcast them."""
+    if isinstance(old, np.ndarray) and np.shape(new) != old.shape:
+        raise InputError(
+            f"the {what} returned shape {np.shape(new)}, expected {old.shape} as the particles before",
+            "x[:, None] makes (n, 1) of (n,)",
+        )
+    return new
+
+
+def _log_initial(distribution: Distribution, x: Any) -> np.ndarray:
+    """(n,) log p(x_0). Checks the shape of the particles, which a proposal may have drawn."""
+    if np.shape(x)[1:] != distribution.event_shape:
+        raise InputError(f"particles have shape {np.shape(x)}, expected the event shape {distribution.event_shape}")
+    return distribution.log_prob(x)
 
 
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
@@ -208,7 +227,7 @@ class Dynamics(_OfModel, DensityTransition):
         if self.proposal is None or observation is None:
             return population.moved(self.model.sample_transition(rng, old))
         q = as_distribution(self.proposal(old, observation))
-        new = q.sample(rng, len(population))
+        new = _of_shape("proposal", q.sample(rng, len(population)), old)
         gain = self.model.density("log_transition")(old, new) - q.log_prob(new)
         return Population(new, population.log_weights + gain, population.parents)
 

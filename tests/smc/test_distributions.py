@@ -205,6 +205,10 @@ def test_a_value_of_nan_has_no_density(ours, theirs):
 def test_parameters_that_do_not_fit_together():
     with pytest.raises(InputError, match=r"shapes \(4, 2\) and \(4,\) do not fit together"):
         Normal(np.zeros((4, 2)), np.ones(4)).sample(np.random.default_rng(0), 4)
+    for shapes in (((4, 1), (4,)), ((4,), (4, 1))):  # numpy would make (4, 4)
+        with pytest.raises(InputError, match="do not fit together"):
+            Normal(*map(np.ones, shapes)).sample(np.random.default_rng(0), 4)
+    assert Normal(np.zeros((4, 1)), np.ones(3)).event_shape == (3,)
     with pytest.raises(InputError, match=r"mean of shape \(1,\) does not fit a covariance of shape \(2, 2\)"):
         MultivariateNormal([0.0], COV)
     with pytest.raises(InputError, match=r"mean of shape \(4,\) does not fit a covariance of shape \(1, 1\)"):

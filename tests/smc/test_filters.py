@@ -196,3 +196,26 @@ def test_wrong_parts_are_named_with_step_and_slot():
         nan.run(YS)
     with pytest.raises(InputError, match="needs the next observation"):
         replace(auxiliary(AR1, predictive, 5), resample="after")
+
+
+def test_a_proposal_draws_the_shape_of_the_state():
+    """numpy would broadcast (n, 1) against (n,), and sum over all pairs of particles."""
+    scalar = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+    vector = StateSpaceModel.of(
+        Normal(np.zeros((1, 2)), 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x[:, 0], 1.0)
+    )
+    own = replace(scalar, log_transition=lambda old, new: -np.square(new - old).reshape(len(new), -1).sum(axis=1))
+    for model, proposal, initial, message in (
+        (scalar, lambda x, y: Normal(x[:, None], 1.0), None, "1, transition: the proposal returned"),
+        (own, lambda x, y: Normal(x[:, None], 1.0), None, "1, transition: the proposal returned"),
+        (scalar, None, lambda y: Normal(np.full((1, 1), y), 1.0), "0, initial: particles have"),
+        (vector, None, lambda y: Normal(np.full((1, 1), y), 1.0), "0, initial: particles have"),
+        (vector, lambda x, y: Normal(x[:, 0], 1.0), None, "1, transition: the proposal returned"),
+    ):
+        with pytest.raises(InputError, match=f"step {message} .*shape"):
+            guided(model, proposal, 6, initial).run([0.1, 0.2])
+    growing = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(x[:, None], 0.5), lambda x: Normal(x.T[0].T, 1.0))
+    with pytest.raises(
+        InputError, match=r"step 1, transition: the transition returned shape \(6, 1\), expected \(6,\)"
+    ):
+        bootstrap(growing, 6).run([None, None])
