@@ -91,6 +91,9 @@ class _Checked(Distribution):
 
     def __post_init__(self) -> None:
         for name in self.ranges:
+            value = getattr(self, name)
+            if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub":  # would wrap
+                object.__setattr__(self, name, value.astype(np.float64))
             if not (self.lazy and type(getattr(self, name)) is np.ndarray):
                 self._check(name, self.ranges[name])
 
@@ -180,7 +183,8 @@ def _sum_rows(log_prob: Any) -> np.ndarray:
 
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
-    z = np.asarray(np.subtract(value, loc), dtype=np.float64)
+    integers = isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub"  # would wrap
+    z = np.asarray(np.subtract(value, loc, dtype=np.float64 if integers else None), dtype=np.float64)
     fits = (
         isinstance(scale, float)
         or np.shape(scale) == z.shape
@@ -200,8 +204,9 @@ class Normal(_Independent):
     lazy: ClassVar = True
 
     def __post_init__(self) -> None:
-        if not (type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray):
-            super().__post_init__()  # not in the usual case
+        usual = type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray
+        if not (usual and self.loc.dtype.kind == "f"):
+            super().__post_init__()
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -414,6 +419,7 @@ class Categorical(Distribution):
 
     def log_prob(self, value: Any) -> np.ndarray:
         k = np.asarray(value)
+        k = k.astype(np.int64) if k.dtype.kind in "iub" else k  # numpy clips to the range of its type
         index = np.nan_to_num(np.clip(k, 0, self.probs.shape[-1] - 1)).astype(np.int64)
         with np.errstate(divide="ignore"):
             log_p = np.log(self.probs)

@@ -189,7 +189,8 @@ class _Job:
         check_one_shape(name, [row.shape[1:] for row in rows if len(row)])
         complete = all(len(row) == n_steps for row in rows)
         empty = -np.inf if self.collectors[name] is log_evidence else np.nan
-        kind = longest.dtype if complete else np.result_type(longest.dtype, np.float64)
+        kinds = {row.dtype for row in rows if len(row)} or {longest.dtype}
+        kind = np.result_type(*kinds, *([] if complete else [np.float64]))
         values = np.full((len(rows), n_steps, *longest.shape[1:]), 0 if complete else empty, kind)
         for value, row in zip(values, rows, strict=True):
             value[: len(row)] = row if len(row) else 0
