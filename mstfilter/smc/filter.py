@@ -369,7 +369,8 @@ class _Step:
             notes=self.slot.notes,
             seconds=self.slot.seconds,
         )
-        return State(self.state.t + 1, population, self.state.key, self.state.properly_weighted), info
+        proper = self.state.properly_weighted and self.given.properly_weighted
+        return State(self.state.t + 1, population, self.state.key, proper), info
 
 
 class _Slot:

@@ -312,7 +312,7 @@ class State:
     t: int  #: number of observations so far
     population: Population | None  #: the particles after the last observation; None before the first
     key: Key  #: names the random streams of the run
-    properly_weighted: bool = True  #: whether the filter is properly weighted
+    properly_weighted: bool = True  #: whether the filters of all steps are properly weighted
 
     def __repr__(self) -> str:
         evidence = "" if self.log_evidence is None else f", log evidence {self.log_evidence:.4g}"

@@ -182,7 +182,10 @@ def test_evidence_of_improper_parts_is_not_reported():
     assert bootstrap(AR1, 5, Top()).run(YS)[0].log_evidence is None
     filter = replace(bootstrap(AR1, 5), lookahead=Guess(predictive))
     assert filter.run(YS)[0].log_evidence is None
-    assert bootstrap(AR1, 5).run(YS)[0].log_evidence is not None
+    proper = bootstrap(AR1, 5)
+    assert proper.run(YS)[0].log_evidence is not None
+    for first, second in ((proper, bootstrap(AR1, 5, Top())), (bootstrap(AR1, 5, Top()), proper)):
+        assert second.run(YS[4:], first.run(YS[:4])[0])[0].log_evidence is None
 
 
 def test_wrong_parts_are_named_with_step_and_slot():
