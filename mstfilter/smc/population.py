@@ -388,7 +388,10 @@ def _kind(particles: Particles) -> str:
 
 
 def union(predicted: Population | None, proposed: Population | None) -> Population:
-    """Join predicted and proposed particles, with their weights and parents. One of the populations may be None."""
+    """Join predicted and proposed particles, with their weights and parents. One of the populations may be None.
+
+    Raises InputError if both are None, or if particles that are mappings have different variables.
+    """
     if predicted is None or proposed is None:
         population = predicted if predicted is not None else proposed
         if population is None:
@@ -399,6 +402,10 @@ def union(predicted: Population | None, proposed: Population | None) -> Populati
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         particles = np.concatenate([a, b])
     elif isinstance(a, Mapping) and isinstance(b, Mapping):
+        if a.keys() != b.keys():
+            raise InputError(
+                f"predicted and proposed particles have the variables {sorted(a)} and {sorted(b)}, expected the same"
+            )
         particles = {name: np.concatenate([a[name], b[name]]) for name in a}
     else:
         particles = (*a, *b)

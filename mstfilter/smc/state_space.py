@@ -307,6 +307,10 @@ class RandomWalkMove(Rejuvenation):
 
     def _step(self, rng: np.random.Generator, x: Particles) -> Particles:
         if isinstance(x, np.ndarray):
+            if x.dtype.kind != "f":
+                raise InputError(
+                    f"particles are {x.dtype}, expected floats", "write a Rejuvenation for discrete states"
+                )
             return x + self.scale * rng.standard_normal(x.shape)
         return {name: self._step(rng, a) for name, a in x.items()}
 

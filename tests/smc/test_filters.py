@@ -150,6 +150,14 @@ def test_densities_of_transitions():
         guided(bare, optimal, 5).run(YS, 0)
 
 
+def test_a_random_walk_refuses_integers():
+    """A step of real numbers would leave the states of a chain."""
+    for kind, message in (("vector", "particles are int64"), ("mapping", "particles are int64")):
+        model = hmm(kind)
+        with pytest.raises(InputError, match=f"step 1, rejuvenation: {message}, expected floats"):
+            resample_move(model, RandomWalkMove(model, 0.5), 20, trigger=Always()).run([0, 2], 0)
+
+
 @dataclass(frozen=True)
 class Alternating(Size):
     """90 particles where the effective sample size is low, 30 where it is high."""
