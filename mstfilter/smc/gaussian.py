@@ -14,10 +14,8 @@ other part z_t is linear and Gaussian:
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
 A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_0 .. y_t. The particles are a mapping
-of arrays. The transition draws u_t and predicts the mean and covariance of z_t. The update weights by p(y_t | u_0 ..
-u_t, y_0 .. y_{t-1}) and corrects the mean and covariance. Reference: Doucet, de Freitas, Murphy, Russell (2000).
-
-`mstfilter.smc.exact` has linear models and their exact posteriors.
+of arrays. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}). Reference: Doucet, de Freitas, Murphy, Russell
+(2000).
 """
 
 from __future__ import annotations
@@ -146,10 +144,12 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
         expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
         raise InputError(f"{name} has shape {cov.shape}, expected {expected}")
     if np.allclose(cov, cov.T):
+        size = np.sqrt(np.where(np.diag(cov) > 0, np.diag(cov), 1.0))
+        values = np.linalg.eigvalsh(cov / np.outer(size, size))  # entries may have very different scales
+        if (values > 1e-14 * values.max()).all():
+            return np.linalg.cholesky(cov), False
         values, axes = np.linalg.eigh(cov)
         rounding = 1e-14 * max(values.max(), 0.0)
-        if (values > rounding).all():
-            return np.linalg.cholesky(cov), False
         if semidefinite and (values >= -rounding).all():
             return axes * np.sqrt(np.maximum(values, 0.0)), True
     kind = "semidefinite" if semidefinite else "definite"

@@ -147,6 +147,8 @@ def test_it_is_its_definition(shape):
     a, b = populations(shape)
     assert energy_distance(a, b) == pytest.approx(by_definition(a, b), abs=1e-12)
     assert energy_distance(a, a) == pytest.approx(0.0, abs=1e-12)
+    absent = Population(np.concatenate([a.particles, a.particles[:1] * np.nan]), np.append(a.log_weights, -np.inf))
+    assert energy_distance(absent, b) == pytest.approx(energy_distance(a, b))  # a particle of weight 0 has no effect
     if shape == ():
         scipy = stats.energy_distance(a.particles, b.particles, a.weights, b.weights)
         assert energy_distance(a, b) == pytest.approx(scipy**2)
