@@ -2,11 +2,10 @@
 
 `mstfilter.smc.run_many` uses this module if all components can process the particles of several runs in one call.
 
-Each component is called once per step with the n particles of all R runs, as one population of R n particles. Runs
-are batched if the attribute `batched` of each component is True or None. Programs and models of `StateSpaceModel.of`
-have ``batched=None``: batching is tried. The arrays of a call have no axis of runs. A component must treat each row
-independently, and draw arrays in the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``.
-`RunGenerators` draws the rows of a run from the random stream of the run.
+Each component is called once per step with the n particles of all R runs, as one population of R n particles, if its
+attribute `batched` is True or None. A component must treat each row independently, and draw arrays in the shape of
+its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of a run from the random
+stream of the run.
 
 Some runs of the batch are compared with single runs at steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the
 number of runs changes. If results differ by more than rounding and the component states ``batched=True``, InputError
@@ -395,6 +394,8 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
 
 def difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
     """Whether the first difference of two arrays (or mappings) is rounding, and the two values; None if identical."""
+    if ours is other:
+        return None
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)

@@ -3,9 +3,7 @@
 >>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 
-`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant for any number of particles
-(Andrieu, Doucet, Holenstein 2010). Programs are supported too. `path_log_prob` is the joint log density of a path and
-the observations. `particle_gibbs` uses `conditional_path`, and its argument `draw` may use `path_log_prob`.
+`path_log_prob` is the joint log density of a path and the observations. Programs are supported too.
 """
 
 from __future__ import annotations
@@ -36,10 +34,11 @@ def conditional_path(
 ) -> Particles:
     """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
 
-    One particle follows `path`, and the filter draws the other particles. The result is the path of one final
-    particle, drawn by weight. Ancestors are drawn multinomially at every step; `resampler` and `trigger` of the
-    filter are not used. If the density of the transition is known, the ancestors of the particle that follows the
-    path are also drawn (ancestor sampling). A program that returns values is used without ancestor sampling.
+    This holds for any number of particles (Andrieu, Doucet, Holenstein 2010). One particle follows `path`, and the
+    filter draws the other particles. The result is the path of one final particle, drawn by weight. Ancestors are
+    drawn multinomially at every step; `resampler` and `trigger` of the filter are not used. If the density of the
+    transition is known, the ancestors of the particle that follows the path are also drawn (ancestor sampling). A
+    program that returns values is used without ancestor sampling.
 
     Parameters
     ----------
@@ -73,8 +72,7 @@ def conditional_path(
         if now.update is not None and y is not None:
             update_rng = key.child("step", t, "update").generator() if now.update.draws else rng
             moved, past = past, now.update.update(update_rng, past, None, y)
-            same = past.particles is moved.particles or difference(past.particles, moved.particles) is None
-            if not same:  # the given particle would be updated again
+            if difference(past.particles, moved.particles) is not None:  # the given particle would be updated again
                 raise InputError(
                     f"step {t}: the update changes the particles, and conditional SMC needs one that only weights",
                     "use a model of the whole state in place of a Rao-Blackwellised filter",

@@ -8,8 +8,7 @@
 >>> exact = forward_backward(initial, transition, log_likelihood, observations)
 >>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
 
-The first observation updates the initial state before the first prediction, as in all filters of this package. A
-missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
+A missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
 belongs to the transition from x_{t-1} to x_t, and entry 0 is not used.
 """
 
@@ -112,15 +111,15 @@ def kalman_filter(
     found |= {name: _root(name, found[name]) for name in ("Q", "R", "P0")}
     m = {name: np.broadcast_to(found[name], (T, *found[name].shape[-2:])) for name in "FQHR"}
     d, k = len(found["m0"]), m["H"].shape[1]
-    # x_t - offset_t has no input, and the same covariances.
-    offsets = np.zeros((T, d)) if B is None else _offsets(m["F"], found["B"], [u for _, u in given])
     means, roots, total = np.empty((T, d)), np.empty((T, d, d)), np.zeros(T)
     moves = []  # means of x_{t+1}, and roots of the joint covariances of x_{t+1} and x_t, given y_0 .. y_t
     x, root = found["m0"], found["P0"]  # the covariance of x is root root'
-    for t, (y, _) in enumerate(given):
+    for t, (y, u) in enumerate(given):
         total[t] = total[t - 1] if t else 0.0
         if t:
-            x = m["F"][t] @ x
+            if B is not None and u is None:
+                raise InputError(f"observation {t} has no input", "with B, give WithInput(y, u)")
+            x = m["F"][t] @ x + (0.0 if B is None else _input_effect(_entry("B", found["B"], t), u))
             joint = _triangular([[m["F"][t] @ root, m["Q"][t]], [root, np.zeros((d, d))]])
             moves.append((x, joint))
             root = joint[:d, :d]
@@ -129,7 +128,7 @@ def kalman_filter(
             S, root = joint[:k, :k], joint[k:, k:]
             if (abs(np.diag(S)) <= 1e-14 * np.linalg.norm(S, axis=1)).any():
                 raise InputError(f"the covariance H P H' + R of observation {t} is singular", "is R too small?")
-            z = np.linalg.solve(S, _observed(t, y, k) - m["H"][t] @ (x + offsets[t]))
+            z = np.linalg.solve(S, _observed(t, y, k) - m["H"][t] @ x)
             x = x + joint[k:, :k] @ z
             total[t] -= 0.5 * (z @ z + k * np.log(2 * np.pi)) + np.log(abs(np.diag(S))).sum()
         means[t], roots[t] = x, root
@@ -143,7 +142,7 @@ def kalman_filter(
         free = cross - cross @ inverse @ later  # parts that x_{t+1} does not determine
         smoothed_roots[t] = _triangular([[joint[d:, d:], free, cross @ inverse @ smoothed_roots[t + 1]]])
     covariances = (r @ np.swapaxes(r, -1, -2) for r in (roots, smoothed_roots))
-    return Kalman(means + offsets, next(covariances), smoothed + offsets, next(covariances), total)
+    return Kalman(means, next(covariances), smoothed, next(covariances), total)
 
 
 def _root(name: str, cov: np.ndarray) -> np.ndarray:
@@ -169,16 +168,6 @@ def _observed(t: int, y: Any, k: int) -> np.ndarray:
             f"observation {t} is {vector.tolist()}, expected finite numbers", "one that is missing is None"
         )
     return vector
-
-
-def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
-    """(T, d) effect of all inputs up to each step on the state."""
-    found = np.zeros(F.shape[:2])
-    for t in range(1, len(F)):
-        if inputs[t] is None:
-            raise InputError(f"observation {t} has no input", "with B, give WithInput(y, u)")
-        found[t] = F[t] @ found[t - 1] + _input_effect(_entry("B", B, t), inputs[t])
-    return found
 
 
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:

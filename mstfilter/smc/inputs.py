@@ -10,8 +10,7 @@
 A model function with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
 observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
 
-`Component.at_step` returns the component for step t with input u. `step_functions` names the fields of a component or
-model that are functions. Components without such fields override `at_step`, or ignore time and inputs.
+`Component.at_step` returns the component for step t with input u.
 """
 
 from __future__ import annotations

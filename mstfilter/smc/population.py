@@ -9,10 +9,8 @@ array([0.25, 0.25, 0.5 ])
 2.667
 
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
-particles on access. `take` selects particles of any type: array rows are copied, and objects are shared.
-
-A population is immutable. A population does not copy the given arrays but stores read-only views of the arrays. If
-you write to an array later, pass ``array.copy()`` to the population.
+particles on access. A population is immutable. It stores read-only views of the given arrays. If you write to an
+array later, pass ``array.copy()`` to the population.
 """
 
 from __future__ import annotations
@@ -61,8 +59,8 @@ class Candidates(Sequence[_T], Generic[_T]):
     """Particles ``build(index)`` that are built at the first access and then stored.
 
     In MST the weight of a candidate is known before the candidate is built, so only selected candidates are built.
-    `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) are the
-    indices of the candidates in order; repeated indices are allowed. An integer n stands for the indices 0 .. n-1.
+    `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) may
+    repeat; an integer n stands for the indices 0 .. n-1.
     """
 
     def __init__(

@@ -12,9 +12,6 @@
 
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
-
-The function `metropolis` makes the Metropolis-Hastings steps of particles (`RandomWalkMove`), parameters (`pmmh`)
-and ancestors (`backward_paths`).
 """
 
 from __future__ import annotations
@@ -67,8 +64,7 @@ class StateSpaceModel(AtStep):
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     batched : bool or None
-        Whether the functions treat each particle independently, so that one call can process the particles of many
-        runs (see `mstfilter.smc.batching`). With None, `run_many` tests the independence.
+        Whether the functions treat each particle independently (see `Component.batched`).
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -261,8 +257,7 @@ class RandomWalkMove(Rejuvenation):
 
     ``notes["accepted"]`` is the acceptance rate.
 
-    After a resampling several particles share a parent. The Metropolis kernel separates these particles and leaves
-    p(x_t | x_{t-1}, y_t) invariant. The weights do not change.
+    The Metropolis kernel leaves p(x_t | x_{t-1}, y_t) invariant. The weights do not change.
 
     Parameters
     ----------
@@ -392,16 +387,8 @@ def guided(
 ) -> ParticleFilter:
     """The guided filter, which moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
 
-    Parameters
-    ----------
-    model : StateSpaceModel
-        The model with its log densities.
-    proposal : callable
-        ``(particles, y) -> distribution`` q of x_t; None means the transition f of the model.
-    initial : callable, optional
-        ``(y) -> distribution`` of x_0; the default is the prior of the model.
-    **components
-        Other fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
+    The model needs its log densities. `proposal` is as in `Dynamics`, and None means the transition f of the model.
+    `initial` is as the proposal of `Prior`. `components` are other fields of `ParticleFilter`, such as ``resampler``.
     """
     return replace(
         bootstrap(model, n), initial=Prior(model, initial), transition=Dynamics(model, proposal), **components
@@ -420,15 +407,11 @@ def auxiliary(
 
     Parameters
     ----------
-    model : StateSpaceModel
-        The model, with its log densities if `proposal` is given.
     log_priority : callable
         ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}). The filter is exact for any finite priority.
-    proposal, initial : callable, optional
+    proposal, initial, **components
         As in `guided`. With priority p(y_t | x_{t-1}) and proposal p(x_t | x_{t-1}, y_t), the filter is fully
         adapted.
-    **components
-        As in `guided`.
     """
     return replace(guided(model, proposal, n, initial, **components), lookahead=PriorityLookahead(log_priority))
 

@@ -1,8 +1,7 @@
 """Contracts of resamplers.
 
 A particle of normalised weight W_i must get n W_i copies on average if the resampler is properly weighted. If output
-weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test
-cases: n = m, n < m and n > m, ties, zeros, heavy and light weights.
+weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` has the cases.
 """
 
 from __future__ import annotations
@@ -117,8 +116,8 @@ class ResamplerContract(ScaleContract):
         component = skip_unless_properly_weighted(self.make())
         for seed, case in enumerate(self.cases[:4]):
             sample = self._carried(component, case, seed, repeats=2)
-            message = fault_message(sample, int(np.argmax(sample.evidence())))
-            assert self._excess(sample) <= 0, f"of equal particles: {message}"
+            message = "of equal particles: " + fault_message(sample, int(np.argmax(sample.evidence())))
+            assert self._excess(sample) <= 0, message
 
     def _carried(self, component: Resampler, case: Case, seed: int, repeats: int = 1) -> Sample:
         """The weight of the copies of each particle and each group of particles in many calls.
