@@ -2,11 +2,10 @@
 
 `mstfilter.smc.run_many` uses this module if all components can process the particles of several runs in one call.
 
-Each component is called once per step with the n particles of all R runs, as one population of R n particles. Runs
-are batched if the attribute `batched` of each component is True or None. Programs and models of `StateSpaceModel.of`
-have ``batched=None``: batching is tried. The arrays of a call have no axis of runs. A component must treat each row
-independently, and draw arrays in the shape of its arguments, as in ``x + rng.standard_normal(x.shape)``.
-`RunGenerators` draws the rows of a run from the random stream of the run.
+Each component is called once per step with the n particles of all R runs, as one population of R n particles, if its
+attribute `batched` is True or None. A component must treat each row independently, and draw arrays in the shape of
+its arguments, as in ``x + rng.standard_normal(x.shape)``. `RunGenerators` draws the rows of a run from the random
+stream of the run.
 
 Some runs of the batch are compared with single runs at steps 0, 1, 2, 5, 12, 29, ..., at the last step, and when the
 number of runs changes. If results differ by more than rounding and the component states ``batched=True``, InputError
@@ -264,7 +263,7 @@ class _Sweep:
 
     def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
         """Raise an error if the batch and the single run give different results for a run."""
-        found = _difference(ours, alone)
+        found = difference(ours, alone)
         if found is None or (found[0] and self.rounding):
             return
         if found[0]:
@@ -393,12 +392,14 @@ def _called(slot: str, component: Any, rng: Any, population: Population | None, 
     return component.update(rng, population, None, y)
 
 
-def _difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
+def difference(ours: Any, other: Any) -> tuple[bool, Any, Any] | None:
     """Whether the first difference of two arrays (or mappings) is rounding, and the two values; None if identical."""
+    if ours is other:
+        return None
     if isinstance(ours, Mapping) and isinstance(other, Mapping):
         if ours.keys() != other.keys():
             return False, sorted(ours), sorted(other)
-        found = [d for d in (_difference(ours[name], other[name]) for name in ours) if d is not None]
+        found = [d for d in (difference(ours[name], other[name]) for name in ours) if d is not None]
         return min(found, key=lambda d: d[0], default=None)
     a, b = np.asarray(ours), np.asarray(other)
     if a.shape != b.shape or a.dtype != b.dtype:

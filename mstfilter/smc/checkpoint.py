@@ -5,13 +5,10 @@
 >>> state = load_state(path)                                         # later, or in another process
 >>> state, infos = filter.run(observations[state.t:], state)
 
-The file is an .npz of plain arrays, read and written without pickle. The file is written under a temporary name and
-then renamed, so it holds the state of a complete step even if the process is killed. All draws depend on the seed and
-the step only, so a continued run has the results of an uninterrupted run. The file stores no filter and no
-observations: pass both to the continued run.
-
-`ArrayCodec` stores particles that are arrays or mappings of arrays. Particles of another type need a `Codec`. Loading
-a file never imports code.
+The file is an .npz of plain arrays, read and written without pickle. Loading it never imports code. The file is
+written under a temporary name and then renamed, so it holds the state of a complete step even if the process is
+killed. A continued run has the results of an uninterrupted run. The file stores no filter and no observations: pass
+both to the continued run. Particles that are neither arrays nor mappings of arrays need a `Codec`.
 """
 
 from __future__ import annotations

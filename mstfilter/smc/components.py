@@ -3,7 +3,7 @@
 >>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
 >>> transition = Branching(Dynamics(model), branches=4)
 
-A trigger decides when to resample. A size component decides the number of particles:
+A size component decides the number of particles:
 
 >>> import numpy as np
 >>> from mstfilter.smc import Bins, Kld, Population
@@ -66,15 +66,8 @@ class Branching(Transition):
 
     Schemes without duplicates (Fearnhead-Clifford, k-DPP, coalescing) need more candidates than particles. If n
     particles are selected from n candidates, all candidates are kept, and the filter degenerates. If the branches of
-    a discrete state are all its successors, the filter is the algorithm of Fearnhead and Clifford (2003):
-
-    >>> filter = replace(
-    ...     bootstrap(model, n=50),
-    ...     transition=Branching(Dynamics(model), branches=4),
-    ...     resampler=FearnheadClifford(),
-    ...     trigger=Never(),           # 200 candidates are more than 50 particles: they are always resampled
-    ...     resample="after",
-    ... )
+    a discrete state are all its successors, the filter is the algorithm of Fearnhead and Clifford (2003). Use
+    ``resample="after"``, and `Never` as the trigger: more than n candidates are always resampled.
 
     Parameters
     ----------
@@ -189,7 +182,7 @@ class Kld(Size):
     k occupied bins require n >= bound(k) = chi2_{k-1}(1 - delta) / (2 epsilon) draws (Fox 2003, "Adapting the sample
     size in particle filters through KLD-sampling"). Fox counts the occupied bins while drawing. `Kld` uses the weight
     W_b of each bin. It chooses the least n with n >= bound(k), where k = sum_b (1 - (1 - W_b)^n) is the expected
-    number of bins that n draws occupy. This n applies to any resampling scheme, and slightly exceeds Fox's n.
+    number of bins that n draws occupy. This n slightly exceeds Fox's n.
 
     Parameters
     ----------

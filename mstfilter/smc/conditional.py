@@ -3,9 +3,7 @@
 >>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 
-`conditional_path` is a Markov kernel that leaves the smoothing distribution invariant for any number of particles
-(Andrieu, Doucet, Holenstein 2010). Programs are supported too. `path_log_prob` is the joint log density of a path and
-the observations. `particle_gibbs` uses `conditional_path`, and its argument `draw` may use `path_log_prob`.
+`path_log_prob` is the joint log density of a path and the observations. Programs are supported too.
 """
 
 from __future__ import annotations
@@ -16,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, check_integer
+from mstfilter.smc.batching import difference
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import split_input
+from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, program_step, run_program
@@ -35,15 +34,17 @@ def conditional_path(
 ) -> Particles:
     """A path of states drawn by conditional SMC, a kernel that leaves p(x_0 .. x_T | y_0 .. y_T) invariant.
 
-    One particle follows `path`, and the filter draws the other particles. The result is the path of one final
-    particle, drawn by weight. Ancestors are drawn multinomially at every step; `resampler` and `trigger` of the
-    filter are not used. If the density of the transition is known, the ancestors of the particle that follows the
-    path are also drawn (ancestor sampling). A program that returns values is used without ancestor sampling.
+    This holds for any number of particles (Andrieu, Doucet, Holenstein 2010). One particle follows `path`, and the
+    filter draws the other particles. The result is the path of one final particle, drawn by weight. Ancestors are
+    drawn multinomially at every step; `resampler` and `trigger` of the filter are not used. If the density of the
+    transition is known, the ancestors of the particle that follows the path are also drawn (ancestor sampling). A
+    program that returns values is used without ancestor sampling.
 
     Parameters
     ----------
     filter : ParticleFilter
-        Bootstrap or guided filter of a model or a program, with at least two particles.
+        Bootstrap or guided filter of a model or a program, with at least two particles. The update must not change
+        the particles.
     path : T particles, optional
         The present path. Row t is the particle at time t. If `path` is None, an ordinary filter draws the path.
 
@@ -52,10 +53,7 @@ def conditional_path(
     array (T, ...), mapping of arrays (T, ...), or tuple of T objects
     """
     _check_conditional(filter)
-    ys = list(observations)
-    if not ys or (path is not None and count_particles(path) != len(ys)):
-        states = "" if path is None else f" for a path of {count_particles(path)} states"
-        raise InputError(f"there are {len(ys)} observations{states}")
+    ys = _observations(observations, path)
     key = seed if isinstance(seed, Key) else Key(seed)
     rng = key.child("ancestors").generator()
     populations: list[Population] = []
@@ -73,13 +71,27 @@ def conditional_path(
         past = _moved(now, key.child("step", t), past, given, y)
         if now.update is not None and y is not None:
             update_rng = key.child("step", t, "update").generator() if now.update.draws else rng
-            past = now.update.update(update_rng, past, None, y)
+            moved, past = past, now.update.update(update_rng, past, None, y)
+            if difference(past.particles, moved.particles) is not None:  # the given particle would be updated again
+                raise InputError(
+                    f"step {t}: the update changes the particles, and conditional SMC needs one that only weights",
+                    "use a model of the whole state in place of a Rao-Blackwellised filter",
+                )
         populations.append(past)
     rows = [int(draw_log(rng, populations[-1].log_weights[None])[0])]
     for index in reversed(parents):
         rows.append(int(index[rows[-1]]))
     chosen = zip(populations, reversed(rows), strict=True)
     return _joined([take(p.realised().particles, np.array([row])) for p, row in chosen])
+
+
+def _observations(observations: Sequence[Any], path: Particles | None) -> list[Any]:
+    """The observations. Raises InputError if there are none, or if a path has another length."""
+    ys = list(check_observations(observations))
+    if not ys or (path is not None and count_particles(path) != len(ys)):
+        states = "" if path is None else f" for a path of {count_particles(path)} states"
+        raise InputError(f"there are {len(ys)} observations{states}")
+    return ys
 
 
 def _check_conditional(filter: ParticleFilter) -> None:
@@ -200,10 +212,11 @@ def _joined(rows: list[Particles]) -> Particles:
 def path_log_prob(filter: ParticleFilter, observations: Sequence[Any], path: Particles) -> float:
     """log p(x_0 .. x_T, y_0 .. y_T) of a path, computed by the model or the program of a filter.
 
-    The filter must be made from a `Program`, or from a `StateSpaceModel` that has log densities.
+    The filter must be made from a `Program`, or from a `StateSpaceModel` that has log densities. Raises InputError if
+    the path does not have one state per observation.
     """
     total, previous = 0.0, None
-    for t, observation in enumerate(observations):
+    for t, observation in enumerate(_observations(observations, path)):
         y, u = split_input(observation)
         row = take(path, np.array([t]))
         total += _step_log_prob(filter.at_step(t, u), previous, row, y)

@@ -3,9 +3,8 @@
 >>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
 >>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
 
-`run_variance` follows ancestors, so all particles of the filter must have known parents. `energy_distance` compares
-two populations, such as the populations before and after a resampling. Half of the energy distance between a
-population and the true state is the energy score (Gneiting and Raftery 2007). A lower score is better:
+`energy_distance` compares two populations. Half of the energy distance between a population and the true state is
+the energy score (Gneiting and Raftery 2007). A lower score is better:
 
 >>> energy_distance(population, Population(np.array([truth]))) / 2
 """
@@ -24,7 +23,7 @@ from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.smoothing import known_parents
-from mstfilter.smc.wrapped_resampling import ResamplerWrapper
+from mstfilter.smc.wrapped_resampling import Coalesced, ResamplerWrapper
 
 
 def energy_distance(
@@ -51,15 +50,14 @@ def _energy(particles: Any, masses: np.ndarray, distance: Callable[[Any], np.nda
         if d.shape != (len(masses),) * 2:
             raise InputError(f"distances have shape {d.shape}, expected {(len(masses),) * 2}")
         return max(0.0, -float(masses @ d @ masses))
-    x = as_matrix(particles)
+    x, some = as_matrix(particles), masses != 0
+    x, masses = x[some], masses[some]
     if x.shape[1] == 1:  # 2 times the integral of the squared difference of the distribution functions
         order = np.argsort(x[:, 0])
         gaps, below = np.diff(x[order, 0]), np.cumsum(masses[order])[:-1]
         return 2.0 * float(gaps @ (below * below))
     from scipy.spatial.distance import cdist
 
-    some = masses != 0
-    x, masses = x[some], masses[some]
     rows = max(1, 4_000_000 // max(1, len(x)))
     parts = [masses[k : k + rows] @ (cdist(x[k : k + rows], x) @ masses) for k in range(0, len(x), rows)]
     return max(0.0, -float(sum(parts)))
@@ -107,17 +105,13 @@ def run_variance(
     parts are added. The lag reduces the noise of the estimates. With a lag, the variances can be estimated even if
     all particles share one ancestor at time 0. The bias from the lag is small if x_t hardly depends on x_{t-L}.
 
-    The estimated variances are of first order in 1 / n, and too low for small n. In `experiments/run_variance`, 300
-    particles give estimates within 15 % of the variance over seeds. With 30 particles, the log evidence of AR(1) has
-    a variance of 2, and the variances of means are estimated 90 % too low (`sizes.csv`). Use more particles if the
-    log evidence has a variance above 0.3.
+    The estimated variances are of first order in 1 / n, and too low for small n. Use more particles if the log
+    evidence has a variance above 0.3 (`experiments/run_variance`).
 
     Parameters
     ----------
     filter : ParticleFilter
-        A properly weighted filter with at least 2 particles.
-    observations : iterable
-    seed : int
+        A properly weighted filter with at least 2 particles. `Coalesced` is not supported.
     lag : int, optional
         Number of steps L, at least 1. By default, L covers all steps. Time and memory grow with n times the lag.
     function : callable, optional
@@ -135,6 +129,13 @@ def run_variance(
         raise InputError("a filter that is not properly weighted reports no evidence, and so has no variance of it")
     if filter.n < 2:
         raise InputError(f"n is {filter.n}, expected at least 2 particles to estimate a variance")
+    scheme: Any = filter.resampler
+    while scheme is not None:
+        if isinstance(scheme, Coalesced):
+            raise InputError(
+                "Coalesced merges particles, so ancestors do not show the variance of a run", "use its inner scheme"
+            )
+        scheme = getattr(scheme, "scheme", None)
     watched = _Watched(filter.resampler)
     ancestry = _Ancestry(lag)
     rows: list[tuple[Any, ...]] = []

@@ -23,7 +23,6 @@ raise InputError, but have the log density NaN, so that the moves are rejected.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -91,6 +90,9 @@ class _Checked(Distribution):
 
     def __post_init__(self) -> None:
         for name in self.ranges:
+            value = getattr(self, name)
+            if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub":  # would wrap
+                object.__setattr__(self, name, value.astype(np.float64))
             if not (self.lazy and type(getattr(self, name)) is np.ndarray):
                 self._check(name, self.ranges[name])
 
@@ -130,9 +132,9 @@ class _Independent(_Checked):
     def parameter_shape(self) -> tuple[int, ...]:
         return _broadcast_shape(*vars(self).values())
 
-    @abstractmethod
     def _mean(self) -> Any:
         """Means of the independent entries."""
+        return self.loc  # type: ignore[attr-defined]
 
     @property
     def mean(self) -> np.ndarray:
@@ -161,6 +163,8 @@ def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
             shape = shape or other
             continue
         try:
+            if shape[0] > 1 and (shape == (*other, 1) or other == (*shape, 1)):
+                raise ValueError("numpy would make (n, n) of (n,) and (n, 1)")
             shape = np.broadcast_shapes(shape, other)
         except ValueError:
             raise InputError(
@@ -178,7 +182,8 @@ def _sum_rows(log_prob: Any) -> np.ndarray:
 
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
-    z = np.asarray(np.subtract(value, loc), dtype=np.float64)
+    integers = isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub"  # would wrap
+    z = np.asarray(np.subtract(value, loc, dtype=np.float64 if integers else None), dtype=np.float64)
     fits = (
         isinstance(scale, float)
         or np.shape(scale) == z.shape
@@ -198,8 +203,9 @@ class Normal(_Independent):
     lazy: ClassVar = True
 
     def __post_init__(self) -> None:
-        if not (type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray):
-            super().__post_init__()  # not in the usual case
+        usual = type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray
+        if not (usual and self.loc.dtype.kind == "f"):
+            super().__post_init__()
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -225,9 +231,6 @@ class Normal(_Independent):
             return _sum_rows(z)
         return _sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
 
-    def _mean(self) -> Any:
-        return self.loc
-
 
 @dataclass(frozen=True, eq=False)
 class Student(_Independent):
@@ -251,9 +254,6 @@ class Student(_Independent):
         df = self.df if type(self.df) is float else np.asarray(self.df, dtype=np.float64)  # a float is faster
         constant = gammaln((df + 1) / 2) - gammaln(df / 2) - 0.5 * np.log(df * np.pi) - np.log(self.scale)
         return _sum_rows(constant - (df + 1) / 2 * np.log1p(z * z / df))
-
-    def _mean(self) -> Any:
-        return self.loc
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,6 +412,7 @@ class Categorical(Distribution):
 
     def log_prob(self, value: Any) -> np.ndarray:
         k = np.asarray(value)
+        k = k.astype(np.int64) if k.dtype.kind in "iub" else k  # numpy clips to the range of its type
         index = np.nan_to_num(np.clip(k, 0, self.probs.shape[-1] - 1)).astype(np.int64)
         with np.errstate(divide="ignore"):
             log_p = np.log(self.probs)

@@ -1,7 +1,6 @@
 """Resampling schemes that keep more distinct particles. The output weights are unequal.
 
 `FearnheadClifford` and `Chopthin` need only the weights. `ClusterStratified` compares particles by a `Similarity`.
-`FearnheadClifford` needs more candidates than particles to select.
 
 >>> import numpy as np
 >>> from mstfilter.smc import ClusterStratified, Gaussian, Population
@@ -102,11 +101,8 @@ class Chopthin(WeightResampler):
     particles are returned, and all output weights lie in [a, ratio a]. If n of n particles are selected and the
     largest weight is at most ratio / 2 times the smallest, the result equals the input.
 
-    Parameters
-    ----------
-    ratio : float
-        Largest allowed ratio of two output weights. It must be at least 4. The effective sample size is then at
-        least 4 ratio / (1 + ratio)^2 times n, which is n / 2 for the default ratio of 3 + sqrt(8).
+    `ratio`, at least 4, is the largest allowed ratio of two output weights. The effective sample size is then at
+    least 4 ratio / (1 + ratio)^2 times n, which is n / 2 for the default ratio of 3 + sqrt(8).
 
     Reference: Gandy and Lau (2016), "The chopthin algorithm for resampling", IEEE Transactions on Signal Processing
     64.

@@ -8,8 +8,7 @@
 >>> exact = forward_backward(initial, transition, log_likelihood, observations)
 >>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
 
-The first observation updates the initial state before the first prediction, as in all filters of this package. A
-missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
+A missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
 belongs to the transition from x_{t-1} to x_t, and entry 0 is not used.
 """
 
@@ -97,44 +96,69 @@ class Kalman(NamedTuple):
 def kalman_filter(
     F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, observations: Iterable[Any], B: Any = None
 ) -> Kalman:
-    """Kalman filter and Rauch-Tung-Striebel smoother of filterpy. Observations are (k,), or None if missing.
+    """Kalman filter and Rauch-Tung-Striebel smoother. Observations are (k,), or None if missing.
 
     The arguments are as in `linear_gaussian`. Matrices that change with time have a first axis of length T. With `B`,
-    give each observation with its input as `WithInput`. Raises InputError if shapes do not fit, an input is missing,
-    or an observation is not finite.
-    """
-    from filterpy.kalman import KalmanFilter
+    give each observation with its input as `WithInput`. The recursions are those of square roots of covariances by QR
+    decompositions (Kailath, Sayed, Hassibi 2000, section 12.1), so entries of the state may have very different
+    scales. `Q`, `R` and `P0` may be singular.
 
+    Raises InputError if shapes do not fit, a covariance is not positive semidefinite, an input is missing, an
+    observation is not finite, or the covariance of an observation is singular.
+    """
     given = [split_input(y) for y in check_observations(observations)]
     T, found = len(given), _matrices(F, Q, H, R, m0, P0, B, len(given))
+    found |= {name: _root(name, found[name]) for name in ("Q", "R", "P0")}
     m = {name: np.broadcast_to(found[name], (T, *found[name].shape[-2:])) for name in "FQHR"}
     d, k = len(found["m0"]), m["H"].shape[1]
-    # x_t - offset_t has no input, and the same covariances.
-    offsets = np.zeros((T, d)) if B is None else _offsets(m["F"], found["B"], [u for _, u in given])
-    kf = KalmanFilter(dim_x=d, dim_z=k)
-    kf.x, kf.P = found["m0"].copy(), found["P0"].copy()
-    means, covariances, total = np.empty((T, d)), np.empty((T, d, d)), np.zeros(T)
-    for t, (y, _) in enumerate(given):
+    means, roots, total = np.empty((T, d)), np.empty((T, d, d)), np.zeros(T)
+    moves = []  # means of x_{t+1}, and roots of the joint covariances of x_{t+1} and x_t, given y_0 .. y_t
+    x, root = found["m0"], found["P0"]  # the covariance of x is root root'
+    for t, (y, u) in enumerate(given):
         total[t] = total[t - 1] if t else 0.0
-        kf.F, kf.Q, kf.H, kf.R = (m[name][t] for name in "FQHR")
         if t:
-            kf.predict()
+            if B is not None and u is None:
+                raise InputError(f"observation {t} has no input", "with B, give WithInput(y, u)")
+            x = m["F"][t] @ x + (0.0 if B is None else _input_effect(_entry("B", found["B"], t), u))
+            joint = _triangular([[m["F"][t] @ root, m["Q"][t]], [root, np.zeros((d, d))]])
+            moves.append((x, joint))
+            root = joint[:d, :d]
         if y is not None:
-            kf.update(_observed(t, y, k) - kf.H @ offsets[t])
-            total[t] += kf.log_likelihood
-        means[t], covariances[t] = kf.x, kf.P
-    smoothed = means, covariances
-    if T > 1:
-        smoothed = kf.rts_smoother(means, covariances, list(m["F"]), list(m["Q"]), inv=_inverse)[:2]
-    return Kalman(means + offsets, covariances, smoothed[0] + offsets, smoothed[1], total)
+            joint = _triangular([[m["R"][t], m["H"][t] @ root], [np.zeros((d, k)), root]])
+            S, root = joint[:k, :k], joint[k:, k:]
+            if (abs(np.diag(S)) <= 1e-14 * np.linalg.norm(S, axis=1)).any():
+                raise InputError(f"the covariance H P H' + R of observation {t} is singular", "is R too small?")
+            z = np.linalg.solve(S, _observed(t, y, k) - m["H"][t] @ x)
+            x = x + joint[k:, :k] @ z
+            total[t] -= 0.5 * (z @ z + k * np.log(2 * np.pi)) + np.log(abs(np.diag(S))).sum()
+        means[t], roots[t] = x, root
+    smoothed, smoothed_roots = means.copy(), roots.copy()
+    for t in range(T - 2, -1, -1):
+        predicted, joint = moves[t]
+        later, cross = joint[:d, :d], joint[d:, :d]
+        size = np.maximum(np.linalg.norm(later, axis=1), np.finfo(float).tiny)
+        inverse = np.linalg.pinv(later / size[:, None], rcond=1e-12) / size
+        smoothed[t] = means[t] + cross @ (inverse @ (smoothed[t + 1] - predicted))
+        free = cross - cross @ inverse @ later  # parts that x_{t+1} does not determine
+        smoothed_roots[t] = _triangular([[joint[d:, d:], free, cross @ inverse @ smoothed_roots[t + 1]]])
+    covariances = (r @ np.swapaxes(r, -1, -2) for r in (roots, smoothed_roots))
+    return Kalman(means, next(covariances), smoothed, next(covariances), total)
 
 
-def _inverse(cov: np.ndarray) -> np.ndarray:
-    """The inverse of a covariance; the pseudo-inverse if the covariance is singular."""
-    values = np.linalg.eigvalsh(cov)
-    if values.min() > 1e-12 * values.max():
-        return np.linalg.inv(cov)
-    return np.linalg.pinv(cov, rcond=1e-12, hermitian=True)
+def _root(name: str, cov: np.ndarray) -> np.ndarray:
+    """Square roots of covariances (..., n, n), from the eigenvalues of the correlations."""
+    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    sd = np.where(sd > 0, sd, 1.0)
+    values, axes = np.linalg.eigh(cov / sd[..., None] / sd[..., None, :])
+    if not np.allclose(cov, np.swapaxes(cov, -1, -2)) or (values < -1e-10).any():
+        raise InputError(f"{name} is {cov.tolist()}, expected a covariance: symmetric and positive semidefinite")
+    return sd[..., None] * axes * np.sqrt(np.where(values > 1e-15, values, 0.0))[..., None, :]
+
+
+def _triangular(blocks: list[list[np.ndarray]]) -> np.ndarray:
+    """The lower triangular L with L L' = M M', for a matrix M of blocks."""
+    upper: Any = np.linalg.qr(np.block(blocks).T, mode="r")
+    return upper.T
 
 
 def _observed(t: int, y: Any, k: int) -> np.ndarray:
@@ -144,16 +168,6 @@ def _observed(t: int, y: Any, k: int) -> np.ndarray:
             f"observation {t} is {vector.tolist()}, expected finite numbers", "one that is missing is None"
         )
     return vector
-
-
-def _offsets(F: np.ndarray, B: np.ndarray, inputs: list[Any]) -> np.ndarray:
-    """(T, d) effect of all inputs up to each step on the state."""
-    found = np.zeros(F.shape[:2])
-    for t in range(1, len(F)):
-        if inputs[t] is None:
-            raise InputError(f"observation {t} has no input", "with B, give WithInput(y, u)")
-        found[t] = F[t] @ found[t - 1] + _input_effect(_entry("B", B, t), inputs[t])
-    return found
 
 
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:
@@ -172,7 +186,7 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
         log_start, log_moves = np.log(start), np.log(moves)
 
     def weigh(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
-        return np.asarray(log_likelihood(y, **step), dtype=np.float64)[x]
+        return _of_states(log_likelihood(y, **step), len(start))[x]
 
     return StateSpaceModel(
         lambda rng, n: (below_start <= rng.random(n)[:, None]).sum(axis=-1),
@@ -215,29 +229,34 @@ def forward_backward(
 
     Raises InputError if a shape does not fit, or if an observation has probability 0.
     """
-    start, moves = _chain(initial, transition)
+    from scipy.special import logsumexp
+
+    with np.errstate(divide="ignore"):
+        start, moves = map(np.log, _chain(initial, transition))
     ys = [split_input(y) for y in check_observations(observations)]
     T, K, of_step = len(ys), len(start), step_parameters(log_likelihood, 1)
-    filtered, likelihood, total = np.empty((T, K)), np.ones((T, K)), np.zeros(T)
+    log_filtered, seen, total = np.empty((T, K)), np.zeros((T, K)), np.zeros(T)
     for t, (y, u) in enumerate(ys):
-        predicted = filtered[t - 1] @ moves if t else start
         total[t] = total[t - 1] if t else 0.0
-        filtered[t] = predicted
-        if y is None:
-            continue
-        found = np.asarray(bind_step(log_likelihood, of_step, t, u)(y), dtype=np.float64)
-        if found.shape != (K,):
-            raise InputError(f"log_likelihood returned shape {found.shape}, expected ({K},): one number per state")
-        possible = found[predicted > 0].max()
-        if not np.isfinite(possible):
+        predicted = logsumexp(log_filtered[t - 1][:, None] + moves, axis=0) if t else start
+        if y is not None:
+            found = _of_states(bind_step(log_likelihood, of_step, t, u)(y), K)
+            seen[t] = np.where(predicted > -np.inf, found, -np.inf)
+        gain = logsumexp(predicted + seen[t])
+        if not np.isfinite(gain):
             raise InputError(f"observation {t} is {y!r}: no state that is possible there explains it")
-        likelihood[t] = np.exp(np.where(predicted > 0, found - possible, -np.inf))
-        joint = predicted * likelihood[t]
-        total[t] += np.log(joint.sum()) + possible
-        filtered[t] = joint / joint.sum()
-    smoothed, later = filtered.copy(), np.ones(K)  # later is proportional to p(y_{t+1} .. | x_t)
+        total[t] += gain
+        log_filtered[t] = predicted + seen[t] - gain
+    log_smoothed, later = log_filtered.copy(), np.zeros(K)  # later is log p(y_{t+1} .. | x_t)
     for t in range(T - 2, -1, -1):
-        later = moves @ (likelihood[t + 1] * later)
-        later /= later.max()
-        smoothed[t] = filtered[t] * later / (filtered[t] @ later)
-    return Marginals(filtered, smoothed, total)
+        later = logsumexp(moves + seen[t + 1] + later, axis=1)
+        log_smoothed[t] += later - logsumexp(log_filtered[t] + later)
+    return Marginals(np.exp(log_filtered), np.exp(log_smoothed), total)
+
+
+def _of_states(log_likelihood: Any, K: int) -> np.ndarray:
+    """(K,) the log likelihoods of the states."""
+    found = np.asarray(log_likelihood, dtype=np.float64)
+    if found.shape != (K,):
+        raise InputError(f"log_likelihood returned shape {found.shape}, expected ({K},): one number per state")
+    return found

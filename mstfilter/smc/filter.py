@@ -14,10 +14,9 @@ A step for an observation y makes these calls::
 
 With ``resample="before"``, a step also resamples after the update if there are more than n particles.
 
-`ParticleFilter.step` has one line for each stage, and `_Step` has one method for each stage. Textbook filters have no
-`proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided filters have a transition
-that also weights particles, auxiliary filters have a `lookahead`, resample-move filters have a `rejuvenation`. `step`
-is a pure function of a `State`, so a run can be stopped, stored and resumed at any step.
+Textbook filters have no `proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided
+filters have a transition that also weights particles. `step` is a pure function of a `State`, so a run can be
+stopped, stored and resumed at any step.
 """
 
 from __future__ import annotations
@@ -369,16 +368,12 @@ class _Step:
             notes=self.slot.notes,
             seconds=self.slot.seconds,
         )
-        return State(self.state.t + 1, population, self.state.key, self.state.properly_weighted), info
+        proper = self.state.properly_weighted and self.given.properly_weighted
+        return State(self.state.t + 1, population, self.state.key, proper), info
 
 
 class _Slot:
-    """Wraps a call of a component: measures wall time, and adds the step and the component to error messages.
-
-    >>> with slot("transition"):
-    ...     moved = transition.predict(rng, population, observation)
-    ...     slot.record(moved.notes)
-    """
+    """Wraps a call of a component: measures wall time, and adds the step and the component to error messages."""
 
     def __init__(self, t: int) -> None:
         self.t, self._here = t, threading.local()
@@ -434,8 +429,7 @@ def _priority(lookahead: Lookahead, population: Population, observation: Any) ->
 def keep_freed_memory() -> None:
     """Make glibc keep freed memory, by freeing one large block once per process.
 
-    After the call, glibc keeps freed arrays of up to 32 MB and does not return them to the system after every step.
-    Returning the memory would take a fifth of the time of a filter of 10,000 particles, and a third of the time of
-    resampling a million weights. Other C libraries are not affected.
+    After the call, glibc keeps freed arrays of up to 32 MB. Returning the memory would take a fifth of the time of a
+    filter of 10,000 particles. Other C libraries are not affected.
     """
     np.empty((1 << 25) - 8192, np.uint8)

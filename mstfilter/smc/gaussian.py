@@ -14,10 +14,8 @@ other part z_t is linear and Gaussian:
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
 A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_0 .. y_t. The particles are a mapping
-of arrays. The transition draws u_t and predicts the mean and covariance of z_t. The update weights by p(y_t | u_0 ..
-u_t, y_0 .. y_{t-1}) and corrects the mean and covariance. Reference: Doucet, de Freitas, Murphy, Russell (2000).
-
-`mstfilter.smc.exact` has linear models and their exact posteriors.
+of arrays. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}). Reference: Doucet, de Freitas, Murphy, Russell
+(2000).
 """
 
 from __future__ import annotations
@@ -54,7 +52,7 @@ def nonlinear_gaussian(
     """
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
-    moved, seen = _OfStep(f), _OfStep(h)
+    moved, seen = _OfStep("f", f, len(m0)), _OfStep("h", h, r.size)
     moves, sees = {**moved.parameters, **q.parameters}, {**seen.parameters, **r.parameters}
 
     def transition(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
@@ -104,21 +102,24 @@ class _Noises:
         cov = np.asarray(given, np.float64)
         self.name, self.parameters = name, {"t": True} if cov.ndim == 3 else {}
         self.entries = [_Noise(name, m, k, semidefinite) for m in (cov if self.parameters else cov[None])]
+        self.size = cov.shape[-1]
 
     def at(self, t: int = 0, u: Any = None) -> _Noise:
         return entry(self.name, self.entries, t) if self.parameters else self.entries[0]
 
 
 class _OfStep:
-    """A function of particles that may also have the parameters `t` (step) and `u` (input)."""
+    """A function of particles, (n, size), that may also have the parameters `t` (step) and `u` (input)."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function, self.parameters = function, step_parameters(function, 1)
+    def __init__(self, name: str, function: Callable[..., Any], size: int) -> None:
+        self.name, self.function, self.size = name, function, size
+        self.parameters = step_parameters(function, 1)
 
     def __call__(self, x: np.ndarray, step: dict[str, Any]) -> Any:
-        if not self.parameters:
-            return self.function(x)
-        return self.function(x, **{name: value for name, value in step.items() if name in self.parameters})
+        found = self.function(x, **{name: value for name, value in step.items() if name in self.parameters})
+        if np.shape(found) != (len(x), self.size):  # numpy might broadcast it
+            raise InputError(f"{self.name} returned shape {np.shape(found)}, expected ({len(x)}, {self.size})")
+        return found
 
 
 def entry(name: str, given: Any, t: int) -> Any:
@@ -143,10 +144,12 @@ def _covariance(name: str, given: Any, d: int | None = None, semidefinite: bool 
         expected = "(k, k)" if d is None else f"({d}, {d}) as m0 has {d} entries"
         raise InputError(f"{name} has shape {cov.shape}, expected {expected}")
     if np.allclose(cov, cov.T):
+        size = np.sqrt(np.where(np.diag(cov) > 0, np.diag(cov), 1.0))
+        values = np.linalg.eigvalsh(cov / np.outer(size, size))  # entries may have very different scales
+        if (values > 1e-14 * values.max()).all():
+            return np.linalg.cholesky(cov), False
         values, axes = np.linalg.eigh(cov)
         rounding = 1e-14 * max(values.max(), 0.0)
-        if (values > rounding).all():
-            return np.linalg.cholesky(cov), False
         if semidefinite and (values >= -rounding).all():
             return axes * np.sqrt(np.maximum(values, 0.0)), True
     kind = "semidefinite" if semidefinite else "definite"
@@ -201,10 +204,9 @@ class _Predict(Transition):
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
         """Draw u_t, then predict the mean and covariance of z_t."""
         u = self.model.sample_transition(rng, population.particles["u"])
-        m = self.model.linear(u)
-        F, n = np.asarray(m.F, np.float64), len(population)
-        mean = (F @ population.particles["mean"][..., None])[..., 0] + m.b
-        cov = F @ population.particles["cov"] @ np.swapaxes(F, -1, -2) + m.Q
+        m, n = _checked(self.model.linear(u), population.particles["mean"]), len(population)
+        mean = (m.F @ population.particles["mean"][..., None])[..., 0] + m.b
+        cov = m.F @ population.particles["cov"] @ np.swapaxes(m.F, -1, -2) + m.Q
         particles = {"u": u, "mean": mean, "cov": np.broadcast_to(cov, (n, *cov.shape[-2:]))}
         return Population(particles, population.log_weights, population.parents)
 
@@ -221,9 +223,8 @@ class _Correct(Update):
         """Weight by the predictive density N(y; H m, S), then correct mean and covariance of z_t (Joseph form)."""
         population = union(predicted, proposed)
         p: Any = population.particles
-        y = np.atleast_1d(np.asarray(observation, dtype=np.float64))
-        m = self.model.linear(p["u"])
-        H, R = np.asarray(m.H, np.float64), np.asarray(m.R, np.float64)
+        _, _, H, R, _ = _checked(self.model.linear(p["u"]), p["mean"])
+        y = vector_of("the observation", observation, R.shape[-1])
         expected = (H @ p["mean"][..., None])[..., 0]
         S = H @ p["cov"] @ np.swapaxes(H, -1, -2) + R
         root = np.linalg.cholesky(S)
@@ -236,6 +237,18 @@ class _Correct(Update):
         mean = p["mean"] + (gain @ (y - expected)[..., None])[..., 0]
         particles = {"u": p["u"], "mean": mean, "cov": cov}
         return Population(particles, population.log_weights + log_p, population.parents)
+
+
+def _checked(given: Linear, means: np.ndarray) -> Linear:
+    """The matrices as float64 arrays. Raises InputError if a shape does not fit `means` (n, d)."""
+    (n, d), b = means.shape, np.asarray(given.b, np.float64)
+    m = Linear(**{name: np.atleast_2d(np.asarray(getattr(given, name), np.float64)) for name in "FQHR"}, b=b)
+    k = m.H.shape[-2]
+    for name, shape in {"F": (d, d), "Q": (d, d), "H": (k, d), "R": (k, k), "b": (d,) * (b.ndim > 0)}.items():
+        array = getattr(m, name)  # numpy might broadcast it
+        if array.shape not in (shape, (1, *shape), (n, *shape)):
+            raise InputError(f"linear returned {name} of shape {array.shape}, expected {shape} or {(n, *shape)}")
+    return m
 
 
 def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> ParticleFilter:

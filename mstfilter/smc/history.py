@@ -1,7 +1,6 @@
 """Collectors, which record quantities of a run at every step.
 
-A collector is a function ``(state, info) -> number or array``. Each collector is called after every step. `ess`,
-`unique_ancestors`, `log_evidence`, `mean` and `resampled` are collectors.
+A collector is a function ``(state, info) -> number or array``, which is called after every step.
 
 >>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
 >>> history["ess"]                                   # (T,)

@@ -12,10 +12,8 @@ A model with parameters is a function that returns a filter:
   current parameters is kept until a proposal is accepted, so the chain converges to the exact posterior for any
   number of particles (Andrieu, Doucet, Holenstein 2010).
 - `ensemble` runs the ensemble sampler emcee with such estimates of the likelihood. It needs no scale of the steps.
-- `particle_gibbs` draws the parameters given the path of states, and then the path given the parameters.
-  `conditional_path` draws the path by a filter in which one particle follows the present path (conditional SMC). If
-  the transition has a density, the ancestors of this particle are also drawn (Lindsten, Jordan, Schön 2014).
-  Without ancestor sampling the early states of the path hardly change.
+- `particle_gibbs` draws the parameters given the path of states, and then the path by `conditional_path`. Without
+  ancestor sampling the early states of the path hardly change.
 """
 
 from __future__ import annotations
@@ -159,8 +157,8 @@ def pmmh(
 ) -> Chains:
     """Particle marginal Metropolis-Hastings: a random walk on the parameters.
 
-    More particles make the chain mix better. Choose n so that the log evidence has a standard deviation of about 1 at
-    the posterior mean (Doucet, Pitt, Deligiannidis, Kohn 2015).
+    Choose n so that the log evidence has a standard deviation of about 1 at the posterior mean (Doucet, Pitt,
+    Deligiannidis, Kohn 2015).
 
     Parameters
     ----------
@@ -174,10 +172,9 @@ def pmmh(
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
         Whether ``filter_of`` also accepts parameters (d, m), one column for each of the m particles of all chains.
-        The filters of all chains then run as one batch, see `mstfilter.smc.batching`. To combine a parameter with
-        particles (n, k), use ``theta[0][..., None]``. Some estimates are compared with single runs. If estimates
-        differ by more than rounding, a warning is issued and the filters run one by one. If they differ and a
-        component of the filter states ``batched=True``, InputError is raised.
+        The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
+        ``theta[0][..., None]``. Some estimates are compared with single runs (see `mstfilter.smc.batching`). If they
+        differ, a warning is issued and the filters run one by one.
 
     Raises
     ------
@@ -306,7 +303,7 @@ def particle_gibbs(
     thetas, paths, moved = np.empty((n_iterations, 1, len(theta))), [], 0
     for i in range(n_iterations):
         streams, old = key.child(i), theta
-        theta = np.asarray(draw(streams.child("theta").generator(), theta, path), np.float64)
+        theta = np.array(draw(streams.child("theta").generator(), theta.copy(), path), np.float64)
         if theta.shape != old.shape:
             raise InputError(f"draw returned parameters of shape {theta.shape}, expected {old.shape}")
         path = conditional_path(filter_of(theta), observations, streams, path)

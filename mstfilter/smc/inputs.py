@@ -10,8 +10,7 @@
 A model function with a parameter named ``t`` or ``u`` gets the time or the input by keyword. The first
 observation has t = 0. The transition to x_t is called with t >= 1. An observation without input needs no `WithInput`.
 
-`Component.at_step` returns the component for step t with input u. `step_functions` names the fields of a component or
-model that are functions. Components without such fields override `at_step`, or ignore time and inputs.
+`Component.at_step` returns the component for step t with input u.
 """
 
 from __future__ import annotations
@@ -51,7 +50,8 @@ def split_input(observation: Any) -> tuple[Any, Any]:
 def check_observations(observations: Iterable[Any], where: str = "") -> Any:
     """Check the type and the values of observations, and return the observations unchanged.
 
-    Raises InputError for a table, a mapping or a string, and for an observation whose entries are all NaN.
+    Raises InputError for a table, a mapping or a string, and for an observation whose entries are all NaN. Masked
+    entries also raise InputError, because the functions of models ignore masks.
 
     Iteration over a data frame or a mapping would yield names, not rows. `where` is the start of the error message.
     """
@@ -61,10 +61,13 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
             "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
         )
     if isinstance(observations, (list, tuple, np.ndarray)):
-        for t, y in enumerate(observations):
-            if (isinstance(y, float) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y)):
+        for t, given in enumerate(observations):
+            y, _ = split_input(given)
+            nan = (isinstance(y, (float, np.floating)) and y != y) or (isinstance(y, np.ndarray) and _all_nan(y))
+            if nan or np.ma.is_masked(y):
+                what = "is NaN" if nan else "has masked entries"
                 raise InputError(
-                    f"{where}observation {t} is NaN", "one that is missing is None: then the step only predicts"
+                    f"{where}observation {t} {what}", "one that is missing is None: then the step only predicts"
                 )
     return observations
 

@@ -15,13 +15,8 @@ first argument. All methods work on whole populations, so a component can share 
 ...         step = self.scale * rng.standard_normal(population.particles.shape)
 ...         return Population(population.particles + step, population.log_weights)
 
-A guided transition draws from q(x_t | x_{t-1}, y_t) instead of the model's f(x_t | x_{t-1}), and adds log f - log q
-to the log weights. `mstfilter.smc.Dynamics` makes a guided transition for any model that has densities.
-
 Every filter needs a `Proposal` for its first particles, a `Resampler` and a `Trigger`. Most filters have a
-`Transition` and an `Update`. Optional components are `Size` (number of particles), `Lookahead` (auxiliary filter),
-`Rejuvenation` (resample-move) and `Codec` (checkpoints of object particles). `DensityTransition` extends
-`Transition`, and `WeightResampler` extends `Resampler`. Models and programs use `Distribution` objects.
+`Transition` and an `Update`. Models and programs use `Distribution` objects.
 """
 
 from __future__ import annotations
@@ -57,8 +52,7 @@ class Component(AtStep, ABC):
     def properly_weighted(self) -> bool:
         """Whether unnormalised weighted sums over the result are unbiased, as in an exact particle filter.
 
-        The author of a component declares whether this holds. The default is True; write ``properly_weighted =
-        False`` in the class to change the default. `mstfilter check` tests it for resamplers. A filter
+        The author of a component declares whether this holds. `mstfilter check` tests it for resamplers. A filter
         reports the log evidence only if it has no `proposal` and all its components are properly weighted.
         """
         return True
@@ -72,9 +66,8 @@ class Component(AtStep, ABC):
     def batched(self) -> bool | None:
         """Whether the component treats each particle independently, so that it can process several runs together.
 
-        True states that the component treats each particle independently. With None, `run_many` compares a batch with
-        single runs, and makes the runs one by one if the results differ (see `mstfilter.smc.batching`). With False,
-        the default, `run_many` makes the runs one by one.
+        With None, `run_many` compares a batch with single runs, and makes the runs one by one if the results differ
+        (see `mstfilter.smc.batching`). With False, `run_many` makes the runs one by one.
         """
         return False
 
@@ -216,8 +209,8 @@ class Equivalence(Bounded, ABC):
 class Lookahead(Component):
     """Gives each particle a priority by the next observation, before the selection (auxiliary filter).
 
-    The filter selects by log weight + log priority, and subtracts the log priority from the log weights of the
-    selected particles. The filter is exact for any priority. A good priority is close to log p(y_t | x_{t-1}).
+    The filter subtracts the log priority from the log weights of the selected particles, so it is exact for any
+    priority. A good priority is close to log p(y_t | x_{t-1}).
     """
 
     @abstractmethod
@@ -242,18 +235,10 @@ class Rejuvenation(Component):
 
 
 class Distribution(ABC):
-    """A distribution over the values of particles.
+    """A distribution over the values of particles."""
 
-    Attributes
-    ----------
-    discrete : bool
-        Whether the values are integers or booleans.
-    draws_numbers : bool
-        Whether draws are never NaN. If False, programs check the draws for NaN.
-    """
-
-    discrete = False
-    draws_numbers = False
+    discrete = False  #: whether the values are integers or booleans
+    draws_numbers = False  #: whether draws are never NaN. If False, programs check the draws for NaN
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -312,7 +297,7 @@ class State:
     t: int  #: number of observations so far
     population: Population | None  #: the particles after the last observation; None before the first
     key: Key  #: names the random streams of the run
-    properly_weighted: bool = True  #: whether the filter is properly weighted
+    properly_weighted: bool = True  #: whether the filters of all steps are properly weighted
 
     def __repr__(self) -> str:
         evidence = "" if self.log_evidence is None else f", log evidence {self.log_evidence:.4g}"

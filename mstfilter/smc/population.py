@@ -9,10 +9,8 @@ array([0.25, 0.25, 0.5 ])
 2.667
 
 Particles are an array (n, ...), a mapping of arrays (n, ...), a tuple of frozen objects, or `Candidates`, which build
-particles on access. `take` selects particles of any type: array rows are copied, and objects are shared.
-
-A population is immutable. A population does not copy the given arrays but stores read-only views of the arrays. If
-you write to an array later, pass ``array.copy()`` to the population.
+particles on access. A population is immutable. It stores read-only views of the given arrays. If you write to an
+array later, pass ``array.copy()`` to the population.
 """
 
 from __future__ import annotations
@@ -61,8 +59,8 @@ class Candidates(Sequence[_T], Generic[_T]):
     """Particles ``build(index)`` that are built at the first access and then stored.
 
     In MST the weight of a candidate is known before the candidate is built, so only selected candidates are built.
-    `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) are the
-    indices of the candidates in order; repeated indices are allowed. An integer n stands for the indices 0 .. n-1.
+    `build` must return the same particle at every call with the same index, from any thread. `indices` (n,) may
+    repeat; an integer n stands for the indices 0 .. n-1.
     """
 
     def __init__(
@@ -388,7 +386,10 @@ def _kind(particles: Particles) -> str:
 
 
 def union(predicted: Population | None, proposed: Population | None) -> Population:
-    """Join predicted and proposed particles, with their weights and parents. One of the populations may be None."""
+    """Join predicted and proposed particles, with their weights and parents. One of the populations may be None.
+
+    Raises InputError if both are None, or if particles that are mappings have different variables.
+    """
     if predicted is None or proposed is None:
         population = predicted if predicted is not None else proposed
         if population is None:
@@ -399,6 +400,10 @@ def union(predicted: Population | None, proposed: Population | None) -> Populati
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         particles = np.concatenate([a, b])
     elif isinstance(a, Mapping) and isinstance(b, Mapping):
+        if a.keys() != b.keys():
+            raise InputError(
+                f"predicted and proposed particles have the variables {sorted(a)} and {sorted(b)}, expected the same"
+            )
         particles = {name: np.concatenate([a[name], b[name]]) for name in a}
     else:
         particles = (*a, *b)

@@ -20,15 +20,11 @@ Killing         survive with w_i / max w, else multinomial         see `Killing`
 array([0, 0, 1, 2])
 
 Weights need not sum to 1, may have any float type, and may be zero (log weight -inf). n may differ from the number of
-weights. A particle of weight zero is never selected. Log weights of NaN or +inf, or only zero weights, raise
-`InputError`.
+weights. A particle of weight zero is never selected. The `select` method of your own `WeightResampler` can use
+`inverse_cdf`, `independent_draws` and `draw_rows`.
 
-Three functions invert the cumulative weights: `inverse_cdf` takes one point in each of n equal strata,
-`independent_draws` takes n independent points, and `draw_rows` takes one point for each row of a matrix. The `select`
-method of your own `WeightResampler` can use these functions.
-
-Of several particles with equal weights, `LargestWeights`, `coalesce` and `leader_clusters` take the first. Random
-schemes do not compare weights.
+Of several particles with equal weights, `LargestWeights` and `leader_clusters` take the first. Random schemes do not
+compare weights.
 
 References: Douc, Cappe, Moulines (2005), "Comparison of resampling schemes for particle filtering"; Kitagawa (1996);
 Liu and Chen (1998).
@@ -317,10 +313,9 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
     """(n,) indices drawn independently by weight. Uniform points are first distributed among equal strata of [0, 1).
 
-    For 10^6 points, the function is four times as fast as a binary search.
-
-    Each stratum is divided into bins. The number of cumulative weights in the bins below that of a point is a lower
-    bound of the index, which is then increased if necessary.
+    For 10^6 points, the function is four times as fast as a binary search. Each stratum is divided into bins. The
+    number of cumulative weights in the bins below that of a point is a lower bound of the index, which is then
+    increased if necessary.
     """
     # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
     bits = 62 - max(n.bit_length() - 14, 0)

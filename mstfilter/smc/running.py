@@ -9,10 +9,9 @@
 >>> runs["log_evidence"].shape                         # (arm, seed, time)
 (2, 20, 50)
 
-Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other filters. If
-the components of a filter treat each particle independently, the runs of the filter are processed together as arrays
-(see `mstfilter.smc.batching`). Otherwise the runs are made one by one. Run k of every filter has the same seed and
-random streams, so differences between filters have less noise.
+Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other filters. Runs
+are processed together as arrays if possible (see `mstfilter.smc.batching`). Run k of every filter has the same seed
+and random streams, so differences between filters have less noise.
 """
 
 from __future__ import annotations
@@ -57,9 +56,8 @@ def run_many(
     seeds : iterable of int
         Different non-negative integers.
     workers : int
-        Number of processes. With 1, all runs are made in the calling process. Otherwise joblib's loky starts workers
-        as new interpreters. Workers get the filters by cloudpickle, and limit numerical libraries to one thread. If a
-        worker dies, InputError names the runs that may have caused it.
+        Number of processes. With 1, all runs are made in the calling process. Otherwise joblib's loky starts workers,
+        which get the filters by cloudpickle. If a worker dies, InputError names the runs that may have caused it.
     progress : bool or callable
         True shows a progress bar. A function is called as ``progress(done, total)`` whenever runs finish.
     **collectors
@@ -189,7 +187,8 @@ class _Job:
         check_one_shape(name, [row.shape[1:] for row in rows if len(row)])
         complete = all(len(row) == n_steps for row in rows)
         empty = -np.inf if self.collectors[name] is log_evidence else np.nan
-        kind = longest.dtype if complete else np.result_type(longest.dtype, np.float64)
+        kinds = {row.dtype for row in rows if len(row)} or {longest.dtype}
+        kind = np.result_type(*kinds, *([] if complete else [np.float64]))
         values = np.full((len(rows), n_steps, *longest.shape[1:]), 0 if complete else empty, kind)
         for value, row in zip(values, rows, strict=True):
             value[: len(row)] = row if len(row) else 0

@@ -6,12 +6,11 @@
 
 Three smoothers take a `Record` and return a tuple with one population per time:
 
-- `genealogy` follows the ancestors of the last particles (Kitagawa 1996), and needs only the record. After many
-  resamplings, all paths have the same early states (path degeneracy).
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). `fixed_lag` keeps
-  more distinct particles, but is biased if a state depends on observations more than `lag` steps later.
-- `backward_paths` draws paths backwards by the density of the transition (Godsill, Doucet, West 2004, FFBSi), without
-  path degeneracy. A step evaluates N densities per path, or a few densities with ``method="mcmc"``.
+- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). After many resamplings, all paths have the
+  same early states (path degeneracy).
+- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It is biased if a
+  state depends on observations more than `lag` steps later.
+- `backward_paths` draws paths backwards by the density of the transition, without path degeneracy.
 
 The smoothers accept any properly weighted filter, including filters with guided moves, a lookahead or rejuvenation.
 
@@ -123,14 +122,12 @@ def backward_paths(
     transition : DensityTransition
         The transition of the model, ``Dynamics(model)``. A transition with a proposal must not be used.
     method : "exact" or "mcmc"
-        "exact" (Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
+        "exact" (FFBSi: Godsill, Doucet, West 2004) evaluates n N densities per step: all N particles for each path.
 
         "mcmc" (Bunch and Godsill 2013) starts at the parent of x_{t+1} in the record and makes Metropolis steps that
         leave the distribution of "exact" invariant. The method evaluates (1 + `steps`) n densities per time, and the
-        record must have parents. Few steps suffice (Dau and Chopin 2023): if a bootstrap filter selects by
-        `Multinomial`, the parent of x_{t+1} already has the distribution of "exact". With other schemes, its
-        distribution has an error of order 1 / N. More steps reduce the variance. Without accepted steps, the paths
-        are those of `genealogy`.
+        record must have parents. Few steps suffice (Dau and Chopin 2023): the parent of x_{t+1} has the distribution
+        of "exact" up to an error of order 1 / N. Without accepted steps, the paths are those of `genealogy`.
     steps : int
         Number of Metropolis steps of "mcmc".
     """

@@ -12,15 +12,13 @@
 
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
 resampler=...)``. The first observation updates the initial state before any prediction.
-
-The function `metropolis` makes the Metropolis-Hastings steps of particles (`RandomWalkMove`), parameters (`pmmh`)
-and ancestors (`backward_paths`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -66,8 +64,7 @@ class StateSpaceModel(AtStep):
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     batched : bool or None
-        Whether the functions treat each particle independently, so that one call can process the particles of many
-        runs (see `mstfilter.smc.batching`). With None, `run_many` tests the independence.
+        Whether the functions treat each particle independently (see `Component.batched`).
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -101,7 +98,8 @@ class StateSpaceModel(AtStep):
                 )
 
         def sample(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
-            return as_distribution(transition(x, **step)).sample(rng, count_particles(x))
+            new = as_distribution(transition(x, **step)).sample(rng, count_particles(x))
+            return _of_shape("transition", new, x)
 
         def log_density(previous: Any, new: Any, **step: Any) -> np.ndarray:
             return as_distribution(transition(previous, **step)).log_prob(new)
@@ -114,7 +112,7 @@ class StateSpaceModel(AtStep):
             first.sample,
             with_step(sample, moves),
             with_step(log_likelihood, observes),
-            first.log_prob,
+            partial(_log_initial, first),
             with_step(log_density, moves),
             batched=None,
         )
@@ -131,6 +129,23 @@ class StateSpaceModel(AtStep):
                 "give StateSpaceModel its log densities, or use .of(); a singular covariance has none",
             )
         return found
+
+
+def _of_shape(what: str, new: np.ndarray, old: Any) -> np.ndarray:
+    """The new particles. Raises InputError if their shape differs, because numpy might broadcast them."""
+    if isinstance(old, np.ndarray) and np.shape(new) != old.shape:
+        raise InputError(
+            f"the {what} returned shape {np.shape(new)}, expected {old.shape} as the particles before",
+            "x[:, None] makes (n, 1) of (n,)",
+        )
+    return new
+
+
+def _log_initial(distribution: Distribution, x: Any) -> np.ndarray:
+    """(n,) log p(x_0). Checks the shape of the particles, which a proposal may have drawn."""
+    if np.shape(x)[1:] != distribution.event_shape:
+        raise InputError(f"particles have shape {np.shape(x)}, expected the event shape {distribution.event_shape}")
+    return distribution.log_prob(x)
 
 
 def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
@@ -208,7 +223,7 @@ class Dynamics(_OfModel, DensityTransition):
         if self.proposal is None or observation is None:
             return population.moved(self.model.sample_transition(rng, old))
         q = as_distribution(self.proposal(old, observation))
-        new = q.sample(rng, len(population))
+        new = _of_shape("proposal", q.sample(rng, len(population)), old)
         gain = self.model.density("log_transition")(old, new) - q.log_prob(new)
         return Population(new, population.log_weights + gain, population.parents)
 
@@ -242,8 +257,7 @@ class RandomWalkMove(Rejuvenation):
 
     ``notes["accepted"]`` is the acceptance rate.
 
-    After a resampling several particles share a parent. The Metropolis kernel separates these particles and leaves
-    p(x_t | x_{t-1}, y_t) invariant. The weights do not change.
+    The Metropolis kernel leaves p(x_t | x_{t-1}, y_t) invariant. The weights do not change.
 
     Parameters
     ----------
@@ -288,6 +302,10 @@ class RandomWalkMove(Rejuvenation):
 
     def _step(self, rng: np.random.Generator, x: Particles) -> Particles:
         if isinstance(x, np.ndarray):
+            if x.dtype.kind != "f":
+                raise InputError(
+                    f"particles are {x.dtype}, expected floats", "write a Rejuvenation for discrete states"
+                )
             return x + self.scale * rng.standard_normal(x.shape)
         return {name: self._step(rng, a) for name, a in x.items()}
 
@@ -369,16 +387,8 @@ def guided(
 ) -> ParticleFilter:
     """The guided filter, which moves by a proposal q(x_t | x_{t-1}, y_t) and weights by f p(y_t | x_t) / q.
 
-    Parameters
-    ----------
-    model : StateSpaceModel
-        The model with its log densities.
-    proposal : callable
-        ``(particles, y) -> distribution`` q of x_t; None means the transition f of the model.
-    initial : callable, optional
-        ``(y) -> distribution`` of x_0; the default is the prior of the model.
-    **components
-        Other fields of `ParticleFilter`, such as ``resampler`` or ``trigger``.
+    The model needs its log densities. `proposal` is as in `Dynamics`, and None means the transition f of the model.
+    `initial` is as the proposal of `Prior`. `components` are other fields of `ParticleFilter`, such as ``resampler``.
     """
     return replace(
         bootstrap(model, n), initial=Prior(model, initial), transition=Dynamics(model, proposal), **components
@@ -397,15 +407,11 @@ def auxiliary(
 
     Parameters
     ----------
-    model : StateSpaceModel
-        The model, with its log densities if `proposal` is given.
     log_priority : callable
         ``(particles, y) -> (n,)``, close to log p(y_t | x_{t-1}). The filter is exact for any finite priority.
-    proposal, initial : callable, optional
+    proposal, initial, **components
         As in `guided`. With priority p(y_t | x_{t-1}) and proposal p(x_t | x_{t-1}, y_t), the filter is fully
         adapted.
-    **components
-        As in `guided`.
     """
     return replace(guided(model, proposal, n, initial, **components), lookahead=PriorityLookahead(log_priority))
 

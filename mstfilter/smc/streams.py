@@ -12,8 +12,7 @@ A `Key` consists of a seed and a tuple, and can be stored in a file. The generat
 256-bit seed of a generator is a SHAKE-128 hash (FIPS 202) of the key. Streams of different keys are independent if
 the hash behaves like a random function. Two of a billion streams have equal seeds with probability below 1e-50.
 
-A batched component is called once for R runs of n particles. The particles are `Rows`: arrays (R n, ...), with the n
-rows of run 0 first. `RunGenerators` draws the rows of run r from the generator of run r.
+For batched components, `Rows` are the particles of R runs, and `RunGenerators` are the generators of the runs.
 """
 
 from __future__ import annotations
@@ -178,9 +177,8 @@ class _SeedsInTurn(ISeedSequence):
 class RunGenerators:
     """The generators of R runs, for batched components. The generator of run r draws row r of every array.
 
-    ``standard_normal``, ``random`` and ``standard_exponential`` are fast. Any other method of
-    `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. If `n` is
-    given, arrays have n rows for each run, and a first axis of length R n.
+    A method of `numpy.random.Generator` works if its size, or one of its arguments, has a first axis of length R. If
+    `n` is given, arrays have n rows for each run, and a first axis of length R n.
     """
 
     def __init__(self, generators: list[np.random.Generator], n: int | None = None) -> None:

@@ -24,7 +24,7 @@ from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
 from mstfilter.smc.interfaces import Equivalence, Resampler
 from mstfilter.smc.population import Population, as_matrix
-from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, checked_weights
+from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, checked_weights, search
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ class Shuffled(ResamplerWrapper):
 class Coalesced(ResamplerWrapper):
     """Merges particles that are equal by `equivalence`, and sums their weights, before the selection.
 
-    The heaviest particle of each class is kept (the first of several). The result represents the same distribution
-    with fewer particles. The number of particles grows again only if a transition or update makes more candidates.
-    ``notes["distinct"]`` is the number of different particles of positive weight.
+    One particle of each class is kept, drawn by weight, so the paths of the particles and functions of unequal
+    particles have no bias. The number of particles grows again only if a transition or update makes more candidates.
+    ``notes["distinct"]`` is the number of classes of positive weight.
     """
 
     scheme: Resampler = FearnheadClifford()  # noqa: RUF009 (frozen)
@@ -133,27 +133,27 @@ class Coalesced(ResamplerWrapper):
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         population = population.realised()
         classes = self.equivalence.classes(population.particles)
-        representatives, log_weights = coalesce(population.log_weights, classes)
+        representatives, log_weights = coalesce(rng, population.log_weights, classes)
         chosen = self.scheme.resample(rng, population.take(representatives, log_weights), n)
         ancestors = representatives[chosen.parents["ancestor"]]
         return chosen.with_ancestors(ancestors, distinct=len(representatives))
 
 
-def coalesce(log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Select the heaviest particle of each class, with the total weight of the class.
+def coalesce(rng: np.random.Generator, log_weights: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Draw one particle of each class by weight, with the total weight of the class.
 
-    Returns the representatives (k,) in ascending order and their log weights (k,). If several particles have equal
-    weights, the first is the representative. With m particles and k classes, the output log weight of a class of
-    total weight w is ``log(w k / m)``, so the mean weight does not change. Classes of weight zero are omitted.
+    Returns the representatives (k,) in ascending order and their log weights (k,). With m particles and k classes,
+    the output log weight of a class of total weight w is ``log(w k / m)``, so the mean weight does not change.
+    Classes of weight zero are omitted. Classes of one particle need no random number.
     """
     lw = np.asarray(log_weights, dtype=np.float64)
-    classes = np.asarray(classes)
-    mass = np.bincount(classes, np.exp(lw - lw.max()))
-    heaviest = np.lexsort((np.arange(len(lw)), -lw, classes))
-    first = np.concatenate([[True], np.diff(classes[heaviest]) > 0])
-    representatives = heaviest[first]
-    representatives = np.sort(representatives[mass[classes[representatives]] > 0])
-    total = np.log(mass[classes[representatives]]) + lw.max()
+    classes, weights = np.asarray(classes), np.exp(lw - lw.max())
+    positive = np.flatnonzero(weights)
+    order = positive[np.argsort(classes[positive], kind="stable")]
+    groups = np.split(order, np.flatnonzero(np.diff(classes[order])) + 1)
+    drawn = [g[0] if len(g) == 1 else g[search(weights[g], rng.random(1))[0]] for g in groups]
+    representatives = np.sort(np.array(drawn))
+    total = np.log(np.bincount(classes, weights)[classes[representatives]]) + lw.max()
     return representatives, total + np.log(len(representatives) / len(lw))
 
 

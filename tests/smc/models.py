@@ -50,7 +50,6 @@ def predictive(x, y):
 
 def kalman_ar1(ys):
     """(T, 2) filtered means and variances, and the log evidence. None in `ys` is a missing observation."""
-    pytest.importorskip("filterpy.kalman")
     found = kalman_filter([[RHO]], [[SIGMA**2]], [[1.0]], [[TAU**2]], [0.0], [[SD0**2]], ys)
     return np.stack([found.means[:, 0], found.covariances[:, 0, 0]], axis=1), float(found.log_evidence[-1])
 

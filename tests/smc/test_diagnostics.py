@@ -11,6 +11,7 @@ from scipy import stats
 from mstfilter.errors import InputError
 from mstfilter.smc import (
     Branching,
+    Coalesced,
     Dynamics,
     EssBelow,
     FearnheadClifford,
@@ -19,6 +20,7 @@ from mstfilter.smc import (
     Multinomial,
     Never,
     Population,
+    Shuffled,
     Systematic,
     bootstrap,
     energy_distance,
@@ -114,6 +116,8 @@ def test_wrong_calls_are_named():
         (lambda: run_variance(bootstrap(AR1, 10), YS, lag=0), "lag is 0"),
         (lambda: run_variance(bootstrap(AR1, 1), YS), "at least 2 particles"),
         (lambda: run_variance(bootstrap(AR1, 10, KeepWeights()), YS), "not properly weighted"),
+        (lambda: run_variance(bootstrap(hmm("vector"), 10, Coalesced()), [0, 2]), "Coalesced merges particles"),
+        (lambda: run_variance(bootstrap(AR1, 10, Shuffled(Coalesced())), YS), "Coalesced merges particles"),
         (lambda: run_variance(bootstrap(AR1, 10), YS, function=lambda p: p.mean()), "one row per particle"),
     ):
         with pytest.raises(InputError, match=message):
@@ -143,6 +147,8 @@ def test_it_is_its_definition(shape):
     a, b = populations(shape)
     assert energy_distance(a, b) == pytest.approx(by_definition(a, b), abs=1e-12)
     assert energy_distance(a, a) == pytest.approx(0.0, abs=1e-12)
+    absent = Population(np.concatenate([a.particles, a.particles[:1] * np.nan]), np.append(a.log_weights, -np.inf))
+    assert energy_distance(absent, b) == pytest.approx(energy_distance(a, b))  # a particle of weight 0 has no effect
     if shape == ():
         scipy = stats.energy_distance(a.particles, b.particles, a.weights, b.weights)
         assert energy_distance(a, b) == pytest.approx(scipy**2)

@@ -45,6 +45,31 @@ def test_log_prob_is_that_of_scipy(ours, theirs):
         np.testing.assert_allclose(ours.log_prob(values), expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.int8, np.uint16, np.int64])
+def test_integer_parameters_and_values_are_real_numbers(kind):
+    """Against scipy: integers of few bits must neither wrap nor get logarithms of few digits."""
+    a, b, x = (np.array(v, dtype=kind) for v in ([3, 100, 7], [5, 120, 90], [1, 90, 100]))
+    large = np.full((1, 300), 1 / 300)
+    for ours, theirs in (
+        (Normal(a, b), stats.norm(a.astype(float), b.astype(float))),
+        (Normal(a, 2.0), stats.norm(a.astype(float), 2.0)),
+        (Normal(5, 120), stats.norm(5, 120)),
+        (Normal(kind(5), kind(120)), stats.norm(5, 120)),
+        (Student(a, b, a), stats.t(a.astype(float), b.astype(float), a.astype(float))),
+        (Uniform(a, b), stats.uniform(a.astype(float), (b - a).astype(float))),
+        (Bernoulli(np.array([1, 0, 1], kind)), stats.bernoulli([1, 0, 1])),
+        (Categorical(large), stats.randint(0, 300)),
+    ):
+        expected = theirs.logpmf(x) if ours.discrete else theirs.logpdf(x.astype(float))
+        np.testing.assert_allclose(ours.log_prob(x), expected, rtol=1e-12, err_msg=repr(ours))
+        assert ours.sample(np.random.default_rng(0), 3).dtype.kind in "fib"
+    np.testing.assert_allclose(Normal(a, 2.0).log_prob(300), stats.norm(a.astype(float), 2.0).logpdf(300))
+    wide = Uniform(np.array([-100, 0], np.int8), np.array([100, 120], np.int8))
+    np.testing.assert_allclose(wide.log_prob([50.0, 50.0]), -np.log([200.0, 120.0]))
+    np.testing.assert_allclose(wide.mean, [0.0, 60.0])
+    assert (np.abs(wide.sample(np.random.default_rng(0), 2)) <= 120).all()
+
+
 @pytest.mark.parametrize(("ours", "theirs"), CASES, ids=IDS)
 def test_draws_have_the_law(ours, theirs):
     """Kolmogorov-Smirnov, or chi-square for discrete ones, at a false-alarm rate of 1e-4."""
@@ -205,6 +230,10 @@ def test_a_value_of_nan_has_no_density(ours, theirs):
 def test_parameters_that_do_not_fit_together():
     with pytest.raises(InputError, match=r"shapes \(4, 2\) and \(4,\) do not fit together"):
         Normal(np.zeros((4, 2)), np.ones(4)).sample(np.random.default_rng(0), 4)
+    for shapes in (((4, 1), (4,)), ((4,), (4, 1))):  # numpy would make (4, 4)
+        with pytest.raises(InputError, match="do not fit together"):
+            Normal(*map(np.ones, shapes)).sample(np.random.default_rng(0), 4)
+    assert Normal(np.zeros((4, 1)), np.ones(3)).event_shape == (3,)
     with pytest.raises(InputError, match=r"mean of shape \(1,\) does not fit a covariance of shape \(2, 2\)"):
         MultivariateNormal([0.0], COV)
     with pytest.raises(InputError, match=r"mean of shape \(4,\) does not fit a covariance of shape \(1, 1\)"):

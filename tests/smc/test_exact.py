@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 from mstfilter.errors import InputError
-from mstfilter.smc import forward_backward, hidden_markov, kalman_filter
+from mstfilter.smc import bootstrap, forward_backward, hidden_markov, kalman_filter
 from tests.smc.models import EMIT, MOVES, START
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R
 
@@ -73,6 +74,33 @@ def test_kalman_is_the_conditioned_joint_gaussian(d, k, changing, missing):
         np.testing.assert_allclose(found.smoothed_covariances[t], cov[block, block], atol=1e-9)
 
 
+@pytest.mark.parametrize("case", ["full rank", "singular Q and P0", "no noise at first", "exact observations"])
+def test_kalman_does_not_depend_on_units(case):
+    """The joint Gaussian in even units, and the same model in units that differ by 1e8 for the entries."""
+    rng, T, d, ys = np.random.default_rng(5), 6, 3, [0.3, -0.8, None, 1.4, 0.2, -0.1]
+    F, H = rng.normal(size=(d, d)) / 2, rng.normal(size=(2, d))
+    root = rng.normal(size=(d, 1 if case == "singular Q and P0" else d))
+    Q, R, P0 = root @ root.T, 0.1 * np.eye(2), np.diag([1.0, 0.0, 2.0])
+    P0 = np.zeros((d, d)) if case == "no noise at first" else P0
+    R = np.zeros((2, 2)) if case == "exact observations" else R
+    ys = [None if y is None else np.array([y, 1 - y]) for y in ys]
+    m0, x, y = rng.normal(size=d), np.array([1e4, 1.0, 1e-4]), np.array([1e3, 1e-5])  # units of state and observation
+    xx, yy = np.outer(x, x), np.outer(y, y)
+    units = F * np.outer(x, 1 / x), Q * xx, H * np.outer(y, 1 / x), R * yy, x * m0, P0 * xx
+    found = kalman_filter(*units, [None if value is None else y * value for value in ys])
+    for t in range(T):
+        mean, cov, log_p = conditioned(*([a] * T for a in (F, Q, H, R)), m0, P0, ys, t)
+        block = slice(t * d, t * d + d)
+        np.testing.assert_allclose(found.means[t] / x, mean[t], atol=1e-8)
+        np.testing.assert_allclose(found.covariances[t] / xx, cov[block, block], atol=1e-8)
+        n = sum(value is not None for value in ys[: t + 1])
+        assert found.log_evidence[t] == pytest.approx(log_p - n * np.log(y).sum(), abs=1e-6)
+    for t in range(T):
+        block = slice(t * d, t * d + d)
+        np.testing.assert_allclose(found.smoothed_means[t] / x, mean[t], atol=1e-8)
+        np.testing.assert_allclose(found.smoothed_covariances[t] / xx, cov[block, block], atol=1e-8)
+
+
 def log_emit(y):
     with np.errstate(divide="ignore"):
         return np.log(EMIT[:, y])
@@ -111,6 +139,20 @@ def test_zeros_and_tiny_likelihoods_do_not_underflow():
     assert found.filtered[0].tolist() == [1.0, 0.0, 0.0]
 
 
+def test_a_state_that_is_improbable_at_first_explains_all_later():
+    """Probabilities of 1e-200, twice, and likelihoods of e^-400: sums over paths with logarithms of all terms."""
+    start, moves = np.array([1.0, 1e-200, 0.0]), np.array([[1.0, 1e-200, 0.0], [0.0, 1.0, 1e-200], [0.0, 0.0, 1.0]])
+    table = np.array([[0.0, -np.inf, -5.0], [0.0, -400.0, 2.0], [-1e4, -3e3, -2e3], [-9e3, -8e3, -7.0]])
+    found, paths = forward_backward(start, moves, lambda y: table[y], range(4)), list(product(range(3), repeat=4))
+    with np.errstate(divide="ignore"):
+        a, b = np.log(start), np.log(moves)
+    terms = np.array([a[p[0]] + sum(b[i, j] for i, j in pairwise(p)) + sum(table[range(4), p]) for p in paths])
+    assert found.log_evidence[-1] == pytest.approx(logsumexp(terms), abs=1e-9)
+    for t in range(4):
+        expected = [np.exp(logsumexp(terms[[p[t] == k for p in paths]]) - logsumexp(terms)) for k in range(3)]
+        np.testing.assert_allclose(found.smoothed[t], expected, rtol=1e-9)
+
+
 def test_draws_of_a_hidden_markov_model_have_its_probabilities():
     """Chi-square of 20,000 draws per row, false alarm 1e-6 a row; a state of probability 0 is never drawn."""
     moves = np.array([[0.0, 0.7, 0.3], [0.2, 0.8, 0.0], [1.0, 0.0, 0.0]])
@@ -131,6 +173,9 @@ def test_draws_of_a_hidden_markov_model_have_its_probabilities():
         (lambda: kalman_filter(np.eye(3), Q, H, R, M0, P0, [0.0]), r"F has shape \(3, 3\), expected \(2, 2\)"),
         (lambda: kalman_filter(F, Q, H, R, M0, np.eye(1), [0.0]), "P0 has shape"),
         (lambda: kalman_filter(F, Q, H, R, M0, P0, [0.0, [1.0, 2.0]]), "observation 1 has shape"),
+        (lambda: kalman_filter(F, -Q, H, R, M0, P0, [0.0]), "Q is .*, expected a covariance"),
+        (lambda: kalman_filter(F, Q, H, [[0.0]], M0, 0 * P0, [0.0]), "H P H' . R of observation 0 is singular"),
+        (lambda: bootstrap(hidden_markov([0.5, 0.5], np.eye(2), log_emit), 5).run([0]), r"log_likelihood .* \(3,\)"),
         (lambda: hidden_markov([0.5, 0.6], np.eye(2), log_emit), "sum to 1"),
         (lambda: hidden_markov([0.5, 0.5], np.eye(3), log_emit), r"transition has shape \(3, 3\)"),
         (lambda: forward_backward(START, np.eye(2), log_emit, [0]), "transition has shape"),

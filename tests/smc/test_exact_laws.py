@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.smc import (
+    Bins,
     Chopthin,
     ClusterStratified,
     Coalesced,
@@ -175,12 +176,32 @@ def test_clusters(n, least_mass):
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_shuffled_and_coalesced(n):
-    """All orders of the particles; equal ones merged, whose weight the heaviest carries."""
+    """All orders of the particles; equal ones are merged, and each carries its weight on average."""
     population = of([1.0, 2.0, 1.0, 3.0], [1.0, 2.0, 3.0, 2.0])
     found = carried(Shuffled(), population, n, cells=8)
     np.testing.assert_allclose(found, np.exp(population.log_weights) / 4, atol=1e-12)
-    found = carried(Coalesced(Systematic()), population, n, cells=8)
-    np.testing.assert_allclose(found, np.array([0.0, 2.0, 4.0, 2.0]) / 4, atol=1e-12)
+    for scheme in (Coalesced(Systematic()), Tempered(Coalesced(Systematic()), 0.0)):
+        population = of([1.0, 2.0, 1.0, 3.0, 4.0], [1.0, 2.0, 3.0, 2.0, 0.0])
+        found = carried(scheme, population, n, cells=8)
+        np.testing.assert_allclose(found, np.exp(population.log_weights) / 5, atol=1e-12)
+
+
+def test_distinct_particles_take_no_random_numbers():
+    """Particles that all differ are merged by nothing, so the stream of the inner scheme is the same."""
+    population = of([1.0, 2.0, 4.0, 3.0], [1.0, 2.0, 3.0, 2.0])
+    chosen = [s.resample(np.random.default_rng(3), population, 3) for s in (Systematic(), Coalesced(Systematic()))]
+    np.testing.assert_array_equal(*(c.parents["ancestor"] for c in chosen))
+
+
+@pytest.mark.parametrize("weights", [(1.0, 3.0, 0.0, 4.0), (1.0, 3.0, 2.0, 2.0)])
+def test_bins_do_not_bias_the_mean_of_a_function(weights):
+    """A bin of unequal particles: the weighted mean does not change on average. The heaviest would bias it."""
+    population = of([0.1, 0.9, 0.5, 1.5], weights)
+    total = sum(
+        p * np.exp(chosen.log_weights) @ chosen.particles / len(chosen)
+        for p, chosen in outcomes(lambda r: Coalesced(Systematic(), Bins()).resample(r, population, 3), cells=24)
+    )
+    assert total == pytest.approx(np.array(weights) @ population.particles / 4, abs=1e-12)
 
 
 CHOPPED = [(1.0, 4.0, 1.0, 2.0), (40.0, 1.0, 1.0, 2.0), (3.0, 3.0), (1.0,), (0.0, 1.0, 12.0)]

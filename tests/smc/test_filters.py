@@ -150,6 +150,14 @@ def test_densities_of_transitions():
         guided(bare, optimal, 5).run(YS, 0)
 
 
+def test_a_random_walk_refuses_integers():
+    """A step of real numbers would leave the states of a chain."""
+    for kind, message in (("vector", "particles are int64"), ("mapping", "particles are int64")):
+        model = hmm(kind)
+        with pytest.raises(InputError, match=f"step 1, rejuvenation: {message}, expected floats"):
+            resample_move(model, RandomWalkMove(model, 0.5), 20, trigger=Always()).run([0, 2], 0)
+
+
 @dataclass(frozen=True)
 class Alternating(Size):
     """90 particles where the effective sample size is low, 30 where it is high."""
@@ -182,7 +190,10 @@ def test_evidence_of_improper_parts_is_not_reported():
     assert bootstrap(AR1, 5, Top()).run(YS)[0].log_evidence is None
     filter = replace(bootstrap(AR1, 5), lookahead=Guess(predictive))
     assert filter.run(YS)[0].log_evidence is None
-    assert bootstrap(AR1, 5).run(YS)[0].log_evidence is not None
+    proper = bootstrap(AR1, 5)
+    assert proper.run(YS)[0].log_evidence is not None
+    for first, second in ((proper, bootstrap(AR1, 5, Top())), (bootstrap(AR1, 5, Top()), proper)):
+        assert second.run(YS[4:], first.run(YS[:4])[0])[0].log_evidence is None
 
 
 def test_wrong_parts_are_named_with_step_and_slot():
@@ -196,3 +207,26 @@ def test_wrong_parts_are_named_with_step_and_slot():
         nan.run(YS)
     with pytest.raises(InputError, match="needs the next observation"):
         replace(auxiliary(AR1, predictive, 5), resample="after")
+
+
+def test_a_proposal_draws_the_shape_of_the_state():
+    """numpy would broadcast (n, 1) against (n,), and sum over all pairs of particles."""
+    scalar = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+    vector = StateSpaceModel.of(
+        Normal(np.zeros((1, 2)), 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x[:, 0], 1.0)
+    )
+    own = replace(scalar, log_transition=lambda old, new: -np.square(new - old).reshape(len(new), -1).sum(axis=1))
+    for model, proposal, initial, message in (
+        (scalar, lambda x, y: Normal(x[:, None], 1.0), None, "1, transition: the proposal returned"),
+        (own, lambda x, y: Normal(x[:, None], 1.0), None, "1, transition: the proposal returned"),
+        (scalar, None, lambda y: Normal(np.full((1, 1), y), 1.0), "0, initial: particles have"),
+        (vector, None, lambda y: Normal(np.full((1, 1), y), 1.0), "0, initial: particles have"),
+        (vector, lambda x, y: Normal(x[:, 0], 1.0), None, "1, transition: the proposal returned"),
+    ):
+        with pytest.raises(InputError, match=f"step {message} .*shape"):
+            guided(model, proposal, 6, initial).run([0.1, 0.2])
+    growing = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(x[:, None], 0.5), lambda x: Normal(x.T[0].T, 1.0))
+    with pytest.raises(
+        InputError, match=r"step 1, transition: the transition returned shape \(6, 1\), expected \(6,\)"
+    ):
+        bootstrap(growing, 6).run([None, None])

@@ -82,3 +82,17 @@ def test_what_a_gaussian_model_rejects():
     ):
         with pytest.raises(InputError, match=message):
             nonlinear_gaussian(f, matrices[0], h, matrices[1], [0.0], [[1.0]])
+    uneven, x = np.diag([1e8, 1e-8]), np.zeros((1, 2))
+    model = nonlinear_gaussian(lambda x: x, uneven, lambda x: x, uneven, [0.0, 0.0], uneven)
+    density = stats.norm([0.0, 0.0], [1e4, 1e-4]).logpdf([2e4, 1e-4]).sum()
+    assert model.log_transition(x, x + [2e4, 1e-4]) == pytest.approx(density)
+    assert model.log_likelihood(x, [2e4, 1e-4]) == pytest.approx(density)
+    eye = np.eye(2)
+    for f2, h2, message in (
+        (lambda x: x[:, :1], lambda x: x, r"step 1, transition: f returned shape \(2, 1\), expected \(2, 2\)"),
+        (lambda x: x[:, 0], lambda x: x, r"step 1, transition: f returned shape \(2,\), expected \(2, 2\)"),
+        (lambda x: x, lambda x: x[:, :1], r"step 0, update: h returned shape \(2, 1\), expected \(2, 2\)"),
+        (lambda x: x, lambda x: x[0], r"step 0, update: h returned shape \(2,\), expected \(2, 2\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bootstrap(nonlinear_gaussian(f2, eye, h2, eye, [0.0, 0.0], eye), 2).run([[0.1, 0.2]] * 2)

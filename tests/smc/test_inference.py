@@ -16,11 +16,14 @@ from mstfilter.errors import InputError
 from mstfilter.smc import (
     Branching,
     Categorical,
+    ConditionallyLinear,
     Dynamics,
     LargestWeights,
+    Linear,
     Population,
     Program,
     Proposal,
+    Reweight,
     StateSpaceModel,
     Transition,
     auxiliary,
@@ -33,6 +36,7 @@ from mstfilter.smc import (
     particle_gibbs,
     path_log_prob,
     pmmh,
+    rao_blackwellised,
     sample,
     switch,
 )
@@ -180,6 +184,57 @@ def test_what_has_no_conditional_form():
         conditional_path(bootstrap(AR1, 5), [])
     with pytest.raises(InputError, match="densities are not known"):
         path_log_prob(replace(bootstrap(AR1, 5), initial=Drawn()), ys, np.zeros(3))
+    for n in (2, 4):
+        with pytest.raises(InputError, match=f"there are 3 observations for a path of {n} states"):
+            path_log_prob(bootstrap(AR1, 5), ys, np.zeros(n))
+
+
+@dataclass(frozen=True)
+class Rebuilds(Reweight):
+    """Weights as `Reweight`, in a population with new arrays; `shift` moves the particles."""
+
+    shift: float = 0.0
+
+    def update(self, rng, predicted, proposed, observation):
+        found = super().update(rng, predicted, proposed, observation)
+        return Population(found.particles + self.shift, found.log_weights)
+
+
+def test_an_update_that_changes_particles_has_no_conditional_form():
+    """A given path would be updated again. An update that returns equal particles in new arrays is accepted."""
+    linear = ConditionallyLinear(
+        lambda rng, n: np.zeros(n),
+        lambda rng, u: u,
+        lambda u: Linear([[1.0]], [[1.0]], [[1.0]], [[1.0]]),
+        [0.0],
+        [[1]],
+    )
+    ys, filter = ar1_observations(3), bootstrap(AR1, 5)
+    shifting = replace(filter, update=Rebuilds(AR1.log_likelihood, shift=1.0))
+    for wrong in (rao_blackwellised(linear, 5), shifting):
+        with pytest.raises(InputError, match="step 0: the update changes the particles"):
+            conditional_path(wrong, ys)
+    rebuilding = replace(filter, update=Rebuilds(AR1.log_likelihood))
+    for path in (None, np.zeros(3)):
+        found = [conditional_path(f, ys, 1, path) for f in (filter, rebuilding)]
+        np.testing.assert_array_equal(*found)
+
+
+def test_parameters_that_are_drawn_in_place_are_counted():
+    """Each draw changes the array that it gets, or always returns the same array: all are new parameters."""
+    buffer = np.zeros(1)
+
+    def in_place(rng, theta, path):
+        theta += 0.01
+        return theta
+
+    def returned(rng, theta, path):
+        buffer[:] = rng.random()
+        return buffer
+
+    for draw in (in_place, returned):
+        chains = particle_gibbs(filter_of, YS, draw, [0.5], 5)
+        assert chains.accepted.tolist() == [1.0] and len(set(chains.theta[:, 0, 0].tolist())) == 5
 
 
 @dataclass(frozen=True)
@@ -219,7 +274,6 @@ def filter_of(theta, n=30):
 
 
 def kalman(rho):
-    pytest.importorskip("filterpy.kalman")
     return kalman_filter([[rho]], [[SIGMA**2]], [[1.0]], [[TAU**2]], [0.0], [[SD0**2]], YS).log_evidence[-1]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.smc import Always, Candidates, Population, WeightResampler, bootstrap, log_mean_exp
+from mstfilter.smc.population import union
 from tests.smc.models import AR1
 
 
@@ -31,6 +32,16 @@ def test_take_selects_from_every_kind(particles):
         assert population.best["a"] == 3
     else:
         np.testing.assert_array_equal(chosen.particles[:, 0], [9, 9, 0])
+
+
+@pytest.mark.parametrize("variables", [("a", "b"), ("b", "a")])
+def test_populations_of_other_variables_are_not_joined(variables):
+    """The variable that one population lacks would be lost."""
+    one, both = Population({"x": np.zeros(2)}), Population({"x": np.ones(3), "y": np.ones(3)})
+    pair = (one, both) if variables == ("a", "b") else (both, one)
+    with pytest.raises(InputError, match=r"particles have the variables \['x'.*\] and \['x'"):
+        union(*pair)
+    assert union(both, both).particles["y"].shape == (6,)
 
 
 def test_populations_cannot_be_written_to():

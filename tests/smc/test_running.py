@@ -20,6 +20,7 @@ from mstfilter.smc import (
     Multinomial,
     Population,
     State,
+    WithInput,
     bootstrap,
     collect,
     ess,
@@ -189,6 +190,19 @@ class Table:
         return iter(self.columns)
 
 
+@pytest.mark.parametrize("batched", [True, False], ids=["together", "single"])
+def test_collected_values_have_a_type_of_all_runs(batched):
+    """A collector that returns integers in the first run and numbers in the second."""
+
+    def own(state, info):
+        return 3 if state.key.seed == 0 else 2.5
+
+    filter = bootstrap(AR1, 8)
+    filter = replace(filter, update=replace(filter.update, batched=None if batched else False))
+    found = run_many(filter, YS[:2], [0, 1], own=own)["own"]
+    assert found.tolist() == [[3.0, 3.0], [2.5, 2.5]]
+
+
 @pytest.mark.parametrize(
     ("observations", "message", "hint"),
     [
@@ -197,6 +211,12 @@ class Table:
         ("ab", "observations are a str", "to_numpy"),
         ([np.ones(1), np.array([np.nan])], "observation 1 is NaN", "None"),
         (np.array([1.0, 2.0, np.nan]), "observation 2 is NaN", "None"),
+        (np.array([1.0, np.nan], np.float32), "observation 1 is NaN", "None"),
+        ([1.0, np.float16("nan")], "observation 1 is NaN", "None"),
+        ([1.0, WithInput(np.nan, 0.3)], "observation 1 is NaN", "None"),
+        (np.ma.masked_invalid([1.0, np.nan]), "observation 1 has masked entries", "None"),
+        (np.ma.masked_less([[1.0], [-9.0]], 0.0), "observation 1 has masked entries", "None"),
+        ([np.ma.masked_less([1.0, -9.0], 0.0)], "observation 0 has masked entries", "None"),
     ],
 )
 def test_observations_that_cannot_be_meant_are_refused_before_the_first_step(observations, message, hint):

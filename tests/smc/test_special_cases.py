@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mstfilter.errors import InputError
 from mstfilter.smc import Always, ConditionallyLinear, EssBelow, Linear, kalman_filter, rao_blackwellised
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, observations
 
@@ -55,6 +56,23 @@ def enumerated(ys):
             m, P = m + K @ (y - H @ m), P - K @ H @ P
         total.append(log_p)
     return np.logaddexp.reduce(total)
+
+
+@pytest.mark.parametrize(
+    ("changed", "y", "message"),
+    [
+        ({}, 0.3, r"update: the observation has shape \(\), expected \(2,\)"),
+        ({"R": 0.5}, [0.3, 0.1], r"linear returned R of shape \(1, 1\), expected \(2, 2\)"),
+        ({"Q": np.ones(2)}, [0.3, 0.1], r"transition: linear returned Q of shape \(1, 2\), expected \(2, 2\)"),
+        ({"F": np.ones((3, 2))}, [0.3, 0.1], r"transition: linear returned F of shape \(3, 2\)"),
+        ({"b": np.ones((3, 2))}, [0.3, 0.1], r"transition: linear returned b of shape \(3, 2\)"),
+    ],
+)
+def test_shapes_that_numpy_would_broadcast(changed, y, message):
+    matrices = Linear(**({"F": F, "Q": Q, "H": np.eye(2), "R": np.eye(2)} | changed))
+    model = ConditionallyLinear(lambda rng, n: np.zeros(n), lambda rng, u: u, lambda u: matrices, M0, P0)
+    with pytest.raises(InputError, match=message):
+        rao_blackwellised(model, 1).run([None, y])
 
 
 @pytest.mark.parametrize("trigger", [Always(), EssBelow(0.5)], ids=lambda t: type(t).__name__)

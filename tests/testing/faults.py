@@ -366,4 +366,22 @@ plant(
         lambda chosen, rng: chosen.with_ancestors(np.sort(chosen.parents["ancestor"])),
     ),
 )
+
+
+@FAULTS.faulty("carried_weight_of_equal_particles", "of equal particles")
+@dataclass(frozen=True)
+class KeepsHeaviestOfEqual(Resampler):
+    """Merges equal particles and keeps the heaviest of them, which then carries the weight of all."""
+
+    exact_size: ClassVar[bool] = False
+
+    def resample(self, rng, population, n):
+        x, weights = population.particles, population.weights
+        names, classes = np.unique(x, return_inverse=True)
+        kept = np.array([max(np.flatnonzero(classes == c), key=lambda i: weights[i]) for c in range(len(names))])
+        mass = np.bincount(classes, weights)
+        index = systematic(rng, mass / mass.sum(), n)
+        return population.select(kept[index], np.full(n, population.log_mean_weight))
+
+
 BiasedResidual = next(fault for fault, *_ in FAULTS if fault.__name__ == "BiasedResidual")

@@ -1,8 +1,7 @@
 """Checks that a program treats particles independently and draws random numbers only by `sample`.
 
-A program processes all particles in one pass. By mistake a program may mix particles (``x.mean()``,
-``previous["x"][0]``), draw from another generator, or keep values between steps. A faulty program runs without an
-error, but its weights are wrong. Steps of each kind (first, later, without observation) are counted, and the steps 1,
+By mistake a program may mix particles (``x.mean()``, ``previous["x"][0]``), draw from another generator, or keep
+values between steps. Steps of each kind (first, later, without observation) are counted, and the steps 1,
 2, and 8^k + k (9, 66, 515, ...) are checked. These numbers have all remainders modulo 3, so a fault in every third
 step is detected. A check has three parts:
 
@@ -304,10 +303,8 @@ _KNOWN: set[type] = set()
 def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
     """Raise InputError if the draws of a user's scalar distribution do not have its density.
 
-    Each class is checked once.
-
-    For 1000 sorted draws, the integral of the density may differ from the empirical distribution function by less
-    than .12. The false-alarm rate is 1e-12 (Dvoretzky, Kiefer, Wolfowitz).
+    Each class is checked once. For 1000 sorted draws, the integral of the density may differ from the empirical
+    distribution function by less than .12. The false-alarm rate is 1e-12 (Dvoretzky, Kiefer, Wolfowitz).
     """
     from scipy.integrate import cumulative_trapezoid
 

@@ -30,18 +30,10 @@ class Site(NamedTuple):
 
 
 class SiteHandler(ABC):
-    """Determines the values of sites (calls of `sample`).
+    """Determines the values of sites (calls of `sample`)."""
 
-    Attributes
-    ----------
-    observes : bool
-        Whether the program may call `observe`.
-    draws : bool
-        False if the handler takes given values.
-    """
-
-    observes = True
-    draws = True
+    observes = True  #: whether the program may call `observe`
+    draws = True  #: False if the handler takes given values
 
     @abstractmethod
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:

@@ -34,17 +34,9 @@ def recorded() -> Iterator[list[ProgramRun]]:
 def sample(name: str, distribution: Any) -> Any:
     """Draw a random value for each particle, and store the value in the particles under `name`.
 
-    Parameters
-    ----------
-    name : str
-        A name that is unique within a step. Different branches of a `switch` may use the same name.
-    distribution : Distribution
-        Distribution of this package, or frozen distribution of scipy.stats. Parameters have one row per particle.
-
-    Returns
-    -------
-    ndarray ``(n, *event_shape)``
-        One row per particle, read-only.
+    The name is unique within a step, but different branches of a `switch` may use the same name. The distribution is
+    one of this package, or a frozen one of scipy.stats, with one row of parameters per particle. Returns a read-only
+    array ``(n, *event_shape)``.
     """
     return _current().sample(name, distribution)
 
@@ -67,7 +59,6 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
     name : str
         The index of the branch (n,) is stored in the particles under `name`.
     probs : (k,) or (n, k) array_like
-        Probabilities of the k branches.
     branches : sequence of callables
         Each branch is called once with the rows of `args` that belong to its particles. A branch may call `sample`,
         `observe` and `switch`. Several branches may sample one name, and their values form one array. The entries of
@@ -76,10 +67,7 @@ def switch(name: str, probs: Any, branches: Sequence[Callable[..., Any]], *args:
         Arguments whose rows are split among the branches. A branch reads values shared by all particles from its
         closure.
 
-    Returns
-    -------
-    None, array (n, ...) or mapping
-        The values returned by the branches, merged by rows.
+    Returns the values returned by the branches, merged by rows.
     """
     return _current().switch(name, probs, branches, args)
 

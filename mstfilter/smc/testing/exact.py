@@ -27,8 +27,8 @@ class ExactContract(Contract):
     one particle has more than 1 % of the total weight.
 
     The rows of `exact` must be independent draws, but the states x_{t-1} may lie on a grid. With 200,000 rows, the
-    tests detect an error of 3 % in the standard deviation, and a shift by 3 % of the standard deviation. The tests
-    also detect missing tails of probability 0.1 %, and a correlation of 0.02 between particles.
+    tests detect a shift and an error of the standard deviation by 3 %, missing tails of probability 0.1 %, and a
+    correlation of 0.02 between particles.
     """
 
     returns = Population

@@ -1,8 +1,7 @@
 """Contracts of resamplers.
 
 A particle of normalised weight W_i must get n W_i copies on average if the resampler is properly weighted. If output
-weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` lists the test
-cases: n = m, n < m and n > m, ties, zeros, heavy and light weights.
+weights differ, the copies must have the total weight W_i on average. `mstfilter.smc.testing.copies` has the cases.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mstfilter.smc import Population, Resampler, WeightResampler
+from mstfilter.smc.population import take
 from mstfilter.smc.testing.contract import (
     FALSE_ALARM,
     ScaleContract,
@@ -110,12 +110,22 @@ class ResamplerContract(ScaleContract):
             sample = self._carried(component, case, seed)
             assert self._excess(sample) <= 0, fault_message(sample, int(np.argmax(sample.evidence())))
 
-    def _carried(self, component: Resampler, case: Case, seed: int) -> Sample:
+    @statistical
+    def test_carried_weight_of_equal_particles(self) -> None:
+        """Each of two equal particles carries its weight on average. A scheme that merges them draws one."""
+        component = skip_unless_properly_weighted(self.make())
+        for seed, case in enumerate(self.cases[:4]):
+            sample = self._carried(component, case, seed, repeats=2)
+            message = "of equal particles: " + fault_message(sample, int(np.argmax(sample.evidence())))
+            assert self._excess(sample) <= 0, message
+
+    def _carried(self, component: Resampler, case: Case, seed: int, repeats: int = 1) -> Sample:
         """The weight of the copies of each particle and each group of particles in many calls.
 
         Calls are added while a mean deviates but the evidence against the scheme is below the bound.
         """
         given = self.population(case.weights)
+        given = replace(given, particles=take(given.particles, np.arange(len(given)) // repeats))
         population = Population(given.particles, given.log_weights + 3.0)  # faster without parents
         rng, sample, calls = seeded(seed), Sample(case), case.calls
         while True:
