@@ -21,7 +21,6 @@ relative to the stored pose at the first pause, because the table is seldom at z
 from __future__ import annotations
 
 import math
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,7 +31,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError, warn_user
 from mstfilter.fields import Bounded, NonNegativeInt
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
@@ -337,13 +336,10 @@ def pair_stamps(
             "check that both use the same clock, or raise the limit: tolerance_s=0.1",
         )
     if len(kept) < 0.9 * len(a):
-        warnings.warn(
-            InputWarning(
-                f"{where}: {len(a) - len(kept)} of {len(a)} colour images are omitted, without a depth image within "
-                f"{tolerance_s:g} s ({len(b)} depth images)",
-                "raise the limit: tolerance_s=0.1",
-            ),
-            stacklevel=2,
+        warn_user(
+            f"{where}: {len(a) - len(kept)} of {len(a)} colour images are omitted, without a depth image within "
+            f"{tolerance_s:g} s ({len(b)} depth images)",
+            "raise the limit: tolerance_s=0.1",
         )
     return tuple(kept)
 

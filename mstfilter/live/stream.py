@@ -37,9 +37,11 @@ from mstfilter.scene import (
     Clip,
     Frame,
     Hypothesis,
+    Look,
     VoxelGrid,
     check_depth,
     examine,
+    examine_next,
     find_world,
     render_hypothesis,
     report_findings,
@@ -138,6 +140,8 @@ class Stream:
         self._state, self._on_pause = self._filter.start(seed), on_pause
         self._max, self._threads, self._max_pixels = max_frames, threads, max_pixels
         self._world: Camera | None = None  # the camera of the first pause
+        self._first: Look | None = None  # what the first pause shows
+        self._reported: set[tuple[str, ...]] = set()
         self._clip: list[_Item] = []
         self._trackers: list[Any] = []
         self._n_pauses = 0
@@ -292,8 +296,8 @@ class Stream:
             self._world, self._grid = find_world(item.frame, self._grid)
         if item.frame.camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
-        if not self._clip:
-            report_findings(examine([item.frame], [0], self._grid), "stream")  # type: ignore[arg-type]
+        if rests:
+            self._examine(item)
         self._clip.append(item)
         for tracker in self._trackers:
             tracker.add(item.frame)
@@ -301,6 +305,16 @@ class Stream:
             self._end_clip()
         elif len(self._clip) >= self._max:
             self._thin()
+
+    def _examine(self, item: _Item) -> None:
+        """Compare the frame of a pause with the first pause. A fault gives one warning, not one at every pause."""
+        assert isinstance(self._grid, VoxelGrid)
+        look = Look(item.frame, self._grid, item.number)
+        found = examine([item.frame], [0], self._grid) if self._first is None else examine_next(self._first, look)
+        self._first = self._first or look
+        found = [one for one in found if one.hints not in self._reported]
+        self._reported.update(one.hints for one in found)
+        report_findings(found, "stream")
 
     def _thin(self) -> None:
         """Remove the frames with little motion from the clip, then every second frame while the clip is too long."""

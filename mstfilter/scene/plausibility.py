@@ -11,16 +11,13 @@ limits of the checks were chosen in ``experiments/plausibility``.
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import FrameType
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError, warn_user
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
@@ -88,12 +85,18 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
     return sorted(found, key=lambda finding: not finding.stop)
 
 
+def examine_next(first: Look, look: Look) -> list[Finding]:
+    """Findings about a later pause of a stream, which are those of `examine` about a recording with this pause."""
+    found = [*unreadable(look.frame, f"frame {look.index}"), *_moved([first, look])]
+    return sorted(found, key=lambda finding: not finding.stop)
+
+
 def report_findings(findings: Iterable[Finding], where: str) -> None:
     """Raise InputError for a finding that stops a run; warn of the other findings. Messages begin with `where`."""
     for finding in findings:
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)
-        _warn(f"{where}: {finding.message}", *finding.hints)
+        warn_user(f"{where}: {finding.message}", *finding.hints)
 
 
 def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[Finding]:
@@ -475,12 +478,3 @@ def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Findi
     if (np.abs(change - np.median(change)) > 20).mean() > 0.01:
         text = f"there is one pause in {len(frames)} frames, but the scene changes: the video is not used"
         yield _warning(text, "give a pause before and after each action: pauses=(0, 40, 85)")
-
-
-def _warn(message: str, *hints: str) -> None:
-    """Issue a warning that shows the line of code that called this package."""
-    level = 1
-    frame: FrameType | None = sys._getframe()
-    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("mstfilter", "functools"):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(InputWarning(message, *hints), stacklevel=level)

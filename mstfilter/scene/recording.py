@@ -10,7 +10,6 @@ If the camera pose is not given, the support plane at the first pause defines th
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -23,7 +22,7 @@ from typing import Any, ClassVar, overload
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, InputWarning, check_integer
+from mstfilter.errors import InputError, check_integer, warn_user
 from mstfilter.fields import Bounded
 from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
@@ -211,12 +210,9 @@ class Recording:
         if len(stamps) != n:
             raise InputError(f"there are {len(stamps)} times for {n} frames of {name}")
         if pauses is None and times is None and n > _LONG:
-            warnings.warn(
-                InputWarning(
-                    f"the {n} frames of {name} are one clip from the first to the last, since no pauses are given",
-                    "give pauses=(0, 40, 85), or times in seconds: pauses are then found where nothing moves",
-                ),
-                stacklevel=2,
+            warn_user(
+                f"the {n} frames of {name} are one clip from the first to the last, since no pauses are given",
+                "give pauses=(0, 40, 85), or times in seconds: pauses are then found where nothing moves",
             )
         if pauses is None:
             pauses = "still" if times is not None and n > 2 else "ends"
