@@ -21,7 +21,7 @@ from mstfilter.errors import InputError, warn_user
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
-from mstfilter.scene.geometry import SupportPlane, fit_support_plane
+from mstfilter.scene.geometry import SupportPlane, fit_support_plane, in_columns, shares_with_depth
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
@@ -36,6 +36,7 @@ _ON_TABLE, _NEAR_TABLE = 0.025, 0.1  # metres from z = 0: on the table; where th
 _MAX_TILT, _MAX_HEIGHT = 2.5, 0.025  # degrees and metres between the table and z = 0: warning; twice: stop
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
+_MIN_KNOWN = 0.25  # share of the pixels with readings; warning
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
 _TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
 # Tilt in degrees, height and shift in metres of the camera between pauses: warning; twice: stop.
@@ -80,14 +81,14 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
         looks = [Look(frames[p], grid, p) for p in pauses]
         found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
     if not any(finding.stop for finding in found):
-        found += [*_support(looks[0]), *_scale(looks[0]), *_workspace(looks), *_moved(looks)]
+        found += [*_support(looks[0]), *_scale(looks[0]), *_missing(looks), *_workspace(looks), *_moved(looks)]
         found += [*_registration(looks), *_repeated(looks), *_one_pause(frames, pauses)]
     return sorted(found, key=lambda finding: not finding.stop)
 
 
 def examine_next(first: Look, look: Look) -> list[Finding]:
     """Findings about a later pause of a stream, which are those of `examine` about a recording with this pause."""
-    found = [*unreadable(look.frame, f"frame {look.index}"), *_moved([first, look])]
+    found = [*unreadable(look.frame, f"frame {look.index}"), *_missing([look]), *_moved([first, look])]
     return sorted(found, key=lambda finding: not finding.stop)
 
 
@@ -123,6 +124,7 @@ class Look:
         self.frame, self.edges = _sampled(frame, 160), _Edges(_sampled(frame, 320))
         self.corners = _Corners(_sampled(frame, 640), grid)
         self.points = self.frame.points[self.frame.valid]
+        self.known = shares_with_depth(frame, grid)
 
     @cached_property
     def on_table(self) -> np.ndarray:
@@ -132,7 +134,7 @@ class Look:
     @cached_property
     def in_columns(self) -> np.ndarray:
         """(n,) bool: whether each depth reading is inside, above or below the workspace."""
-        return _in_columns(self.grid, self.points)
+        return in_columns(self.grid, self.points)
 
     @cached_property
     def inside(self) -> np.ndarray:
@@ -177,12 +179,6 @@ def _sampled(frame: Frame, width: int) -> Frame:
     K[:2] /= step
     mask = None if frame.robot_mask is None else frame.robot_mask[part, part]
     return Frame(rgb, depth, Camera(K, depth.shape[1], depth.shape[0], frame.camera.T_world_camera), mask)
-
-
-def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """(...) bool: whether x and y of points (..., 3) are inside the grid."""
-    index = grid.index_of(points)[..., :2]
-    return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
 
 
 _Limits = tuple[float, float]
@@ -298,6 +294,17 @@ def _scale(first: Look) -> Iterator[Finding]:
         yield _warning(text, _CHECK_SCALE, "or give a higher workspace", floor)
 
 
+def _missing(looks: Sequence[Look]) -> Iterator[Finding]:
+    """A finding if few pixels of a pause have depth readings."""
+    least = min(looks, key=lambda look: min(look.known))
+    if min(least.known) < _MIN_KNOWN:
+        text = "frame {} has depth readings in {:.0%} of the image and {:.0%} of its part that shows the workspace"
+        hint = (
+            "objects without readings are missed: check exposure, distance and glare, and the colour format of depth"
+        )
+        yield _warning(text.format(least.index, *least.known), hint)
+
+
 def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
     """A finding if the workspace is beside the table, or below or above the objects."""
     if any((look.inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS for look in looks):
@@ -324,7 +331,7 @@ class _Corners:
 
         points = frame.points
         with np.errstate(invalid="ignore"):
-            still = (np.abs(points[..., 2]) < _MIN_HEIGHT) | ~_in_columns(grid, points)
+            still = (np.abs(points[..., 2]) < _MIN_HEIGHT) | ~in_columns(grid, points)
         mask = cv2.erode((still & frame.valid).astype(np.uint8), np.ones((9, 9), np.uint8))
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners, self.features = cv2.ORB_create(1000, fastThreshold=4).detectAndCompute(grey, mask)  # type: ignore[attr-defined]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
+from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.geometry import in_columns, shares_with_depth
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -164,3 +167,16 @@ def test_the_workspace_ends_at_a_wall_behind_the_table():
     grid = Recording.from_arrays(rgb, behind, CAMERA.K, T_world_camera=CAMERA.pose).grid
     assert alone.upper[1] > 0.8 and 0.5 <= grid.upper[1] <= 0.65
     assert grid.origin[1] == alone.origin[1]  # the end of the table near the camera
+
+
+def test_depth_that_is_missing_in_the_workspace_alone_gives_a_warning():
+    rgb, depth, _ = table_scene()
+    grid = VoxelGrid((-0.1, -0.1, 0.0), 0.01, (20, 20, 20))
+    frame = Frame(rgb, depth, CAMERA)
+    assert min(shares_with_depth(frame, grid)) > 0.9
+    shown = in_columns(grid, frame.points)
+    holes = replace(frame, depth=np.where(shown & (np.arange(160) % 8 != 0), np.nan, depth))
+    found = [one for one in examine([holes], [0], grid) if "has depth readings" in one.message]
+    assert len(found) == 1 and not found[0].stop and "frame 0" in found[0].message
+    robot = replace(holes, robot_mask=np.isnan(holes.depth))
+    assert min(shares_with_depth(robot, grid)) > 0.9
