@@ -30,7 +30,7 @@ from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
-from mstfilter.scene import decode_image
+from mstfilter.scene import check_depth, decode_image
 
 
 @dataclass(frozen=True)
@@ -182,6 +182,8 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
         metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
     elif encoding == "32FC1":
         metres = _pixels(message, np.dtype(np.float32), 1, where)[..., 0].astype(np.float32)
+        if np.any(metres > 0):
+            check_depth(metres, where)
     else:
         metres = _pixels(message, np.dtype(np.uint16), 1, where)[..., 0] * np.float32(depth_scale)
     with np.errstate(invalid="ignore"):

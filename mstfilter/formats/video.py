@@ -259,7 +259,8 @@ def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: floa
         )
     if rgb.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{where} is {sizes[0]}, the camera has {camera.width} x {camera.height}")
-    check_depth(depth, f"depth of {where} with {scale:g} m per unit")
+    hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002"
+    check_depth(depth, f"depth of {where} with {scale:g} m per unit", hint)
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ from mstfilter.scene.evidence import (
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
+    check_depth as check_depth,
     decode_image as decode_image,
     depth_sigma as depth_sigma,
     grey_blocks as grey_blocks,
@@ -68,7 +69,6 @@ from mstfilter.scene.recording import (
     PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
-    check_depth as check_depth,
     find_world as find_world,
     truth_reader as truth_reader,
 )

@@ -122,6 +122,23 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
     return (found[256], found[257]) if {256, 257} <= set(found) else None
 
 
+_IN_METRES = "floating-point depth is read in metres, whatever the depth scale is: multiply millimetres by 0.001"
+
+
+def check_depth(depth: np.ndarray, where: str, hint: str = _IN_METRES) -> None:
+    """Raise InputError if a depth image (H, W) has no reading, or if its median is not plausible in metres."""
+    with np.errstate(invalid="ignore"):
+        metres = depth[np.isfinite(depth) & (depth > 0)]
+    if metres.size == 0:
+        raise InputError(
+            f"{where} has no reading at all",
+            "0 and NaN are no reading; leave such frames out, for a video with start_s or stop_s",
+        )
+    median = float(np.median(metres))
+    if not 0.05 < median < 30:
+        raise InputError(f"{where} has a median of {median:g} m, expected between 0.05 and 30 m", hint)
+
+
 def read_rgb(path: Path) -> np.ndarray:
     """Colour image (H, W, 3) uint8, RGB."""
     import cv2
@@ -143,7 +160,10 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
             f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits or "
             "float"
         )
-    unit = 1 if np.issubdtype(image.dtype, np.floating) else scale
+    unit = scale
+    if np.issubdtype(image.dtype, np.floating):
+        unit = 1
+        check_depth(image, f"depth image {path}")
     return np.where(image > 0, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
 
 

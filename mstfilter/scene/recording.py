@@ -27,7 +27,7 @@ from mstfilter.fields import Bounded
 from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
-from mstfilter.scene.frame import Clip, Frame
+from mstfilter.scene.frame import Clip, Frame, check_depth
 from mstfilter.scene.geometry import fit_support_plane, workspace
 from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
@@ -334,23 +334,6 @@ def _stacked(images: Any, what: str) -> np.ndarray:
     except ValueError as error:
         shapes = sorted({np.shape(image) for image in images})
         raise InputError(f"{what} have different shapes: {', '.join(map(str, shapes))}") from error
-
-
-def check_depth(depth: np.ndarray, where: str) -> None:
-    """Raise InputError if a depth image (H, W) has no reading, or if its median is not plausible in metres."""
-    with np.errstate(invalid="ignore"):
-        metres = depth[np.isfinite(depth) & (depth > 0)]
-    if metres.size == 0:
-        raise InputError(
-            f"{where} has no reading at all",
-            "0 and NaN are no reading; leave such frames out, for a video with start_s or stop_s",
-        )
-    median = float(np.median(metres))
-    if not 0.05 < median < 30:
-        raise InputError(
-            f"{where} has a median of {median:g} m, expected between 0.05 and 30 m",
-            "check the depth scale: millimetres need 0.001, TUM images 0.0002",
-        )
 
 
 def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid]:

@@ -410,3 +410,17 @@ def test_a_part_of_a_video(tmp_path):
     np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
     with pytest.raises(InputError, match=r"lasts 1\.6 s"):
         Tum(K=K, start_s=9).open(path)
+
+
+def test_floating_point_depth_in_millimetres_is_not_blamed_on_the_scale(tmp_path):
+    path = write_rgb_and_depth(tmp_path / "mine", kind="npy")
+    for file in (path / "depth").iterdir():
+        np.save(file, 1000 * np.load(file))
+    rgb, depth, _ = video((0,))
+    for make in (
+        lambda: open_recording(path, options=["depth_scale=0.001"]),
+        lambda: Recording.from_arrays(rgb, 1000 * depth, CAMERA.K),
+    ):
+        with pytest.raises(InputError, match="has a median of 778 m") as caught:
+            make()
+        assert "per unit" not in caught.value.message and "multiply millimetres by 0.001" in caught.value.hints[0]
