@@ -161,9 +161,7 @@ def missing_library(error: ImportError, what: str, *hints: str, library: str = "
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
-        f"{what} needs {library}, which cannot be imported: {error}",
-        install_hint(library),
-        *hints,
+        f"{what} needs {library}, which cannot be imported: {error}", install_hint(library), *hints
     )
 
 

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import time
@@ -270,11 +271,16 @@ def _paired(
 
 
 def _seconds(number: Decimal) -> Decimal | None:
-    """A time stamp in seconds, from a number with decimals or an integer Unix time in s, ms, us or ns; else None."""
-    if number != number.to_integral_value() or number.as_tuple().exponent != 0:
-        return number
+    """A time stamp in seconds, from a Unix time in s, ms, us or ns or another number with decimals; else None."""
     unit = next((unit for unit in (1, 10**3, 10**6, 10**9) if 10**9 <= number / unit < 10**10), None)
-    return None if unit is None else number / unit
+    if unit is not None:
+        return number / unit
+    return number if number.as_tuple().exponent != 0 else None
+
+
+def _stamp(word: str) -> float:
+    """The time in seconds of a line of a TUM file."""
+    return float(_seconds(Decimal(word)) or Decimal(word))
 
 
 def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
@@ -358,7 +364,7 @@ class Tum(VideoFormat):
         outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
         if outside:
             raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
-        stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
+        stamps = [[_stamp(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
 
         times = tuple(stamps[0][i] for i, _ in pairs)
@@ -384,8 +390,9 @@ def _table(path: Path, columns: int) -> list[list[str]]:
         if not words:
             continue
         try:
-            float(words[0])
-        except ValueError:
+            Decimal(words[0]) + 0  # refuses signalling values
+            words = words if math.isfinite(float(words[0])) else []
+        except (ValueError, ArithmeticError):
             words = []
         if len(words) < columns:
             raise InputError(
@@ -398,7 +405,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
     """Camera poses at given times, each from the line of the file with the nearest time stamp."""
     try:
-        rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
+        rows = np.array([[_stamp(row[0]), *map(float, row[1:8])] for row in _table(path, 8)])
         if not np.isfinite(rows).all():
             raise ValueError("a value is not finite")
         stamps = rows[:, 0]

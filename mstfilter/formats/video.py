@@ -334,7 +334,7 @@ def pair_stamps(
         raise InputError(
             f"{where}: no colour image has a depth image within {tolerance_s:g} s; the closest pair is "
             f"{np.abs(a - b[to_b]).min():.3g} s apart",
-            "check that both use the same clock, or raise the limit: tolerance_s=0.1",
+            "check that both use the same clock and are in seconds, or raise the limit: tolerance_s=0.1",
         )
     if len(kept) < 0.9 * len(a):
         warn_user(

@@ -309,8 +309,11 @@ class Stream:
     def _examine(self, item: _Item) -> None:
         """Compare the frame of a pause with the first pause. A fault gives one warning, not one at every pause."""
         assert isinstance(self._grid, VoxelGrid)
+        times = [one.time for one in (*self._clip, item)]
         look = Look(item.frame, self._grid, item.number)
-        found = examine([item.frame], [0], self._grid) if self._first is None else examine_next(self._first, look)
+        found = (
+            examine([item.frame], [0], self._grid) if self._first is None else examine_next(self._first, look, times)
+        )
         self._first = self._first or look
         found = [one for one in found if one.hints not in self._reported]
         self._reported.update(one.hints for one in found)

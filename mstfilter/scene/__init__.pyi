@@ -4,12 +4,7 @@ from mstfilter.scene.arrays import (
     max_of_three as max_of_three,
     read_only as read_only,
 )
-from mstfilter.scene.cache import (
-    Cache as Cache,
-    memo as memo,
-    memo_many as memo_many,
-    scene_cache as scene_cache,
-)
+from mstfilter.scene.cache import Cache as Cache, memo as memo, memo_many as memo_many, scene_cache as scene_cache
 from mstfilter.scene.camera import (
     WORKING_PIXELS as WORKING_PIXELS,
     Camera as Camera,
@@ -19,10 +14,7 @@ from mstfilter.scene.camera import (
     scaled_length as scaled_length,
 )
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
-from mstfilter.scene.encoding import (
-    decode_hypotheses as decode_hypotheses,
-    encode_hypotheses as encode_hypotheses,
-)
+from mstfilter.scene.encoding import decode_hypotheses as decode_hypotheses, encode_hypotheses as encode_hypotheses
 from mstfilter.scene.evidence import (
     Evidence as Evidence,
     FreeSpace as FreeSpace,

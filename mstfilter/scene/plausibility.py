@@ -24,6 +24,7 @@ from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
 from mstfilter.scene.geometry import SupportPlane, fit_support_plane, in_columns, shares_with_depth
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
+_Limits = tuple[float, float]
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
 _ASPECTS, _ANY = (0.8, 1.25), (-np.inf, np.inf)  # ratio of the focal lengths; warning
 _OFF_CENTRE = (0.2, 0.4)  # of the image size: principal point from the middle; warning and stop
@@ -36,6 +37,7 @@ _ON_TABLE, _NEAR_TABLE = 0.025, 0.1  # metres from z = 0: on the table; where th
 _MAX_TILT, _MAX_HEIGHT = 2.5, 0.025  # degrees and metres between the table and z = 0: warning; twice: stop
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
+_MAX_INTERVAL = 10.0  # seconds between frames; warning
 _MIN_KNOWN = 0.25  # share of the pixels with readings; warning
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
 _TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
@@ -69,14 +71,14 @@ _GIVE_POSE = "give the pose T_world_camera of the camera over the table"
 _GIVE_WORKSPACE = "give a workspace around the objects, or none: it is then placed around the objects on the table"
 
 
-def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
-    """Findings about the frames of a recording at its pauses, and about the workspace.
+def examine(
+    frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid, times: Sequence[float] = ()
+) -> list[Finding]:
+    """Findings about the frames of a recording at its pauses, about the workspace and the times in seconds.
 
-    Findings that stop a run come first.
-
-    The frames are read one by one. Only reduced images (160 and 320 columns) and image corners are kept in memory.
+    Findings that stop a run come first. The frames are read one by one, and are not kept in memory.
     """
-    found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
+    found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid), *_interval(times, len(pauses))]
     if not any(finding.stop for finding in found):
         looks = [Look(frames[p], grid, p) for p in pauses]
         found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
@@ -86,15 +88,15 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
     return sorted(found, key=lambda finding: not finding.stop)
 
 
-def examine_next(first: Look, look: Look) -> list[Finding]:
-    """Findings about a later pause of a stream, which are those of `examine` about a recording with this pause."""
-    found = [*unreadable(look.frame, f"frame {look.index}"), *_missing([look]), *_moved([first, look])]
-    return sorted(found, key=lambda finding: not finding.stop)
+def examine_next(first: Look, look: Look, times: Sequence[float]) -> list[Finding]:
+    """Findings about a later pause of a stream, and about the times of its clip: those of `examine`."""
+    found = [*_interval(times, 2), *unreadable(look.frame, f"frame {look.index}")]
+    return [*found, *_missing([look]), *_moved([first, look])]
 
 
 def report_findings(findings: Iterable[Finding], where: str) -> None:
     """Raise InputError for a finding that stops a run; warn of the other findings. Messages begin with `where`."""
-    for finding in findings:
+    for finding in sorted(findings, key=lambda finding: not finding.stop):
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)
         warn_user(f"{where}: {finding.message}", *finding.hints)
@@ -136,17 +138,6 @@ class Look:
         """(n,) bool: whether each depth reading is inside, above or below the workspace."""
         return in_columns(self.grid, self.points)
 
-    @cached_property
-    def inside(self) -> np.ndarray:
-        """World points (m, 3) of the depth readings inside the workspace."""
-        return self.points[self.grid.contains(self.grid.index_of(self.points))]
-
-    @cached_property
-    def distance(self) -> float:
-        """Median depth in metres of the readings on the table, or of all readings if few are on the table."""
-        depth = self.frame.depth[self.frame.valid]
-        return float(np.median(depth[self.on_table] if self.on_table.mean() > _MIN_ON_TABLE else depth))
-
     def plane(self, chosen: np.ndarray) -> tuple[float, float, np.ndarray] | None:
         """Tilt (degrees), height (m) and normal (3,) in camera axes of a plane fitted to `chosen` readings (n,)."""
         valid = np.zeros_like(self.frame.valid)
@@ -179,9 +170,6 @@ def _sampled(frame: Frame, width: int) -> Frame:
     K[:2] /= step
     mask = None if frame.robot_mask is None else frame.robot_mask[part, part]
     return Frame(rgb, depth, Camera(K, depth.shape[1], depth.shape[0], frame.camera.T_world_camera), mask)
-
-
-_Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
@@ -217,6 +205,16 @@ def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
     text = f"the voxels have edges of {size:g} m, expected {_VOXELS[0]} to {_VOXELS[1]} m"
     hint = "check the workspace: its bounds and its voxel size are in metres"
     yield from _limited(size, _VOXELS, _POSSIBLE_VOXELS, text, hint)
+
+
+def _interval(times: Sequence[float], n_pauses: int) -> Iterator[Finding]:
+    """A finding if the frames between the pauses are far apart, as milliseconds are that are taken for seconds."""
+    apart = float(np.median(np.diff(times))) if len(times) > n_pauses + 2 else 0.0
+    if apart > _MAX_INTERVAL:
+        text = f"the frames are {apart:.4g} s apart, so motion cannot be tracked: are their times in milliseconds?"
+        yield _warning(
+            text, "times are in seconds: multiply milliseconds by 0.001, or rename the images by time in s"
+        )
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
@@ -280,7 +278,8 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
 def _scale(first: Look) -> Iterator[Finding]:
     """Findings about distances that are unusual for a camera over a table."""
-    z, size = first.distance, first.grid.voxel_size
+    depth, size = first.frame.depth[first.frame.valid], first.grid.voxel_size
+    z = float(np.median(depth[first.on_table] if first.on_table.mean() > _MIN_ON_TABLE else depth))
     possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
     text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
     voxels = "larger" if z > possible[1] else "smaller"
@@ -307,14 +306,15 @@ def _missing(looks: Sequence[Look]) -> Iterator[Finding]:
 
 def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
     """A finding if the workspace is beside the table, or below or above the objects."""
-    if any((look.inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS for look in looks):
+    grid, texts = looks[0].grid, []
+    inside = (look.points[grid.contains(grid.index_of(look.points)), 2] for look in looks)
+    if any((heights > _MIN_HEIGHT).sum() >= _MIN_READINGS for heights in inside):
         return
     raised = max(int((look.in_columns & (look.points[:, 2] > _MIN_HEIGHT)).sum()) for look in looks)
     on_table = max(int((look.in_columns & look.on_table).sum()) for look in looks)
     if raised < _MIN_READINGS and on_table >= _MIN_READINGS:
         return  # an empty table
     spans = np.array([np.percentile(look.points, (2, 98), axis=0) for look in looks])
-    grid, texts = looks[0].grid, []
     for low, high in ((grid.origin, grid.upper), (spans[:, 0].min(axis=0), spans[:, 1].max(axis=0))):
         texts.append(", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True)))
     text = f"it spans {texts[0]} m, depth readings span {texts[1]} m"
@@ -427,10 +427,9 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
 
-    The first value is the best agreement minus the median over all shifts. The second value is the relative loss of
-    agreement without a shift. The third value is the best shift (rows, columns) in pixels of an image with 320
-    columns. The fourth value is the increase of the agreement if the depth images of different pauses are exchanged
-    and no image is shifted.
+    The values are the best agreement minus the median over all shifts, the relative loss of agreement without a
+    shift, the best shift (rows, columns) in pixels of an image with 320 columns, and the increase of the agreement
+    if the depth images of different pauses are exchanged and no image is shifted.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)

@@ -296,7 +296,7 @@ class Recording:
     @cached_property
     def _examined(self) -> None:
         """Check the frames at the pauses (`examine`), and warn or raise InputError. The checks run once."""
-        report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
+        report_findings(examine(self.frames, self.pauses, self.grid, self.times), f"recording {self.name}")
 
 
 class UsesFiles(ABC):

@@ -202,6 +202,7 @@ NAMES = {
     "numbers": lambda part, k: str(k),
     "prefix": lambda part, k: f"cam0_{part}_{k:04d}",
     "seconds": lambda part, k: f"{STAMP + k / FPS + (part == 'depth') * 0.004:.6f}",
+    "milliseconds": lambda part, k: f"{STAMP * 1000 + k * 100 + (part == 'depth') * 4}.250",
     "nanoseconds": lambda part, k: str(STAMP * 10**9 + k * 10**8 + (part == "depth") * 4_000_000),
 }
 
@@ -410,6 +411,17 @@ def test_a_part_of_a_video(tmp_path):
     np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
     with pytest.raises(InputError, match=r"lasts 1\.6 s"):
         Tum(K=K, start_s=9).open(path)
+
+
+def test_milliseconds_of_tum_lists_are_recognised(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    expected = Tum(K=K, world=WORLD).open(path)
+    for name in ("rgb.txt", "depth.txt"):
+        rows = [line.split() for line in (path / name).read_text().splitlines()[1:]]
+        (path / name).write_text("".join(f"{float(t) * 1000:.3f} {file}\n" for t, file in rows))
+    found = Tum(K=K, world=WORLD).open(path)
+    assert found.pauses == expected.pauses
+    np.testing.assert_allclose(found.times, expected.times, atol=1e-5)
 
 
 def test_floating_point_depth_in_millimetres_is_not_blamed_on_the_scale(tmp_path):

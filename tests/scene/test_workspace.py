@@ -15,6 +15,7 @@ from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import in_columns, shares_with_depth
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
+from tests.formats.layouts import video
 from tests.scene.scenes import CAMERA, GRID, table_scene
 from tests.test_cli import call
 
@@ -167,6 +168,16 @@ def test_the_workspace_ends_at_a_wall_behind_the_table():
     grid = Recording.from_arrays(rgb, behind, CAMERA.K, T_world_camera=CAMERA.pose).grid
     assert alone.upper[1] > 0.8 and 0.5 <= grid.upper[1] <= 0.65
     assert grid.origin[1] == alone.origin[1]  # the end of the table near the camera
+
+
+@pytest.mark.parametrize(("step", "silent"), [(0.1, True), (66.7, False)])
+def test_frames_that_are_far_apart_give_a_warning(step, silent):
+    rgb, depth, _ = video()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Recording.from_arrays(rgb, depth, CAMERA.K, times=step * np.arange(len(rgb)), pauses=(0, 13))
+    said = [str(one.message) for one in caught if "are their times in milliseconds?" in str(one.message)]
+    assert (said == []) == silent and all("frames are 66.7 s apart" in text for text in said)
 
 
 def test_depth_that_is_missing_in_the_workspace_alone_gives_a_warning():
