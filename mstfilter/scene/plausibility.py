@@ -85,6 +85,10 @@ def examine(
     if not any(finding.stop for finding in found):
         found += [*_support(looks[0]), *_scale(looks[0]), *_missing(looks), *_workspace(looks), *_moved(looks)]
         found += [*_registration(looks), *_repeated(looks), *_one_pause(frames, pauses)]
+        for view in frames[pauses[0]].views:
+            doubts = [*_intrinsics(view.camera), *unreadable(view, "the image")]
+            doubts = doubts or [*_support(look := Look(view, grid)), *_scale(look)]
+            found += [_warning(f"one of the views: {doubt.message}", *doubt.hints) for doubt in doubts]
     return sorted(found, key=lambda finding: not finding.stop)
 
 

@@ -170,6 +170,16 @@ def test_the_workspace_ends_at_a_wall_behind_the_table():
     assert grid.origin[1] == alone.origin[1]  # the end of the table near the camera
 
 
+def test_the_pose_of_a_view_is_examined():
+    rgb, depth, _ = table_scene()
+    right, wrong = (Frame(rgb, depth, CAMERA.at(pose)) for pose in (CAMERA.pose, CAMERA.pose.inv()))
+    main = Frame(rgb, depth, CAMERA)
+    assert examine([replace(main, views=(right,))], [0], GRID) == examine([main], [0], GRID)
+    found = examine([replace(main, views=(right, wrong))], [0], GRID)
+    assert any(one.message.startswith("one of the views: no table is at z = 0") for one in found)
+    assert not any(one.stop for one in found)
+
+
 @pytest.mark.parametrize(("step", "silent"), [(0.1, True), (66.7, False)])
 def test_frames_that_are_far_apart_give_a_warning(step, silent):
     rgb, depth, _ = video()
