@@ -115,6 +115,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         n, pauses = len(self.frames), tuple(int(p) for p in self.pauses)
+        object.__setattr__(self, "times", _in_seconds(self.times, self.name))
         if n == 0 or not pauses:
             raise InputError(f"recording {self.name} has {n} frames and {len(pauses)} pauses, expected at least 1")
         if list(pauses) != sorted(set(pauses)) or pauses[0] < 0 or pauses[-1] >= n:
@@ -206,7 +207,7 @@ class Recording:
         for index, image in enumerate(depth):
             check_depth(image, f"depth image of frame {index} of {name}")
         cameras = _cameras(Camera(K, width, height), T_world_camera, n)
-        stamps = tuple(float(t) for t in (times if times is not None else range(n)))
+        stamps = _in_seconds(times if times is not None else range(n), name)
         if len(stamps) != n:
             raise InputError(f"there are {len(stamps)} times for {n} frames of {name}")
         if pauses is None and times is None and n > _LONG:
@@ -308,6 +309,18 @@ class UsesFiles(ABC):
     @abstractmethod
     def check_files(self, recording: Recording) -> None:
         """Raise InputError before a run if a file is missing or cannot be used for a recording."""
+
+
+def _in_seconds(times: Sequence[Any], name: str) -> tuple[float, ...]:
+    """Times as numbers. Dates of NumPy become the seconds since the first date."""
+    stamps = np.asarray(times)
+    if stamps.size and stamps.dtype.kind in "mM":
+        stamps = (stamps - stamps[0]) / np.timedelta64(1, "s")
+    try:
+        return tuple(float(t) for t in stamps)
+    except (TypeError, ValueError) as error:
+        hint = "for datetime objects: [(t - times[0]).total_seconds() for t in times]"
+        raise InputError(f"times of {name} begin with {stamps.flat[0]!r}, expected seconds", hint) from error
 
 
 def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -188,6 +189,18 @@ def test_frames_that_are_far_apart_give_a_warning(step, silent):
         Recording.from_arrays(rgb, depth, CAMERA.K, times=step * np.arange(len(rgb)), pauses=(0, 13))
     said = [str(one.message) for one in caught if "are their times in milliseconds?" in str(one.message)]
     assert (said == []) == silent and all("frames are 66.7 s apart" in text for text in said)
+
+
+def test_times_are_numbers_or_dates_of_numpy():
+    rgb, depth, _ = video((0, 1))
+    seconds = [0.0, 0.25]
+    dates = np.datetime64("2024-05-01T10:00:00.000") + np.array([0, 250], "timedelta64[ms]")
+    made = [Recording.from_arrays(rgb, depth, CAMERA.K, times=times) for times in (seconds, dates)]
+    assert made[0].times == made[1].times == replace(made[0], times=tuple(dates)).times == (0.0, 0.25)
+    for wrong in (["10:00:00", "10:00:01"], [datetime(2024, 5, 1, 10), datetime(2024, 5, 1, 11)]):
+        with pytest.raises(InputError, match="times of arrays begin with .* expected seconds") as caught:
+            Recording.from_arrays(rgb, depth, CAMERA.K, times=wrong)
+        assert "total_seconds" in caught.value.hints[0]
 
 
 def test_depth_that_is_missing_in_the_workspace_alone_gives_a_warning():
