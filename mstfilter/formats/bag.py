@@ -317,11 +317,9 @@ class Bag(VideoFormat):
         fitting = [s for s in found if s.size == colour.size and (self.registered or s.frame_id == colour.frame_id)]
         depth = _choose(path, "depth", self.depth, fitting if fitting and not self.depth else found, streams)
         if depth.size != colour.size:
-            raise InputError(
-                f"{path}: depth {depth} and colour {colour} differ in size: depth is not registered to colour",
-                "record the aligned depth (RealSense: align_depth.enable, Azure Kinect: depth_to_rgb, Kinect: "
-                "depth_registered)",
-            )
+            text = f"{path}: depth {depth} and colour {colour} differ in size: depth is not registered to colour"
+            drivers = "RealSense: align_depth.enable, Azure Kinect: depth_to_rgb, Kinect: depth_registered"
+            raise InputError(text, f"record the aligned depth ({drivers})")
         if depth.frame_id != colour.frame_id and not self.registered:
             raise InputError(
                 f"{path}: depth {depth} has another frame than colour {colour}: it is not registered",

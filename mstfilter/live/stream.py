@@ -109,10 +109,8 @@ class Stream:
 
     Notes
     -----
-    If `max_frames` frames are queued because the filter is slower than the camera, new frames are dropped. If a clip
-    reaches `max_frames`, frames with little motion are removed from the clip. `counts` has the number of dropped and
-    removed frames. At most three times `max_frames` frames are in memory.
-
+    If `max_frames` frames are queued, new frames are dropped. If a clip reaches `max_frames`, frames with little
+    motion are removed from the clip. `counts` has the numbers. At most three times `max_frames` frames are in memory.
     An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
@@ -308,13 +306,11 @@ class Stream:
 
     def _examine(self, item: _Item) -> None:
         """Compare the frame of a pause with the first pause. A fault gives one warning, not one at every pause."""
-        assert isinstance(self._grid, VoxelGrid)
-        times = [one.time for one in (*self._clip, item)]
-        look = Look(item.frame, self._grid, item.number)
-        found = (
-            examine([item.frame], [0], self._grid) if self._first is None else examine_next(self._first, look, times)
-        )
-        self._first = self._first or look
+        grid, times = self._grid, [one.time for one in (*self._clip, item)]
+        assert isinstance(grid, VoxelGrid)
+        look, first = Look(item.frame, grid, item.number), self._first
+        found = examine([item.frame], [0], grid) if first is None else examine_next(first, look, times)
+        self._first = first or look
         found = [one for one in found if one.hints not in self._reported]
         self._reported.update(one.hints for one in found)
         report_findings(found, "stream")

@@ -431,9 +431,9 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
 
-    The values are the best agreement minus the median over all shifts, the relative loss of agreement without a
-    shift, the best shift (rows, columns) in pixels of an image with 320 columns, and the increase of the agreement
-    if the depth images of different pauses are exchanged and no image is shifted.
+    The first two values are the best agreement minus the median over all shifts, and its relative loss without a
+    shift. The third is the best shift (rows, columns) in pixels of an image with 320 columns. The fourth is the
+    increase of the agreement if the depth images of different pauses are exchanged.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)

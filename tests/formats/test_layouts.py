@@ -91,7 +91,7 @@ def test_entries_of_the_intrinsics_that_are_not_read_are_named(tmp_path):
     path = write_redwood(tmp_path / "data")
     stored = json.loads((path / "intrinsic.json").read_text())
     (path / "intrinsic.json").write_text(json.dumps({**stored, "dist_coeffs": [0.1, 0, 0, 0]}))
-    with pytest.warns(InputWarning, match="dist_coeffs is not read"):
+    with pytest.warns(InputWarning, match="not read: dist_coeffs\n"):
         Redwood(fps=FPS).open(path)
 
 
@@ -411,6 +411,23 @@ def test_a_part_of_a_video(tmp_path):
     np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
     with pytest.raises(InputError, match=r"lasts 1\.6 s"):
         Tum(K=K, start_s=9).open(path)
+
+
+@pytest.mark.parametrize("layout", VIDEOS)
+def test_robot_masks_beside_the_images_are_read(tmp_path, layout):
+    write, reader = VIDEOS[layout]
+    path = write(tmp_path / "data")
+    (path / "robot").mkdir()
+    left = np.where(np.arange(160) < 40, 255, np.zeros((120, 160))).astype(np.uint8)
+    colour = sorted((path / ("color" if layout == "redwood" else "rgb")).iterdir())
+    write_image(path / "robot" / f"{colour[3].stem}.png", left)
+    masks = [frame.robot_mask for frame in reader.open(path).frames]
+    assert [k for k, mask in enumerate(masks) if mask is not None] == [3] and masks[3].mean() == 0.25
+    (path / "robot" / f"{colour[3].stem}.png").rename(path / "robot" / "mask_3.png")
+    with pytest.warns(
+        InputWarning, match="robot: 1 masks of no colour image are not read, for example mask_3.png"
+    ):
+        reader.open(path)
 
 
 def test_milliseconds_of_tum_lists_are_recognised(tmp_path):

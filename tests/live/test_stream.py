@@ -18,7 +18,7 @@ from mstfilter.live import filter_folder
 from mstfilter.presets import load_config
 from mstfilter.report import write_report
 from mstfilter.runs import filter_recording
-from mstfilter.scene import Recording, encode_hypotheses, scene_cache
+from mstfilter.scene import Recording, encode_hypotheses, scene_cache, write_image
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
 from tests.wrong_inputs import shifted_camera
@@ -145,6 +145,14 @@ def test_a_fault_of_several_pauses_gives_one_warning():
     assert [str(one.message).partition("\n")[0] for one in caught if one.category is InputWarning] == [
         "stream: the colour image of frame 1 is uniform"
     ]
+
+
+def test_a_live_folder_has_the_robot_masks(tmp_path):
+    path = write_redwood(tmp_path / "data", (0, 1))
+    (path / "robot").mkdir()
+    write_image(path / "robot" / "00001.png", np.where(DEPTH[0] < 0.7, 255, 0).astype(np.uint8))
+    (frame,) = [frame for _, frame in Redwood().arriving(path, idle_s=0.8)]
+    np.testing.assert_array_equal(frame.robot_mask, DEPTH[0] < 0.7)
 
 
 def test_a_full_queue_drops_frames_and_says_so():
