@@ -53,7 +53,7 @@ _PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 def _decode(path: Path, flags: int) -> np.ndarray:
     with reading(path, "an image"):
         if not path.exists():
-            raise InputError(f"image is missing: {path}", "record the frame again, or remove it from manifest.json")
+            raise InputError(f"image is missing: {path}", "copy or record it again, or leave the frame out")
     data = read_bytes(path, "an image")
     if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
         # The decoder would fill the missing rows with zeros without an error.
