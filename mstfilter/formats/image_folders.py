@@ -64,10 +64,13 @@ class PairedImages(VideoFormat):
         key = lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]  # noqa: E731
         present = sorted(sorted(names), key=key)
         chosen = [str(name) for name in self.frames] or present or ["NAME"]
-        if missing := [name for name in chosen if name not in names]:
-            hint = f"there are {len(present)}: {', '.join(present[:8])}, ..."
-            raise InputError(f"no frame {missing[0]!r} in {path}: {missing[0]}_rgb.png and _depth.png", hint)
         files = [tuple(path / f"{name}_{part}.png" for part in ("rgb", "depth", "robot")) for name in chosen]
+        for name, pair in zip(chosen, files, strict=True):
+            if lost := [file.name for file in pair[:2] if not file.is_file()]:
+                hint = (
+                    f"a pair is NAME_rgb.png and NAME_depth.png; there are {len(present)}: {', '.join(present[:8])}"
+                )
+                raise InputError(f"no frame {name!r} in {path}: {' and '.join(lost)} missing", hint)
         title = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
         times = tuple(float(k) for k in range(len(chosen)))
         made = _calibrated(self, path, source, title, times, files, scale)
@@ -166,6 +169,8 @@ class Redwood(VideoFormat):
             raise failed
 
     def video(self, path: Path) -> Video:
+        if len(found := [name for name in _COLOUR if (path / name).is_dir()]) > 1:
+            warn_user(f"{path} has the colour folders {', '.join(found)}: {found[0]} is read", "remove the others")
         colour, depth = self._files(path)
         _check_masks(path, colour)
         return self._video(path, colour, depth)
@@ -193,8 +198,11 @@ def _calibrated(
 ) -> Video:
     """The video of triples of files, with the options of a reader or else the entries of a file of intrinsics."""
     file, stored = source
-    K, distortion = reader.K or _stored_matrix(path, *source), reader.distortion or stored.get("distortion", ())
-    video = Video.of_files(name, times, files, K, path, scale, distortion=tuple(distortion))
+    K, distortion = (
+        reader.K or _stored_matrix(path, *source),
+        reader.distortion or tuple(stored.get("distortion", ())),
+    )
+    video = Video.of_files(name, times, files, K, path, scale, distortion=distortion)
     for side, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
         if not reader.K and _stored(file, stored, side, n) != n:
             text = f"{file} is for images of another {side}: the images have {n}"
@@ -208,7 +216,9 @@ def _mask(path: Path, colour: Path) -> Path:
 
 
 def _check_masks(path: Path, colour: Iterable[Path]) -> None:
-    """Warn of robot masks that belong to no colour image."""
+    """Warn of robot masks that belong to no colour image, or are in a folder with another name."""
+    if near := [name for name in os.listdir(path) if re.search("robot.|mask", name.lower()) and "." not in name]:
+        warn_user(f"{path / near[0]} is not read", "rename it to robot/ if it has the robot masks")
     if other := sorted({*path.glob("robot/[!.]*")} - {_mask(path, file) for file in colour}):
         text = f"{path / 'robot'}: {len(other)} masks of no colour image are not read, for example {other[0].name}"
         warn_user(text, "name a robot mask as its colour image: robot/000000.png for rgb/000000.jpg")
@@ -313,6 +323,7 @@ def _read_intrinsics(path: Path, names: Iterable[str], *more: str) -> _Source:
         stored = read_json(file, kind)
         if not isinstance(stored, dict):
             raise TypeError(f"it holds a {type(stored).__name__}, expected an object with the entry K")
+        stored["distortion"] = np.ravel(stored.get("distortion", ())).astype(float).tolist()
     warn_of_unread(file, stored, (*_READ, *more), _NOTES)
     return file, stored
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Sequence
+from fnmatch import fnmatch
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,7 @@ def detect_format(path: Path) -> str:
         if not entries or is_recording(path):
             return "recording"
         for name, parts in _PARTS.items():
-            if set(parts) & set(entries):
+            if any(fnmatch(entry, part) for entry in entries for part in parts):
                 return name
     raise InputError(
         f"{path} has no known format",
@@ -104,7 +105,7 @@ def detect_format(path: Path) -> str:
 
 
 _PARTS = {
-    "pairs": ("info.json",),
+    "pairs": ("info.json", "*_rgb.png", "*_depth.png"),
     "tum": ("rgb.txt", "depth.txt"),
     "redwood": ("depth", "rgb", "color", "colour", "image"),
     "recording": ("manifest.json", "camera.json"),
@@ -113,13 +114,13 @@ _PARTS = {
 
 def _near_misses(entries: Sequence[str]) -> list[str]:
     """Hints about files and folders whose names are nearly those of a known format."""
-    known, hints = [*chain(*_PARTS.values())], []
-    for name in set(entries) - {*known, *INTRINSICS}:
-        inside = [word for word in known if "." not in name and word in name.lower()]
+    known, hints = [*chain(*_PARTS.values(), INTRINSICS)], []
+    for name in (entry for entry in entries if not any(fnmatch(entry, part) for part in known)):
+        inside = [word for word in _PARTS["redwood"] if "." not in name and word in name.lower()]
         close = difflib.get_close_matches(name.lower(), known, 1, 0.75) or inside
         if close and close[0] not in entries:
             hints.append(f"{name} is there: is it {close[0]}? rename it")
-    return sorted(hints)
+    return hints
 
 
 def format_settings(options: Sequence[str]) -> dict[str, Any]:

@@ -143,12 +143,15 @@ def read_rgb(path: Path) -> np.ndarray:
     """Colour image (H, W, 3) uint8, RGB."""
     import cv2
 
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)  # as its depth image
+    # The orientation is ignored, as in the depth image. The bits are kept, so that depth is not taken for colour.
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype != np.uint8:
+        raise InputError(f"colour image {path} has type {image.dtype}, expected 8 bits", "is it a depth image?")
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres. Pixels with the value 0 in the file become NaN.
+    """Depth image (H, W) float32 in metres, NaN for no reading: the values 0 and (of 16 bits) 65535 in the file.
 
     16-bit integers are multiplied by `scale` (metres per unit). Floating-point values (.npy, .tif) must be in metres.
     """
@@ -164,7 +167,8 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
     if np.issubdtype(image.dtype, np.floating):
         unit = 1
         check_depth(image, f"depth image {path}")
-    return np.where(image > 0, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+    read = (image > 0) & (image != 65535)
+    return np.where(read, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
 
 
 def _load_array(path: Path) -> np.ndarray:

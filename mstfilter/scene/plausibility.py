@@ -225,9 +225,9 @@ def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
     """Findings about images that are constant or fully masked. `which` names the frame in the messages."""
     depth = frame.depth[np.isfinite(frame.depth)]
     masked = 0.0 if frame.robot_mask is None else frame.robot_mask.mean()
-    if masked > 0.95 or not frame.valid.any():
-        text = f"the robot mask of {which} covers {masked:.0%} of the image, and all or most of its depth"
-        yield _stop(text, "is the mask inverted? True is the robot")
+    if masked > 0.6 or not frame.valid.any():
+        text = f"the robot mask of {which} covers {masked:.0%} of the image and most or all of its depth"
+        yield Finding(masked > 0.95 or not frame.valid.any(), text, ("is the mask inverted? True is the robot",))
     elif np.ptp(depth) < 1e-6:
         text = f"all depth readings of {which} are {depth[0]:.3g} m"
         yield _stop(text, "check that the depth images are those of the camera, in metres")

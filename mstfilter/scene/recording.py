@@ -230,7 +230,9 @@ class Recording:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
         if len(masks) != n:
-            raise InputError(f"there are {len(masks)} robot masks for {n} frames of {name}")
+            raise InputError(
+                f"robot_masks has shape {np.asarray(robot_masks).shape}, expected {depth.shape} of {name}"
+            )
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
         posed, grid = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:

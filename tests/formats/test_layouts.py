@@ -25,6 +25,7 @@ from tests.formats.layouts import (
     PAUSES,
     SHIFTS,
     K,
+    units,
     video,
     write_redwood,
     write_tum,
@@ -424,10 +425,43 @@ def test_robot_masks_beside_the_images_are_read(tmp_path, layout):
     masks = [frame.robot_mask for frame in reader.open(path).frames]
     assert [k for k, mask in enumerate(masks) if mask is not None] == [3] and masks[3].mean() == 0.25
     (path / "robot" / f"{colour[3].stem}.png").rename(path / "robot" / "mask_3.png")
-    with pytest.warns(
-        InputWarning, match="robot: 1 masks of no colour image are not read, for example mask_3.png"
-    ):
+    shutil.copytree(path / "robot", path / "robot_masks")
+    with pytest.warns(InputWarning, match="robot_masks is not read"):
         reader.open(path)
+    with pytest.warns(InputWarning, match="robot: 1 masks of no colour image are not read, for example mask_3.png"):
+        reader.open(path)
+
+
+def test_depth_images_are_not_taken_for_colour(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    (path / "rgb.txt").write_text((path / "depth.txt").read_text())
+    with pytest.raises(InputError, match=r"colour image .* has type uint16, expected 8 bits"):
+        Tum(K=K).open(path)
+
+
+def test_the_largest_value_of_16_bits_is_no_reading(tmp_path):
+    _, (depth,), _ = video((0,))
+    write_image(tmp_path / "a.png", np.where(np.arange(160) < 9, 65535, units(depth, 0.001)).astype(np.uint16))
+    found = read_depth(tmp_path / "a.png", 0.001)
+    assert np.isnan(found[:, :9]).all() and not np.isnan(found[:, 9:][depth[:, 9:] > 0]).any()
+
+
+def test_a_second_colour_folder_is_named(tmp_path):
+    path = write_redwood(tmp_path / "data")
+    shutil.copytree(path / "color", path / "rgb")
+    with pytest.warns(InputWarning, match="colour folders color, rgb: color is read"):
+        Redwood(fps=FPS).open(path)
+
+
+def test_distortion_may_be_nested_and_must_be_numbers(tmp_path):
+    path = write_redwood(tmp_path / "data", (0, 1))
+    for stored, fault in (([[0.1, 0, 0, 0]], None), (["a", "b", "c", "d"], "intrinsic.json .*could not convert")):
+        edit(path / "intrinsic.json", lambda data, stored=stored: data.update(distortion=stored))
+        if fault is None:
+            assert Redwood().video(path).distortion == (0.1, 0, 0, 0)
+        else:
+            with pytest.raises(InputError, match=fault):
+                Redwood().video(path)
 
 
 def test_milliseconds_of_tum_lists_are_recognised(tmp_path):

@@ -151,8 +151,9 @@ def test_a_folder_with_nearly_the_right_names_is_told_which(tmp_path):
     [
         (layouts.write_tum, "depth.txt", "depth.txt is missing"),
         (layouts.write_redwood, "depth", "depth is missing"),
-        (write_pairs, "a_rgb.png", "image is missing"),
-        (write_pairs, "a_depth.png", "image is missing"),
+        (write_pairs, "a_rgb.png", "a_rgb.png missing"),
+        (write_pairs, "info.json", "info.json: depth_scale_m is None"),
+        (write_pairs, "a_depth.png", "a_depth.png missing"),
     ],
 )
 def test_what_is_missing_is_named_in_the_words_of_the_layout(tmp_path, write_layout, lost, message):

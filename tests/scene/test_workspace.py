@@ -171,6 +171,15 @@ def test_the_workspace_ends_at_a_wall_behind_the_table():
     assert grid.origin[1] == alone.origin[1]  # the end of the table near the camera
 
 
+def test_robot_masks_of_most_pixels_and_of_another_shape_are_named():
+    most = np.broadcast_to(np.arange(160) < 110, (1, 120, 160))
+    with pytest.warns(InputWarning, match="the robot mask of frame 0 covers 69% of the image"):
+        arrays(GRID, robot_masks=most[0])
+    rgb, depth, _ = video((0, 1))
+    with pytest.raises(InputError, match=r"robot_masks has shape \(120, 160\), expected \(2, 120, 160\)"):
+        Recording.from_arrays(rgb, depth, CAMERA.K, robot_masks=most[0])
+
+
 def test_the_pose_of_a_view_is_examined():
     rgb, depth, _ = table_scene()
     right, wrong = (Frame(rgb, depth, CAMERA.at(pose)) for pose in (CAMERA.pose, CAMERA.pose.inv()))
