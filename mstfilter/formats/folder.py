@@ -218,21 +218,16 @@ def save_recording(
         for index in range(total):
             frame = recording.frames[index]
             pause = index in recording.pauses
+            where = f"frame {index} of {recording.name}"
             if not np.array_equal(frame.camera.K, camera.K):
-                raise InputError(
-                    f"frame {index} of {recording.name} has camera matrix {frame.camera.K.tolist()}, frame "
-                    f"{recording.pauses[0]} has {camera.K.tolist()}: a recording folder stores one",
-                    "convert frames of one camera only",
-                )
+                text = f"{where} has camera matrix {frame.camera.K.tolist()}, frame {recording.pauses[0]} has "
+                text += f"{camera.K.tolist()}: a recording folder stores one"
+                raise InputError(text, "convert frames of one camera only")
             if frame.views:
-                raise InputError(
-                    f"frame {index} of {recording.name} has images of {len(frame.all_views)} cameras: a recording "
-                    "folder stores one",
-                    "write one recording per camera, and join their frames by Frame(..., views=...)",
-                )
-            moved = (
-                {} if frame.camera.key == camera.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
-            )
+                text = f"{where} has images of {len(frame.all_views)} cameras: a recording folder stores one"
+                raise InputError(text, "write one recording per camera, and join the frames by Frame(..., views=...)")
+            pose = {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
+            moved = {} if frame.camera.key == camera.key else pose
             writer.add_frame(
                 frame.rgb,
                 frame.depth,
@@ -343,13 +338,9 @@ class RecordingFolder(RecordingFormat):
                 "give the pauses: --pauses still, or --pauses 0,40,85 (frames)",
             )
 
-        poses = {
-            e.index: rigid_from_matrix(
-                e.T_world_camera, f"{path / 'manifest.json'}: T_world_camera of frame {e.index}"
-            )
-            for e in entries
-            if e.T_world_camera is not None
-        }
+        where = f"{path / 'manifest.json'}: T_world_camera of frame"
+        posed = [e for e in entries if e.T_world_camera is not None]
+        poses = {e.index: rigid_from_matrix(e.T_world_camera, f"{where} {e.index}") for e in posed}
 
         def read(index: int, view: Camera) -> Frame:
             name = f"{index:06d}.png"
