@@ -15,12 +15,15 @@ import difflib
 import errno
 import linecache
 import math
+import sys
 import sysconfig
 import traceback
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 
@@ -56,6 +59,15 @@ class InputWarning(_WithHints, UserWarning):
 
     def __str__(self) -> str:
         return "\n".join((self.message, *(f"hint: {hint}" for hint in self.hints)))
+
+
+def warn_user(message: str, *hints: str) -> None:
+    """Issue an `InputWarning` that shows the line of code that called this package."""
+    level = 1
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("mstfilter", "functools"):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(InputWarning(message, *hints), stacklevel=level)
 
 
 @contextmanager
@@ -149,9 +161,7 @@ def missing_library(error: ImportError, what: str, *hints: str, library: str = "
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
     return MissingLibraryError(
-        f"{what} needs {library}, which cannot be imported: {error}",
-        install_hint(library),
-        *hints,
+        f"{what} needs {library}, which cannot be imported: {error}", install_hint(library), *hints
     )
 
 

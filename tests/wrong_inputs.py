@@ -71,6 +71,10 @@ def floor(depth, camera, directions):
     return np.where((np.abs(points[..., :2]) > (0.45, 0.3)).any(axis=-1), np.where(below < 6, below, np.nan), depth)
 
 
+def sparse(depth, share):
+    return np.where(np.random.default_rng(0).random(depth.shape) < share, depth, np.float32(np.nan))
+
+
 def depth_times(factor):
     return lambda: changed(depth=right()[0]["depth"] * np.float32(factor))
 
@@ -119,6 +123,7 @@ WRONG = {
     "depth 5 times too small": depth_times(0.2),
     "depth 4 times too large (RealSense L515, 0.25 mm)": depth_times(4),
     "depth without any reading": depth_times(np.nan),
+    "depth at a fifth of the pixels": lambda: changed(depth=sparse(right()[0]["depth"], 0.2)),
     "constant depth": lambda: changed(depth=np.full_like(right()[0]["depth"], 0.8)),
     "depth not registered to colour": lambda: changed(
         depth=warped(right()[0]["depth"], [[1, 0, 8], [0, 1, -6]], np.nan)

@@ -92,7 +92,7 @@ def _osd(folder: Path, first: int, last: int) -> Sequence:
     def truth(t: int) -> Truth:
         return Truth(read_labels(folder / f"{names[t]}_label.png").astype(np.int64) - 1)  # 0 is unknown, 1 the table
 
-    return Sequence(f"learn{first}-{last}", "osd", PairedImages(names).open(folder), truth)
+    return Sequence(f"learn{first}-{last}", "osd", PairedImages(frames=names).open(folder), truth)
 
 
 def _jack(path: Path) -> Sequence:

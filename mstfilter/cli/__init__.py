@@ -13,14 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mstfilter import __version__
-from mstfilter.errors import (
-    InputError,
-    InputWarning,
-    describe_error,
-    exhausted,
-    missing_library,
-    place_in_user_file,
-)
+from mstfilter.errors import InputError, InputWarning, describe_error, exhausted, missing_library, place_in_user_file
 from mstfilter.processes import log_lines
 
 _WITHOUT_TYPER = """Usage: mstfilter list [KIND]

@@ -23,10 +23,7 @@ def list_(
 
 @app.command()
 def check(
-    component: Annotated[
-        str,
-        typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic."),
-    ],
+    component: Annotated[str, typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic.")],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Values of fields.")
     ] = None,

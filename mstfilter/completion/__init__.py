@@ -10,10 +10,5 @@ __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
 __interfaces__ = {"completer": "Completer", "architecture": "Architecture"}
 __components__ = {
-    "completer": {
-        "extrude": "Extrude",
-        "network": "NetworkCompleter",
-        "surface": "SurfaceOnly",
-        "hull": "Hull",
-    }
+    "completer": {"extrude": "Extrude", "network": "NetworkCompleter", "surface": "SurfaceOnly", "hull": "Hull"}
 }

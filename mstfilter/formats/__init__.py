@@ -22,11 +22,5 @@ __components__ = {
         "redwood": "Redwood",
         "bag": "Bag",
     },
-    "pauses": {
-        "still": "Still",
-        "settled": "Settled",
-        "at": "At",
-        "ends": "Ends",
-        "every": "EveryNth",
-    },
+    "pauses": {"still": "Still", "settled": "Settled", "at": "At", "ends": "Ends", "every": "EveryNth"},
 }

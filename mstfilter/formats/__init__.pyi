@@ -5,13 +5,7 @@ from mstfilter.formats.folder import (
     save_recording as save_recording,
 )
 from mstfilter.formats.image_folders import PairedImages as PairedImages, Redwood as Redwood, Tum as Tum
-from mstfilter.formats.pauses import (
-    At as At,
-    Ends as Ends,
-    EveryNth as EveryNth,
-    Settled as Settled,
-    Still as Still,
-)
+from mstfilter.formats.pauses import At as At, Ends as Ends, EveryNth as EveryNth, Settled as Settled, Still as Still
 from mstfilter.formats.sources import (
     detect_format as detect_format,
     open_format as open_format,

@@ -30,7 +30,7 @@ from mstfilter.errors import InputError, missing_library
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
-from mstfilter.scene import decode_image
+from mstfilter.scene import check_depth, decode_image
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,8 @@ class BagFile:
             raise
         except Exception as error:  # rosbags passes on errors of storage and compression libraries
             reason = " ".join(str(error).split())[:160]  # one line
-            raise InputError(
-                f"bag cannot be read: {self.path} ({type(error).__name__}: {reason})",
-                "copy it again, or repair it: rosbag reindex, ros2 bag reindex, mcap recover",
-            ) from error
+            hint = "copy it again, or repair it: rosbag reindex, ros2 bag reindex, mcap recover"
+            raise InputError(f"bag cannot be read: {self.path} ({type(error).__name__}: {reason})", hint) from error
 
     def _messages(self, topic: str, start: int | None = None, stop: int | None = None) -> Iterator[tuple[int, Any]]:
         connections = [c for c in self._reader.connections if c.topic == topic]
@@ -169,9 +167,8 @@ def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
 
 def _check_encoding(encoding: str, known: Iterable[str], what: str) -> None:
     if encoding not in known:
-        raise InputError(
-            f"{what} has encoding {encoding!r}, which is not supported", f"supported: {', '.join(known)}"
-        )
+        text = f"{what} has encoding {encoding!r}, which is not supported"
+        raise InputError(text, f"supported: {', '.join(known)}")
 
 
 def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) -> np.ndarray:
@@ -182,6 +179,8 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
         metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
     elif encoding == "32FC1":
         metres = _pixels(message, np.dtype(np.float32), 1, where)[..., 0].astype(np.float32)
+        if np.any(metres > 0):
+            check_depth(metres, where)
     else:
         metres = _pixels(message, np.dtype(np.uint16), 1, where)[..., 0] * np.float32(depth_scale)
     with np.errstate(invalid="ignore"):
@@ -223,6 +222,7 @@ def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
+_REGISTERED = "record the aligned depth; or, if it is registered: registered=true"
 
 
 @dataclass(frozen=True)
@@ -315,16 +315,12 @@ class Bag(VideoFormat):
         fitting = [s for s in found if s.size == colour.size and (self.registered or s.frame_id == colour.frame_id)]
         depth = _choose(path, "depth", self.depth, fitting if fitting and not self.depth else found, streams)
         if depth.size != colour.size:
-            raise InputError(
-                f"{path}: depth {depth} and colour {colour} differ in size: depth is not registered to colour",
-                "record the aligned depth (RealSense: align_depth.enable, Azure Kinect: depth_to_rgb, Kinect: "
-                "depth_registered)",
-            )
+            text = f"{path}: depth {depth} and colour {colour} differ in size: depth is not registered to colour"
+            drivers = "RealSense: align_depth.enable, Azure Kinect: depth_to_rgb, Kinect: depth_registered"
+            raise InputError(text, f"record the aligned depth ({drivers})")
         if depth.frame_id != colour.frame_id and not self.registered:
-            raise InputError(
-                f"{path}: depth {depth} has another frame than colour {colour}: it is not registered",
-                "record the aligned depth; or, if it is registered: registered=true",
-            )
+            text = f"{path}: depth {depth} has another frame than colour {colour}: it is not registered"
+            raise InputError(text, _REGISTERED)
         return depth
 
     def _intrinsics(
@@ -349,10 +345,8 @@ class Bag(VideoFormat):
         if not self.registered and other in infos and other != name:
             of_depth, _, size = _camera_info(bag, other, "rect" in depth.name)
             if size[0] and not np.allclose(of_depth, matrix, atol=1.0):
-                raise InputError(
-                    f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour",
-                    "record the aligned depth; or, if it is registered: registered=true",
-                )
+                text = f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour"
+                raise InputError(text, _REGISTERED)
         return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), self.distortion or distortion
 
 

@@ -5,19 +5,9 @@
 >>> recording = RecordingFolder().open(Path("recordings/mine"))
 >>> save_recording(recording, "recordings/copy")
 
-===================  ==========================================================================================
-manifest.json        version, generator, seed, frames: [{index, time_s, role: static | action}]
-camera.json          K, width, height, depth_scale (metres per unit, mandatory), T_world_camera, workspace
-rgb/, depth/         000000.png, ...: 8-bit RGB images, 16-bit depth images (0 = no reading)
-instance/, robot/    000000.png, ...: optional object number of each pixel, optional robot mask
-voxels.npz           optional ground truth: labels (S, X, Y, Z), frame (S,), origin, voxel_size
-poses.json           optional ground truth: per frame, per object a 4x4 T_world_object
-SHA256SUMS           hashes of these files
-===================  ==========================================================================================
-
-Frames with role ``static`` are the pauses. If camera.json has no pose, the support plane at the first pause defines
-the world axes. If camera.json has no workspace, a grid is placed around the visible table. A recording is written
-under a temporary name and renamed when it is complete. If writing fails, no file remains.
+The page "File formats" of the documentation describes the files. If camera.json has no pose, the support plane at the
+first pause defines the world axes. If camera.json has no workspace, a grid is placed around the visible table. A
+recording is written under a temporary name and renamed when it is complete. If writing fails, no file remains.
 """
 
 from __future__ import annotations
@@ -35,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mstfilter.errors import InputError, check_choice, naming
 from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
-from mstfilter.formats.video import RecordingFormat, check_images
+from mstfilter.formats.video import RecordingFormat, check_images, read_optional, warn_of_unread
 from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
     Camera,
@@ -48,7 +38,6 @@ from mstfilter.scene import (
     examine,
     find_world,
     read_depth,
-    read_labels,
     read_rgb,
     report_findings,
     rigid_from_matrix,
@@ -220,28 +209,25 @@ def save_recording(
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further keyword arguments, such as the generator, are stored in manifest.json.
     """
-    report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
+    report_findings(
+        examine(recording.frames, recording.pauses, recording.grid, recording.times), f"recording {recording.name}"
+    )
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
     with RecordingWriter(path, camera, recording.grid, **manifest) as writer:
         for index in range(total):
             frame = recording.frames[index]
             pause = index in recording.pauses
+            where = f"frame {index} of {recording.name}"
             if not np.array_equal(frame.camera.K, camera.K):
-                raise InputError(
-                    f"frame {index} of {recording.name} has camera matrix {frame.camera.K.tolist()}, frame "
-                    f"{recording.pauses[0]} has {camera.K.tolist()}: a recording folder stores one",
-                    "convert frames of one camera only",
-                )
+                text = f"{where} has camera matrix {frame.camera.K.tolist()}, frame {recording.pauses[0]} has "
+                text += f"{camera.K.tolist()}: a recording folder stores one"
+                raise InputError(text, "convert frames of one camera only")
             if frame.views:
-                raise InputError(
-                    f"frame {index} of {recording.name} has images of {len(frame.all_views)} cameras: a recording "
-                    "folder stores one",
-                    "write one recording per camera, and join their frames by Frame(..., views=...)",
-                )
-            moved = (
-                {} if frame.camera.key == camera.key else {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
-            )
+                text = f"{where} has images of {len(frame.all_views)} cameras: a recording folder stores one"
+                raise InputError(text, "write one recording per camera, and join the frames by Frame(..., views=...)")
+            pose = {"T_world_camera": frame.camera.pose.as_matrix().tolist()}
+            moved = {} if frame.camera.key == camera.key else pose
             writer.add_frame(
                 frame.rgb,
                 frame.depth,
@@ -333,12 +319,10 @@ class RecordingFolder(RecordingFormat):
         if not path.is_dir():
             raise InputError(f"recording folder does not exist: {path}")
         if not any(path.iterdir()):
-            raise InputError(
-                f"recording folder is empty: {path}",
-                *_HINTS,
-            )
+            raise InputError(f"recording folder is empty: {path}", *_HINTS)
         manifest, manifest_data = _load(path / "manifest.json", _Manifest)
-        camera_file, _ = _load(path / "camera.json", _CameraFile)
+        camera_file, stored = _load(path / "camera.json", _CameraFile)
+        warn_of_unread(path / "camera.json", stored, _CameraFile.model_fields)
         entries, scale = manifest.frames, camera_file.depth_scale
 
         with reading(path / "camera.json", "a recording"):
@@ -354,21 +338,16 @@ class RecordingFolder(RecordingFormat):
                 "give the pauses: --pauses still, or --pauses 0,40,85 (frames)",
             )
 
-        poses = {
-            e.index: rigid_from_matrix(
-                e.T_world_camera, f"{path / 'manifest.json'}: T_world_camera of frame {e.index}"
-            )
-            for e in entries
-            if e.T_world_camera is not None
-        }
+        where = f"{path / 'manifest.json'}: T_world_camera of frame"
+        posed = [e for e in entries if e.T_world_camera is not None]
+        poses = {e.index: rigid_from_matrix(e.T_world_camera, f"{where} {e.index}") for e in posed}
 
         def read(index: int, view: Camera) -> Frame:
             name = f"{index:06d}.png"
             rgb, depth = read_rgb(path / "rgb" / name), read_depth(path / "depth" / name, scale)
             check_images(rgb, depth, view, scale, f"frame {index} of {path}")
-            robot_path = path / "robot" / name
-            robot = read_labels(robot_path) > 0 if robot_path.exists() else None
-            return Frame(rgb, depth, view, robot)
+            robot = read_optional(path / "robot" / name)
+            return Frame(rgb, depth, view, None if robot is None else robot > 0)
 
         if camera.T_world_camera is None or not isinstance(grid, VoxelGrid):
             first = marked[0]
@@ -376,10 +355,6 @@ class RecordingFolder(RecordingFormat):
 
         def read_posed(index: int) -> Frame:
             return read(index, camera.at(poses[index]) if index in poses else camera)
-
-        def read_instance(index: int) -> np.ndarray | None:
-            file = path / "instance" / f"{index:06d}.png"
-            return read_labels(file) if file.exists() else None
 
         truth, true_poses = path / "voxels.npz", path / "poses.json"
         true_volumes = _read_voxels(truth, grid, marked) if truth.exists() else lambda t: None
@@ -394,7 +369,7 @@ class RecordingFolder(RecordingFormat):
                 path=path,
                 manifest=manifest_data,
                 truth=true_volumes,
-                instance=read_instance,
+                instance=lambda index: read_optional(path / "instance" / f"{index:06d}.png"),
                 poses=_read_poses(true_poses) if true_poses.exists() else lambda index: None,
             )
 

@@ -7,12 +7,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import time
-import warnings
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -20,68 +20,71 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, InputWarning, check_number
+from mstfilter.errors import InputError, check_number, warn_user
 from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
-from mstfilter.formats.video import KnownWorld, RecordingFormat, Video, VideoFormat, object_numbers, pair_stamps
+from mstfilter.formats.video import Video, VideoFormat, object_numbers, pair_stamps, read_optional, warn_of_unread
 from mstfilter.reading import read_json, read_text
-from mstfilter.scene import Frame, Recording, read_labels, table_residual
+from mstfilter.scene import Frame, PauseRule, Recording, table_residual
 
 
 @dataclass(frozen=True)
-class PairedImages(RecordingFormat):
-    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json. Every frame is a pause.
+class PairedImages(VideoFormat):
+    """A folder of pairs NAME_rgb.png, NAME_depth.png with an info.json. By default, every frame is a pause.
 
     ``info.json`` holds ``K`` (fx, fy, cx, cy, or a 3x3 matrix) and ``depth_scale_m``, metres per unit of the 16-bit
-    depth images. The format has no pose: the support plane defines the world axes. Label images NAME_label.png (8 or
-    16 bits, one number for each object) are used as the true label images. Label 0, and labels with most of their
-    depth readings on the support plane, are background.
+    depth images. Label images NAME_label.png (8 or 16 bits, one number for each object) are used as the true label
+    images. Label 0, and labels with most of their depth readings on the support plane, are background. Robot masks
+    NAME_robot.png are optional. The frames have the times 0, 1, 2, ... s.
+
+    Further parameters: `VideoFormat`.
 
     Parameters
     ----------
     frames : tuple of str
         Names of the frames in order. By default, all frames are read, sorted by name with numbers in numerical order.
+    depth_scale : float
+        Metres per unit of integer depth. The default is the scale in info.json.
     """
 
     frames: tuple[str | int, ...] = ()
+    depth_scale: float = 0.0
+    pauses: PauseRule = field(default_factory=EveryNth)
 
     @classmethod
     def detects(cls, path: Path) -> bool:
         return (path / "info.json").is_file() and any(path.glob("*_rgb.png"))
 
-    def open(self, path: Path) -> Recording:
-        example = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
-        with reading(path / "info.json", "pairs of images", example):
-            info = read_json(path / "info.json", "pairs of images", example)
-            K, scale = _four(info["K"]), float(info["depth_scale_m"])
-        names = [p.name.removesuffix("_rgb.png") for p in path.glob("*_rgb.png")]
-        present = sorted(
-            names, key=lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]
-        )
-        chosen = [str(name) for name in self.frames] or present
-        missing = [name for name in chosen if name not in present]
-        if missing:
-            raise InputError(
-                f"no frame {missing[0]!r} in {path}", f"there are {len(present)}: {', '.join(present[:8])}, ..."
-            )
-        pairs = [(path / f"{name}_rgb.png", path / f"{name}_depth.png") for name in chosen]
+    def video(self, path: Path) -> Video:
+        source = _read_intrinsics(path, ("info.json",), "depth_scale_m")
+        scale: Any = self.depth_scale or source[1].get("depth_scale_m")
+        hint = 'for example {"K": [525, 525, 319.5, 239.5], "depth_scale_m": 0.001}'
+        check_number(f"{path / 'info.json'}: depth_scale_m", scale, hint, above=0)
+        names = {p.name.removesuffix(end) for end in ("_rgb.png", "_depth.png") for p in path.glob(f"*{end}")}
+        key = lambda name: [w.zfill(20) if w.isdigit() else w for w in re.split(r"(\d+)", name)]  # noqa: E731
+        present = sorted(sorted(names), key=key)
+        chosen = [str(name) for name in self.frames] or present or ["NAME"]
+        files = [tuple(path / f"{name}_{part}.png" for part in ("rgb", "depth", "robot")) for name in chosen]
+        for name, pair in zip(chosen, files, strict=True):
+            if lost := [file.name for file in pair[:2] if not file.is_file()]:
+                hint = (
+                    f"a pair is NAME_rgb.png and NAME_depth.png; there are {len(present)}: {', '.join(present[:8])}"
+                )
+                raise InputError(f"no frame {name!r} in {path}: {' and '.join(lost)} missing", hint)
         title = chosen[0] if len(chosen) == 1 else f"{chosen[0]}-{chosen[-1]}"
-        video = Video.of_files(title, tuple(float(k) for k in range(len(chosen))), pairs, K, path, scale)
-        made = video.recording(EveryNth(), KnownWorld())
+        times = tuple(float(k) for k in range(len(chosen)))
+        made = _calibrated(self, path, source, title, times, files, scale)
+        return replace(made, read_instance=lambda k: read_optional(path / f"{chosen[k]}_label.png"))
 
-        def instance(index: int) -> np.ndarray | None:
-            return _instance(made.frames[index], path / f"{chosen[index]}_label.png")
+    def open(self, path: Path) -> Recording:
+        made = super().open(path)
+        return replace(made, instance=lambda index: _objects(made.frames[index], made.instance(index)))
 
-        return replace(made, instance=instance)
 
-
-def _instance(frame: Frame, file: Path) -> np.ndarray | None:
-    """The true label image (H, W) of a frame, or None without a label file."""
-    if not file.is_file():
+def _objects(frame: Frame, labels: np.ndarray | None) -> np.ndarray | None:
+    """The label image (H, W) of a frame without the labels of the table."""
+    if labels is None:
         return None
-    labels = read_labels(file)
-    if labels.shape != frame.depth.shape:
-        raise InputError(f"label image {file} has shape {labels.shape}, its frame has {frame.depth.shape}")
     with np.errstate(invalid="ignore"):
         on_plane = np.abs(table_residual(frame)) < _ON_PLANE
     known = np.unique(labels[frame.valid])
@@ -95,8 +98,13 @@ _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _STILL = "remove the file if the camera stands still"
 _POLL_S = 0.02
 _WRITTEN_S = 0.3  # age of the last files after which they are complete
-_INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
-_UNREAD = {"D", "coeffs", "dist_coeffs", "distortion_coefficients", "extrinsics", "T_world_camera"}
+INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
+_ENTRIES = INTRINSICS, "fps", "depth_scale"
+_READ = ("K", "fx", "fy", "cx", "cy", "intrinsic_matrix", "distortion", "width", "height")
+#: Entries of the recorders of Open3D, and of info.json, that say nothing about the images.
+_NOTES = {"device_name", "serial_number", "serial_number_", "stream_length_usec", "color_format", "depth_format"}
+_NOTES |= {"color_mode", "depth_mode", "class_name", "version_major", "version_minor", "frames", "classes", "source"}
+_Source = tuple[Path | None, dict[str, Any]]  # a file of intrinsics, and its entries
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,8 @@ class Redwood(VideoFormat):
     holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
     Open3D's ``intrinsic_matrix`` in column-major order. Colour and depth images are paired by the last number in
     their names, or by time if the numbers are time stamps. Depth files are 16-bit PNG or TIFF, or floating-point in
-    metres (.npy, .tif). The camera must not move. Format: http://redwood-data.org/indoor/fileformat.html.
+    metres (.npy, .tif). An optional robot mask robot/NAME.png has the name of its colour image. The camera must not
+    move. Format: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
@@ -124,7 +133,7 @@ class Redwood(VideoFormat):
 
     @classmethod
     def detects(cls, path: Path) -> bool:
-        if not (path / "depth").is_dir() or _is_recording(path) or (path / "scene_camera.json").is_file():
+        if not (path / "depth").is_dir() or is_recording(path) or (path / "scene_camera.json").is_file():
             return False
         folders = tuple(name for name in _COLOUR if name != "rgb" or not (path / "rgb.txt").is_file())
         return any((path / name).is_dir() for name in folders)
@@ -133,20 +142,22 @@ class Redwood(VideoFormat):
         """Yield the time in seconds and the frame (without a pose) of each image pair that is added to a folder.
 
         A pair is read when a later pair exists, or when the files of the pair no longer change. A colour image
-        without a depth image of the same number is skipped. The iteration ends after `idle_s` seconds without a new
-        pair.
+        without a depth image of the same number is skipped, as is one without a robot mask if there is a folder
+        robot/. The iteration ends after `idle_s` seconds without a new pair.
         """
         known: set[str] = set()  # names of the images that were read
         pairs: list[tuple[Path, Path]] = []  # the first and the latest one
         n, since, failed = 0, time.monotonic(), None
         while time.monotonic() - since < idle_s:
             try:
-                for pair in _complete(*self._files(path, known), after=pairs[-1:]):
+                new, images = self._files(path, known)
+                new = [file for file in new if _mask(path, file).is_file()] if (path / "robot").is_dir() else new
+                for pair in _complete(new, images, after=pairs[-1:]):
                     colour, depth = map(list, zip(*pairs[:1], pair, strict=True))
                     video = self._video(path, colour, depth)
                     camera, _, read = video.frame_reader()
                     stamped = _seconds(_number(pair[0])) is not None
-                    seconds = video.times[-1] if stamped else n / self._rate(*_read_intrinsics(path))
+                    seconds = video.times[-1] if stamped else n / self._rate(*_read_intrinsics(path, *_ENTRIES))
                     yield seconds, read(len(video.times) - 1, camera)
                     pairs, n = [*pairs[:1], pair], n + 1
                     known.update(file.name for file in pair)
@@ -158,7 +169,11 @@ class Redwood(VideoFormat):
             raise failed
 
     def video(self, path: Path) -> Video:
-        return self._video(path, *self._files(path))
+        if len(found := [name for name in _COLOUR if (path / name).is_dir()]) > 1:
+            warn_user(f"{path} has the colour folders {', '.join(found)}: {found[0]} is read", "remove the others")
+        colour, depth = self._files(path)
+        _check_masks(path, colour)
+        return self._video(path, colour, depth)
 
     def _files(self, path: Path, known: Collection[str] = ()) -> tuple[list[Path], list[Path]]:
         """Files of colour images and of depth images, except files with names in `known`."""
@@ -171,29 +186,45 @@ class Redwood(VideoFormat):
 
     def _video(self, path: Path, colour: list[Path], depth: list[Path]) -> Video:
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
-        file, stored = _read_intrinsics(path)
-        K = self.K or _stored_matrix(path, file, stored)
+        file, stored = _read_intrinsics(path, *_ENTRIES)
         scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
-        fps = self._rate(file, stored)
-        video = Video.of_files(
-            path.resolve().name,
-            stamps or tuple(k / fps for k in range(len(pairs))),
-            pairs,
-            K,
-            path,
-            scale,
-            distortion=self.distortion or tuple(stored.get("distortion", ())),
-        )
-        for name, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
-            if not self.K and _stored(file, stored, name, n) != n:
-                raise InputError(
-                    f"{file} is for images of another {name}: the images have {n}",
-                    "scale the intrinsics, or give them: K=fx,fy,cx,cy",
-                )
-        return video
+        times = stamps or tuple(k / self._rate(file, stored) for k in range(len(pairs)))
+        files = [(rgb, image, _mask(path, rgb)) for rgb, image in pairs]
+        return _calibrated(self, path, (file, stored), path.resolve().name, times, files, scale)
 
 
-def _is_recording(path: Path) -> bool:
+def _calibrated(
+    reader: VideoFormat, path: Path, source: _Source, name: str, times: tuple[float, ...], files: Any, scale: float
+) -> Video:
+    """The video of triples of files, with the options of a reader or else the entries of a file of intrinsics."""
+    file, stored = source
+    K, distortion = (
+        reader.K or _stored_matrix(path, *source),
+        reader.distortion or tuple(stored.get("distortion", ())),
+    )
+    video = Video.of_files(name, times, files, K, path, scale, distortion=distortion)
+    for side, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
+        if not reader.K and _stored(file, stored, side, n) != n:
+            text = f"{file} is for images of another {side}: the images have {n}"
+            raise InputError(text, "scale the intrinsics, or give them: K=fx,fy,cx,cy")
+    return video
+
+
+def _mask(path: Path, colour: Path) -> Path:
+    """The file of the optional robot mask of a colour image."""
+    return path / "robot" / f"{colour.stem}.png"
+
+
+def _check_masks(path: Path, colour: Iterable[Path]) -> None:
+    """Warn of robot masks that belong to no colour image, or are in a folder with another name."""
+    if near := [name for name in os.listdir(path) if re.search("robot.|mask", name.lower()) and "." not in name]:
+        warn_user(f"{path / near[0]} is not read", "rename it to robot/ if it has the robot masks")
+    if other := sorted({*path.glob("robot/[!.]*")} - {_mask(path, file) for file in colour}):
+        text = f"{path / 'robot'}: {len(other)} masks of no colour image are not read, for example {other[0].name}"
+        warn_user(text, "name a robot mask as its colour image: robot/000000.png for rgb/000000.jpg")
+
+
+def is_recording(path: Path) -> bool:
     """Whether a folder is a recording folder: it has a manifest.json, or a camera.json with a workspace."""
     camera = path / "camera.json"
     ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
@@ -270,16 +301,21 @@ def _paired(
 
 
 def _seconds(number: Decimal) -> Decimal | None:
-    """A time stamp in seconds, from a number with decimals or an integer Unix time in s, ms, us or ns; else None."""
-    if number != number.to_integral_value() or number.as_tuple().exponent != 0:
-        return number
+    """A time stamp in seconds, from a Unix time in s, ms, us or ns or another number with decimals; else None."""
     unit = next((unit for unit in (1, 10**3, 10**6, 10**9) if 10**9 <= number / unit < 10**10), None)
-    return None if unit is None else number / unit
+    if unit is not None:
+        return number / unit
+    return number if number.as_tuple().exponent != 0 else None
 
 
-def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
-    """Path of the intrinsics file, and the entries in the file."""
-    file = next((path / name for name in _INTRINSICS if (path / name).is_file()), None)
+def _stamp(word: str) -> float:
+    """The time in seconds of a line of a TUM file."""
+    return float(_seconds(Decimal(word)) or Decimal(word))
+
+
+def _read_intrinsics(path: Path, names: Iterable[str], *more: str) -> _Source:
+    """Path of the intrinsics file, and the entries in the file. The reader also uses the entries `more`."""
+    file = next((path / name for name in names if (path / name).is_file()), None)
     if file is None:
         return None, {}
     kind = "a file of intrinsics"
@@ -287,9 +323,8 @@ def _read_intrinsics(path: Path) -> tuple[Path | None, dict[str, Any]]:
         stored = read_json(file, kind)
         if not isinstance(stored, dict):
             raise TypeError(f"it holds a {type(stored).__name__}, expected an object with the entry K")
-    if unread := sorted(_UNREAD & stored.keys()):
-        hint = "the lens is read from the entry distortion (k1, k2, p1, p2, ...), the pose from world.T_world_camera"
-        warnings.warn(InputWarning(f"{file}: {unread[0]} is not read", hint), stacklevel=2)
+        stored["distortion"] = np.ravel(stored.get("distortion", ())).astype(float).tolist()
+    warn_of_unread(file, stored, (*_READ, *more), _NOTES)
     return file, stored
 
 
@@ -305,7 +340,7 @@ def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tup
     """Intrinsics fx, fy, cx, cy from the intrinsics file."""
     if file is None:
         raise InputError(
-            f"{path}: intrinsics are missing, there is no {' or '.join(_INTRINSICS)}",
+            f"{path}: intrinsics are missing, there is no {' or '.join(INTRINSICS)}",
             "give them: -o K=fx,fy,cx,cy (the default of Redwood is 525,525,319.5,239.5)",
         )
     hint = "expected fx, fy, cx, cy, or K row by row, or intrinsic_matrix of Open3D column by column; or give K"
@@ -358,15 +393,15 @@ class Tum(VideoFormat):
         outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
         if outside:
             raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
-        stamps = [[float(row[0]) for row in table] for table in (colour, depth)]
+        stamps = [[_stamp(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
-
         times = tuple(stamps[0][i] for i, _ in pairs)
-        truth = path / "groundtruth.txt"
+        truth, images = path / "groundtruth.txt", [path / row[1] for row in colour]
+        _check_masks(path, images)
         return Video.of_files(
             path.resolve().name,
             times,
-            [(path / colour[i][1], path / depth[j][1]) for i, j in pairs],
+            [(images[i], path / depth[j][1], _mask(path, images[i])) for i, j in pairs],
             self.K,
             path,
             self.depth_scale,
@@ -384,8 +419,9 @@ def _table(path: Path, columns: int) -> list[list[str]]:
         if not words:
             continue
         try:
-            float(words[0])
-        except ValueError:
+            Decimal(words[0]) + 0  # refuses signalling values
+            words = words if math.isfinite(float(words[0])) else []
+        except (ValueError, ArithmeticError):
             words = []
         if len(words) < columns:
             raise InputError(
@@ -398,7 +434,7 @@ def _table(path: Path, columns: int) -> list[list[str]]:
 def _motion(path: Path, times: tuple[float, ...]) -> list[RigidTransform]:
     """Camera poses at given times, each from the line of the file with the nearest time stamp."""
     try:
-        rows = np.array([[float(v) for v in row[:8]] for row in _table(path, 8)])
+        rows = np.array([[_stamp(row[0]), *map(float, row[1:8])] for row in _table(path, 8)])
         if not np.isfinite(rows).all():
             raise ValueError("a value is not finite")
         stamps = rows[:, 0]

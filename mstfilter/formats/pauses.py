@@ -126,8 +126,8 @@ class Still(PauseRule):
             raise InputError(f"region is {self.region}, expected left, top, right, bottom from 0 to 1")
 
     def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        intervals = self.intervals(times, read_rgb)
-        if not intervals:
+        found = self._found(times, read_rgb)
+        if not found:
             raise InputError(
                 f"no pause found: in {len(times)} frames ({times[-1] - times[0]:.1f} s) the image is never still for "
                 f"{self.hold_s:g} s",
@@ -136,7 +136,10 @@ class Still(PauseRule):
                 "accept shorter intervals: -o pauses.hold_s=0.2; or use the first and last frame: --pauses ends",
                 'in Python pauses=(0, 40, 85), pauses="ends" or a rule, pauses=Still(hold_s=0.2)',
             )
-        return tuple((first + last) // 2 for first, last in intervals)
+        return found
+
+    def _found(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+        return tuple((first + last) // 2 for first, last in self.intervals(times, read_rgb))
 
     def intervals(
         self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]
@@ -208,15 +211,9 @@ class Settled(Still):
 
         return add
 
-    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
+    def _found(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
         add = self.watch()
-        found = tuple(index for index, time in enumerate(times) if add(time, read_rgb(index)))
-        if not found:
-            raise InputError(
-                f"no pause found: in {len(times)} frames the image is never still for {self.hold_s:g} s",
-                "accept shorter intervals: -o pauses.hold_s=0.2; or give the pauses: --pauses 0,40,85",
-            )
-        return found
+        return tuple(index for index, time in enumerate(times) if add(time, read_rgb(index)))
 
 
 _RECENT = 100  # changes between frames in which `Settled` measures the noise

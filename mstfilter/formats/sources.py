@@ -11,13 +11,17 @@ values of a list. The format ``./file.py:Class`` is a class in a file of the use
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Sequence
+from fnmatch import fnmatch
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from mstfilter import formats
 from mstfilter.errors import InputError
+from mstfilter.formats.image_folders import INTRINSICS, is_recording
 from mstfilter.formats.pauses import pauses_from_text
 from mstfilter.formats.video import RecordingFormat
 from mstfilter.registry import Registry, settings
@@ -83,16 +87,40 @@ def detect_format(path: Path) -> str:
         raise InputError(
             f"{path} looks like {' and like '.join(found)}", f"choose one: --format {' or --format '.join(found)}"
         )
-    if path.is_dir() and (
-        not any(path.iterdir()) or any((path / n).exists() for n in ("camera.json", "rgb", "depth"))
-    ):
-        return "recording"  # its reader reports what is missing
+    entries = sorted(p.name for p in path.iterdir()) if path.is_dir() else []
+    near = _near_misses(entries)
+    if path.is_dir() and not near:  # the reader reports what is missing
+        if not entries or is_recording(path):
+            return "recording"
+        for name, parts in _PARTS.items():
+            if any(fnmatch(entry, part) for entry in entries for part in parts):
+                return name
     raise InputError(
         f"{path} has no known format",
+        *near,
         f"known formats: {', '.join(names)}; `mstfilter list format` describes them",
         "each colour image needs a depth image that is aligned with it: record with an RGB-D camera",
         "in Python, mstfilter.Recording.from_arrays makes a recording from arrays",
     )
+
+
+_PARTS = {
+    "pairs": ("info.json", "*_rgb.png", "*_depth.png"),
+    "tum": ("rgb.txt", "depth.txt"),
+    "redwood": ("depth", "rgb", "color", "colour", "image"),
+    "recording": ("manifest.json", "camera.json"),
+}
+
+
+def _near_misses(entries: Sequence[str]) -> list[str]:
+    """Hints about files and folders whose names are nearly those of a known format."""
+    known, hints = [*chain(*_PARTS.values(), INTRINSICS)], []
+    for name in (entry for entry in entries if not any(fnmatch(entry, part) for part in known)):
+        inside = [word for word in _PARTS["redwood"] if "." not in name and word in name.lower()]
+        close = difflib.get_close_matches(name.lower(), known, 1, 0.75) or inside
+        if close and close[0] not in entries:
+            hints.append(f"{name} is there: is it {close[0]}? rename it")
+    return hints
 
 
 def format_settings(options: Sequence[str]) -> dict[str, Any]:

@@ -6,12 +6,7 @@ A reader is a subclass of `RecordingFormat`. A reader of videos is a `VideoForma
 >>> if reader.detects(path):
 ...     recording = reader.open(path)
 
-To read another layout, define a subclass in a file and pass the class: ``mstfilter convert IN OUT --format
-./mine.py:Mine``. The fields of the class are options of the command line. Build the recording with `Video`, which
-checks every frame on access. For arrays in memory use `Recording.from_arrays`.
-
->>> video = Video("tum", times, read_rgb, read_depth, K, path, depth_scale=0.0002)
->>> video.recording(pauses=Still(), world=KnownWorld())
+To read another layout, see the page "File formats" of the documentation. `Video` checks every frame on access.
 
 By default, the camera pose at the first pause is computed from the support plane. Stored camera poses are used only
 relative to the stored pose at the first pause, because the table is seldom at z = 0 in the axes of stored poses. A
@@ -21,9 +16,8 @@ relative to the stored pose at the first pause, because the table is seldom at z
 from __future__ import annotations
 
 import math
-import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError, warn_user
 from mstfilter.fields import Bounded, NonNegativeInt
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
@@ -46,6 +40,7 @@ from mstfilter.scene import (
     check_depth,
     find_world,
     read_depth,
+    read_labels,
     read_rgb,
     rigid_from_matrix,
 )
@@ -111,22 +106,20 @@ class KnownWorld:
     @cached_property
     def pose(self) -> RigidTransform | None:
         """The given camera pose, or None if no pose is given."""
-        if not self.T_world_camera:
+        if not (numbers := self.T_world_camera):
             return None
-        if len(self.T_world_camera) != 16:
-            raise InputError(f"world.T_world_camera has {len(self.T_world_camera)} numbers, expected 16, row by row")
-        return rigid_from_matrix(np.reshape(self.T_world_camera, (4, 4)), "world.T_world_camera")
+        if len(numbers) != 16:
+            raise InputError(f"world.T_world_camera has {len(numbers)} numbers, expected 16, row by row")
+        return rigid_from_matrix(np.reshape(numbers, (4, 4)), "world.T_world_camera")
 
     @cached_property
     def grid(self) -> VoxelGrid | float:
         """The given workspace, or its voxel size in metres if no workspace is given."""
-        if not self.workspace:
+        if not (box := self.workspace):
             return self.voxel_size
-        if len(self.workspace) != 6:
-            raise InputError(
-                f"world.workspace has {len(self.workspace)} numbers, expected 6: x y z lower, x y z upper"
-            )
-        return VoxelGrid.from_bounds(np.array(self.workspace[:3]), np.array(self.workspace[3:]), self.voxel_size)
+        if len(box) != 6:
+            raise InputError(f"world.workspace has {len(box)} numbers, expected 6: x y z lower, x y z upper")
+        return VoxelGrid.from_bounds(np.array(box[:3]), np.array(box[3:]), self.voxel_size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +137,8 @@ class Video:
     motion: Sequence[RigidTransform] | None = None  #: camera poses in any world, one per frame
     #: True label image of a frame, by index.
     read_instance: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
+    #: Image of a frame that is 0 except at the robot, by index.
+    read_robot: Callable[[int], np.ndarray | None] = field(default=lambda index: None)
     distortion: tuple[float, ...] = ()  #: OpenCV's k1, k2, p1, p2, k3, ... of both images; they are undistorted
     max_pixels: int = WORKING_PIXELS  #: larger images are reduced; 0 means no limit
 
@@ -152,21 +147,16 @@ class Video:
         cls,
         name: str,
         times: tuple[float, ...],
-        pairs: Sequence[tuple[Path, Path]],
+        files: Sequence[tuple[Path, ...]],
         K: tuple[float, ...],
         path: Path,
         depth_scale: float,
         **more: Any,
     ) -> Video:
-        """A video with one colour file and one depth file for each frame."""
-
-        def rgb(index: int) -> np.ndarray:
-            return read_rgb(pairs[index][0])
-
-        def depth(index: int) -> np.ndarray:
-            return read_depth(pairs[index][1], depth_scale)
-
-        return cls(name, times, rgb, depth, K, path, depth_scale, **more)
+        """A video with a colour file, a depth file and an optional file of the robot mask for each frame."""
+        more["read_robot"] = lambda index: read_optional(*files[index][2:])
+        images = lambda k: read_rgb(files[k][0]), lambda k: read_depth(files[k][1], depth_scale)
+        return cls(name, times, *images, K, path, depth_scale, **more)
 
     def between(self, start_s: float, stop_s: float) -> Video:
         """The frames from `start_s` to `stop_s` seconds after the first frame."""
@@ -185,6 +175,7 @@ class Video:
             read_depth=lambda index: self.read_depth(kept[index]),
             motion=None if self.motion is None else [self.motion[k] for k in kept],
             read_instance=lambda index: self.read_instance(kept[index]),
+            read_robot=lambda index: self.read_robot(kept[index]),
         )
 
     def frame_reader(self) -> tuple[Camera, Any, Callable[[int, Camera], Frame]]:
@@ -247,7 +238,22 @@ class Video:
     def _frame(self, index: int, camera: Camera, source: np.ndarray | None) -> Frame:
         rgb, depth = self.read_rgb(index), self.read_depth(index)
         check_images(rgb, depth, camera, self.depth_scale, f"frame {index} of {self.path}")
-        return Frame(_undistort(rgb, source, smooth=True), _undistort(depth, source, np.nan), camera)
+        robot = self.read_robot(index)
+        if robot is not None and robot.shape != depth.shape:
+            raise InputError(f"robot mask of frame {index} of {self.path} has shape {robot.shape}, not {depth.shape}")
+        robot = None if robot is None else _undistort(robot, source) > 0
+        return Frame(_undistort(rgb, source, smooth=True), _undistort(depth, source, np.nan), camera, robot)
+
+
+def read_optional(path: Path | None = None) -> np.ndarray | None:
+    """A label image or mask (H, W), or None if there is no such file."""
+    return read_labels(path) if path is not None and path.is_file() else None
+
+
+def warn_of_unread(file: Path, stored: Iterable[str], read: Iterable[str], notes: Iterable[str] = ()) -> None:
+    """Warn of entries of a file, except `notes`, that are not read."""
+    if unread := sorted(set(stored) - {*read, *notes}):
+        warn_user(f"{file}: not read: {', '.join(unread)}", f"the entries that are read are {', '.join(read)}")
 
 
 def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: float, where: str) -> None:
@@ -260,7 +266,8 @@ def check_images(rgb: np.ndarray, depth: np.ndarray, camera: Camera, scale: floa
         )
     if rgb.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{where} is {sizes[0]}, the camera has {camera.width} x {camera.height}")
-    check_depth(depth, f"depth of {where} with {scale:g} m per unit")
+    hint = "check the depth scale: millimetres need 0.001, TUM images 0.0002"
+    check_depth(depth, f"depth of {where} with {scale:g} m per unit", hint)
 
 
 @dataclass(frozen=True)
@@ -334,16 +341,13 @@ def pair_stamps(
         raise InputError(
             f"{where}: no colour image has a depth image within {tolerance_s:g} s; the closest pair is "
             f"{np.abs(a - b[to_b]).min():.3g} s apart",
-            "check that both use the same clock, or raise the limit: tolerance_s=0.1",
+            "check that both use the same clock and are in seconds, or raise the limit: tolerance_s=0.1",
         )
     if len(kept) < 0.9 * len(a):
-        warnings.warn(
-            InputWarning(
-                f"{where}: {len(a) - len(kept)} of {len(a)} colour images are omitted, without a depth image within "
-                f"{tolerance_s:g} s ({len(b)} depth images)",
-                "raise the limit: tolerance_s=0.1",
-            ),
-            stacklevel=2,
+        warn_user(
+            f"{where}: {len(a) - len(kept)} of {len(a)} colour images are omitted, without a depth image within "
+            f"{tolerance_s:g} s ({len(b)} depth images)",
+            "raise the limit: tolerance_s=0.1",
         )
     return tuple(kept)
 

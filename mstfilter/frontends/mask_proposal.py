@@ -20,13 +20,7 @@ from mstfilter.completion import Completer, Extrude
 from mstfilter.frontends.mask_files import read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
 from mstfilter.scene import Clip, Recording, UsesFiles, component_key, content_key, memo
-from mstfilter.segmentation import (
-    CutSampler,
-    ExactCuts,
-    ObjectRule,
-    Tree,
-    complete_segments,
-)
+from mstfilter.segmentation import CutSampler, ExactCuts, ObjectRule, Tree, complete_segments
 from mstfilter.smc import Population, Proposal, child
 
 

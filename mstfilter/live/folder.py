@@ -97,9 +97,9 @@ def filter_folder(
         settings["max_pixels"] = reader.max_pixels
         try:
             with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
-                stream.push(frame.rgb, frame.depth, time)
+                stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask)
                 for time, frame in frames:
-                    stream.push(frame.rgb, frame.depth, time)
+                    stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask)
         except BaseException as error:
             finish("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
             raise

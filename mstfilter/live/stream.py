@@ -37,9 +37,11 @@ from mstfilter.scene import (
     Clip,
     Frame,
     Hypothesis,
+    Look,
     VoxelGrid,
     check_depth,
     examine,
+    examine_next,
     find_world,
     render_hypothesis,
     report_findings,
@@ -107,10 +109,8 @@ class Stream:
 
     Notes
     -----
-    If `max_frames` frames are queued because the filter is slower than the camera, new frames are dropped. If a clip
-    reaches `max_frames`, frames with little motion are removed from the clip. `counts` has the number of dropped and
-    removed frames. At most three times `max_frames` frames are in memory.
-
+    If `max_frames` frames are queued, new frames are dropped. If a clip reaches `max_frames`, frames with little
+    motion are removed from the clip. `counts` has the numbers. At most three times `max_frames` frames are in memory.
     An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
@@ -138,6 +138,8 @@ class Stream:
         self._state, self._on_pause = self._filter.start(seed), on_pause
         self._max, self._threads, self._max_pixels = max_frames, threads, max_pixels
         self._world: Camera | None = None  # the camera of the first pause
+        self._first: Look | None = None  # what the first pause shows
+        self._reported: set[tuple[str, ...]] = set()
         self._clip: list[_Item] = []
         self._trackers: list[Any] = []
         self._n_pauses = 0
@@ -292,8 +294,8 @@ class Stream:
             self._world, self._grid = find_world(item.frame, self._grid)
         if item.frame.camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
-        if not self._clip:
-            report_findings(examine([item.frame], [0], self._grid), "stream")  # type: ignore[arg-type]
+        if rests:
+            self._examine(item)
         self._clip.append(item)
         for tracker in self._trackers:
             tracker.add(item.frame)
@@ -301,6 +303,17 @@ class Stream:
             self._end_clip()
         elif len(self._clip) >= self._max:
             self._thin()
+
+    def _examine(self, item: _Item) -> None:
+        """Compare the frame of a pause with the first pause. A fault gives one warning, not one at every pause."""
+        grid, times = self._grid, [one.time for one in (*self._clip, item)]
+        assert isinstance(grid, VoxelGrid)
+        look, first = Look(item.frame, grid, item.number), self._first
+        found = examine([item.frame], [0], grid) if first is None else examine_next(first, look, times)
+        self._first = first or look
+        found = [one for one in found if one.hints not in self._reported]
+        self._reported.update(one.hints for one in found)
+        report_findings(found, "stream")
 
     def _thin(self) -> None:
         """Remove the frames with little motion from the clip, then every second frame while the clip is too long."""

@@ -131,9 +131,7 @@ class TrueCompletion(UsesTruth, Completer):
         t = self.truth.pause_of(frame)
         owner = np.where(self.objects.foreground(frame, grid).pixels, self.truth.instance(t), 0).ravel()
         voxels, pixel = memo(
-            "true_pixels",
-            (frame.key, grid.key, self.bound_key),
-            lambda: self._pixels(frame, grid, t),
+            "true_pixels", (frame.key, grid.key, self.bound_key), lambda: self._pixels(frame, grid, t)
         )
         return [
             self._true(rng, frame, np.asarray(mask, bool), grid, voxels, pixel, owner)

@@ -16,7 +16,4 @@ from mstfilter.lazy import attach
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
 __interfaces__ = {"pairs": "PairOdds"}
-__components__ = {
-    "update": {"partition": "PartitionUpdate"},
-    "pairs": {"shares": "PairEvidence"},
-}
+__components__ = {"update": {"partition": "PartitionUpdate"}, "pairs": {"shares": "PairEvidence"}}

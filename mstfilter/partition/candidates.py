@@ -43,12 +43,7 @@ class Choices:
 
     @classmethod
     def of(
-        cls,
-        cells: Cells,
-        log_weights: np.ndarray,
-        log_odds: Sequence[np.ndarray],
-        n: int,
-        temperature: float = 1.0,
+        cls, cells: Cells, log_weights: np.ndarray, log_odds: Sequence[np.ndarray], n: int, temperature: float = 1.0
     ) -> Choices:
         """The n most probable pairs of a prediction and a partition.
 

@@ -212,12 +212,7 @@ class PartitionUpdate(Update):
         return each(lambda one: self._prediction(*one, readings, frame), columns)
 
     def _prediction(
-        self,
-        hypothesis: Hypothesis,
-        refined: Hypothesis,
-        quality: float,
-        readings: Readings,
-        frame: Frame,
+        self, hypothesis: Hypothesis, refined: Hypothesis, quality: float, readings: Readings, frame: Frame
     ) -> Prediction:
         of_objects, of_scene = np.zeros(0), quality
         if self.least_agreement:

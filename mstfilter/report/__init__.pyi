@@ -25,7 +25,4 @@ from mstfilter.report.pictures import (
 from mstfilter.report.run_numbers import RunNumbers as RunNumbers, read_numbers as read_numbers
 from mstfilter.report.run_report import write_report as write_report
 from mstfilter.report.study_report import write_study_report as write_study_report
-from mstfilter.report.viewer import (
-    recording_page as recording_page,
-    run_page as run_page,
-)
+from mstfilter.report.viewer import recording_page as recording_page, run_page as run_page

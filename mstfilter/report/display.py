@@ -23,15 +23,7 @@ from matplotlib.figure import Figure
 from mstfilter.belief import Belief
 from mstfilter.report.identities import match_objects, weigh_distinct
 from mstfilter.report.page import short_text
-from mstfilter.report.pictures import (
-    Colour,
-    colour,
-    data_uri,
-    jpeg_bytes,
-    png_bytes,
-    viewpoint,
-    voxel_picture,
-)
+from mstfilter.report.pictures import Colour, colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
 from mstfilter.scene import Clip, Frame, Hypothesis, Recording
 from mstfilter.smc import Candidates, Infos, Population, State, as_matrix
 

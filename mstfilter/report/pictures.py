@@ -152,10 +152,7 @@ def close_up(volumes: Iterable[_Volume], camera: Camera) -> tuple[float, float, 
 
 
 def viewpoint(
-    volumes: Iterable[_Volume],
-    camera: Camera | None = None,
-    width: int = 600,
-    height: int = 450,
+    volumes: Iterable[_Volume], camera: Camera | None = None, width: int = 600, height: int = 450
 ) -> Camera:
     """A camera that looks down obliquely and shows the occupied voxels of all volumes.
 

@@ -4,12 +4,7 @@ from mstfilter.scene.arrays import (
     max_of_three as max_of_three,
     read_only as read_only,
 )
-from mstfilter.scene.cache import (
-    Cache as Cache,
-    memo as memo,
-    memo_many as memo_many,
-    scene_cache as scene_cache,
-)
+from mstfilter.scene.cache import Cache as Cache, memo as memo, memo_many as memo_many, scene_cache as scene_cache
 from mstfilter.scene.camera import (
     WORKING_PIXELS as WORKING_PIXELS,
     Camera as Camera,
@@ -19,10 +14,7 @@ from mstfilter.scene.camera import (
     scaled_length as scaled_length,
 )
 from mstfilter.scene.disk_cache import DiskCache as DiskCache
-from mstfilter.scene.encoding import (
-    decode_hypotheses as decode_hypotheses,
-    encode_hypotheses as encode_hypotheses,
-)
+from mstfilter.scene.encoding import decode_hypotheses as decode_hypotheses, encode_hypotheses as encode_hypotheses
 from mstfilter.scene.evidence import (
     Evidence as Evidence,
     FreeSpace as FreeSpace,
@@ -36,6 +28,7 @@ from mstfilter.scene.evidence import (
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
+    check_depth as check_depth,
     decode_image as decode_image,
     depth_sigma as depth_sigma,
     grey_blocks as grey_blocks,
@@ -57,8 +50,10 @@ from mstfilter.scene.partitions import (
 )
 from mstfilter.scene.plausibility import (
     Finding as Finding,
+    Look as Look,
     examine as examine,
     examine_hypotheses as examine_hypotheses,
+    examine_next as examine_next,
     report_findings as report_findings,
 )
 from mstfilter.scene.recording import (
@@ -66,7 +61,6 @@ from mstfilter.scene.recording import (
     PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
-    check_depth as check_depth,
     find_world as find_world,
     truth_reader as truth_reader,
 )

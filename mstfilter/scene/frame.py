@@ -53,7 +53,7 @@ _PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 def _decode(path: Path, flags: int) -> np.ndarray:
     with reading(path, "an image"):
         if not path.exists():
-            raise InputError(f"image is missing: {path}", "record the frame again, or remove it from manifest.json")
+            raise InputError(f"image is missing: {path}", "copy or record it again, or leave the frame out")
     data = read_bytes(path, "an image")
     if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
         # The decoder would fill the missing rows with zeros without an error.
@@ -122,16 +122,36 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
     return (found[256], found[257]) if {256, 257} <= set(found) else None
 
 
+_IN_METRES = "floating-point depth is read in metres, whatever the depth scale is: multiply millimetres by 0.001"
+
+
+def check_depth(depth: np.ndarray, where: str, hint: str = _IN_METRES) -> None:
+    """Raise InputError if a depth image (H, W) has no reading, or if its median is not plausible in metres."""
+    with np.errstate(invalid="ignore"):
+        metres = depth[np.isfinite(depth) & (depth > 0)]
+    if metres.size == 0:
+        raise InputError(
+            f"{where} has no reading at all",
+            "0 and NaN are no reading; leave such frames out, for a video with start_s or stop_s",
+        )
+    median = float(np.median(metres))
+    if not 0.05 < median < 30:
+        raise InputError(f"{where} has a median of {median:g} m, expected between 0.05 and 30 m", hint)
+
+
 def read_rgb(path: Path) -> np.ndarray:
     """Colour image (H, W, 3) uint8, RGB."""
     import cv2
 
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)  # as its depth image
+    # The orientation is ignored, as in the depth image. The bits are kept, so that depth is not taken for colour.
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype != np.uint8:
+        raise InputError(f"colour image {path} has type {image.dtype}, expected 8 bits", "is it a depth image?")
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres. Pixels with the value 0 in the file become NaN.
+    """Depth image (H, W) float32 in metres, NaN for no reading: the values 0 and (of 16 bits) 65535 in the file.
 
     16-bit integers are multiplied by `scale` (metres per unit). Floating-point values (.npy, .tif) must be in metres.
     """
@@ -143,8 +163,12 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
             f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits or "
             "float"
         )
-    unit = 1 if np.issubdtype(image.dtype, np.floating) else scale
-    return np.where(image > 0, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
+    unit = scale
+    if np.issubdtype(image.dtype, np.floating):
+        unit = 1
+        check_depth(image, f"depth image {path}")
+    read = (image > 0) & (image != 65535)
+    return np.where(read, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
 
 
 def _load_array(path: Path) -> np.ndarray:

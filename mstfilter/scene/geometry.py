@@ -186,6 +186,26 @@ def table_residual(frame: Frame) -> np.ndarray:
     return memo("table_residual", frame.key, compute)
 
 
+def in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
+    """(...) bool: whether x and y of points (..., 3) are inside the grid."""
+    index = grid.index_of(points)[..., :2]
+    return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
+
+
+def shares_with_depth(frame: Frame, grid: VoxelGrid) -> tuple[float, float]:
+    """Share of the pixels with a depth reading: of the image, and of the part that shows the table of the workspace.
+
+    Pixels of the robot are not counted.
+    """
+    camera, known = frame.camera, np.isfinite(frame.depth)
+    down = camera.rays() @ camera.pose.as_matrix()[2, :3]
+    with np.errstate(divide="ignore"):
+        table = camera.unproject(np.where(down < 0, -camera.position[2] / down, np.nan))
+    image = np.ones_like(known) if frame.robot_mask is None else ~frame.robot_mask
+    shown = image & in_columns(grid, table)
+    return float(known[image].mean()), float(known[shown].mean()) if shown.any() else 1.0
+
+
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 
 _BORDER = 0.03  # metres: a wall may stand at the border of the visible table

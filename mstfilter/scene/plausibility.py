@@ -11,22 +11,20 @@ limits of the checks were chosen in ``experiments/plausibility``.
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import FrameType
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError, warn_user
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
-from mstfilter.scene.geometry import SupportPlane, fit_support_plane
+from mstfilter.scene.geometry import SupportPlane, fit_support_plane, in_columns, shares_with_depth
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
+_Limits = tuple[float, float]
 _FIELDS, _POSSIBLE_FIELDS = (12.0, 130.0), (3.0, 160.0)  # degrees: horizontal field of view; warning and stop
 _ASPECTS, _ANY = (0.8, 1.25), (-np.inf, np.inf)  # ratio of the focal lengths; warning
 _OFF_CENTRE = (0.2, 0.4)  # of the image size: principal point from the middle; warning and stop
@@ -39,6 +37,8 @@ _ON_TABLE, _NEAR_TABLE = 0.025, 0.1  # metres from z = 0: on the table; where th
 _MAX_TILT, _MAX_HEIGHT = 2.5, 0.025  # degrees and metres between the table and z = 0: warning; twice: stop
 _OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
 _MIN_ON_TABLE = 0.1  # share of the readings on the table, as `fit_support_plane` demands
+_MAX_INTERVAL = 10.0  # seconds between frames; warning
+_MIN_KNOWN = 0.25  # share of the pixels with readings; warning
 _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
 _TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
 # Tilt in degrees, height and shift in metres of the camera between pauses: warning; twice: stop.
@@ -71,29 +71,39 @@ _GIVE_POSE = "give the pose T_world_camera of the camera over the table"
 _GIVE_WORKSPACE = "give a workspace around the objects, or none: it is then placed around the objects on the table"
 
 
-def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> list[Finding]:
-    """Findings about the frames of a recording at its pauses, and about the workspace.
+def examine(
+    frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid, times: Sequence[float] = ()
+) -> list[Finding]:
+    """Findings about the frames of a recording at its pauses, about the workspace and the times in seconds.
 
-    Findings that stop a run come first.
-
-    The frames are read one by one. Only reduced images (160 and 320 columns) and image corners are kept in memory.
+    Findings that stop a run come first. The frames are read one by one, and are not kept in memory.
     """
-    found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid)]
+    found = [*_intrinsics(frames[pauses[0]].camera), *_voxels(grid), *_interval(times, len(pauses))]
     if not any(finding.stop for finding in found):
         looks = [Look(frames[p], grid, p) for p in pauses]
         found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
     if not any(finding.stop for finding in found):
-        found += [*_support(looks[0]), *_scale(looks[0]), *_workspace(looks), *_moved(looks)]
+        found += [*_support(looks[0]), *_scale(looks[0]), *_missing(looks), *_workspace(looks), *_moved(looks)]
         found += [*_registration(looks), *_repeated(looks), *_one_pause(frames, pauses)]
+        for view in frames[pauses[0]].views:
+            doubts = [*_intrinsics(view.camera), *unreadable(view, "the image")]
+            doubts = doubts or [*_support(look := Look(view, grid)), *_scale(look)]
+            found += [_warning(f"one of the views: {doubt.message}", *doubt.hints) for doubt in doubts]
     return sorted(found, key=lambda finding: not finding.stop)
+
+
+def examine_next(first: Look, look: Look, times: Sequence[float]) -> list[Finding]:
+    """Findings about a later pause of a stream, and about the times of its clip: those of `examine`."""
+    found = [*_interval(times, 2), *unreadable(look.frame, f"frame {look.index}")]
+    return [*found, *_missing([look]), *_moved([first, look])]
 
 
 def report_findings(findings: Iterable[Finding], where: str) -> None:
     """Raise InputError for a finding that stops a run; warn of the other findings. Messages begin with `where`."""
-    for finding in findings:
+    for finding in sorted(findings, key=lambda finding: not finding.stop):
         if finding.stop:
             raise InputError(f"{where}: {finding.message}", *finding.hints)
-        _warn(f"{where}: {finding.message}", *finding.hints)
+        warn_user(f"{where}: {finding.message}", *finding.hints)
 
 
 def examine_hypotheses(hypotheses: Sequence[Hypothesis], frame: Frame) -> list[Finding]:
@@ -120,6 +130,7 @@ class Look:
         self.frame, self.edges = _sampled(frame, 160), _Edges(_sampled(frame, 320))
         self.corners = _Corners(_sampled(frame, 640), grid)
         self.points = self.frame.points[self.frame.valid]
+        self.known = shares_with_depth(frame, grid)
 
     @cached_property
     def on_table(self) -> np.ndarray:
@@ -129,18 +140,7 @@ class Look:
     @cached_property
     def in_columns(self) -> np.ndarray:
         """(n,) bool: whether each depth reading is inside, above or below the workspace."""
-        return _in_columns(self.grid, self.points)
-
-    @cached_property
-    def inside(self) -> np.ndarray:
-        """World points (m, 3) of the depth readings inside the workspace."""
-        return self.points[self.grid.contains(self.grid.index_of(self.points))]
-
-    @cached_property
-    def distance(self) -> float:
-        """Median depth in metres of the readings on the table, or of all readings if few are on the table."""
-        depth = self.frame.depth[self.frame.valid]
-        return float(np.median(depth[self.on_table] if self.on_table.mean() > _MIN_ON_TABLE else depth))
+        return in_columns(self.grid, self.points)
 
     def plane(self, chosen: np.ndarray) -> tuple[float, float, np.ndarray] | None:
         """Tilt (degrees), height (m) and normal (3,) in camera axes of a plane fitted to `chosen` readings (n,)."""
@@ -174,15 +174,6 @@ def _sampled(frame: Frame, width: int) -> Frame:
     K[:2] /= step
     mask = None if frame.robot_mask is None else frame.robot_mask[part, part]
     return Frame(rgb, depth, Camera(K, depth.shape[1], depth.shape[0], frame.camera.T_world_camera), mask)
-
-
-def _in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
-    """(...) bool: whether x and y of points (..., 3) are inside the grid."""
-    index = grid.index_of(points)[..., :2]
-    return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
-
-
-_Limits = tuple[float, float]
 
 
 def _limited(value: float, usual: _Limits, possible: _Limits, text: str, *hints: str) -> Iterator[Finding]:
@@ -220,13 +211,23 @@ def _voxels(grid: VoxelGrid) -> Iterator[Finding]:
     yield from _limited(size, _VOXELS, _POSSIBLE_VOXELS, text, hint)
 
 
+def _interval(times: Sequence[float], n_pauses: int) -> Iterator[Finding]:
+    """A finding if the frames between the pauses are far apart, as milliseconds are that are taken for seconds."""
+    apart = float(np.median(np.diff(times))) if len(times) > n_pauses + 2 else 0.0
+    if apart > _MAX_INTERVAL:
+        text = f"the frames are {apart:.4g} s apart, so motion cannot be tracked: are their times in milliseconds?"
+        yield _warning(
+            text, "times are in seconds: multiply milliseconds by 0.001, or rename the images by time in s"
+        )
+
+
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
     """Findings about images that are constant or fully masked. `which` names the frame in the messages."""
     depth = frame.depth[np.isfinite(frame.depth)]
     masked = 0.0 if frame.robot_mask is None else frame.robot_mask.mean()
-    if masked > 0.95 or not frame.valid.any():
-        text = f"the robot mask of {which} covers {masked:.0%} of the image, and all or most of its depth"
-        yield _stop(text, "is the mask inverted? True is the robot")
+    if masked > 0.6 or not frame.valid.any():
+        text = f"the robot mask of {which} covers {masked:.0%} of the image and most or all of its depth"
+        yield Finding(masked > 0.95 or not frame.valid.any(), text, ("is the mask inverted? True is the robot",))
     elif np.ptp(depth) < 1e-6:
         text = f"all depth readings of {which} are {depth[0]:.3g} m"
         yield _stop(text, "check that the depth images are those of the camera, in metres")
@@ -281,7 +282,8 @@ def _other_support(first: Look) -> Iterator[Finding]:
 
 def _scale(first: Look) -> Iterator[Finding]:
     """Findings about distances that are unusual for a camera over a table."""
-    z, size = first.distance, first.grid.voxel_size
+    depth, size = first.frame.depth[first.frame.valid], first.grid.voxel_size
+    z = float(np.median(depth[first.on_table] if first.on_table.mean() > _MIN_ON_TABLE else depth))
     possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
     text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
     voxels = "larger" if z > possible[1] else "smaller"
@@ -295,16 +297,28 @@ def _scale(first: Look) -> Iterator[Finding]:
         yield _warning(text, _CHECK_SCALE, "or give a higher workspace", floor)
 
 
+def _missing(looks: Sequence[Look]) -> Iterator[Finding]:
+    """A finding if few pixels of a pause have depth readings."""
+    least = min(looks, key=lambda look: min(look.known))
+    if min(least.known) < _MIN_KNOWN:
+        text = "frame {} has depth readings in {:.0%} of the image and {:.0%} of its part that shows the workspace"
+        hint = (
+            "objects without readings are missed: check exposure, distance and glare, and the colour format of depth"
+        )
+        yield _warning(text.format(least.index, *least.known), hint)
+
+
 def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
     """A finding if the workspace is beside the table, or below or above the objects."""
-    if any((look.inside[:, 2] > _MIN_HEIGHT).sum() >= _MIN_READINGS for look in looks):
+    grid, texts = looks[0].grid, []
+    inside = (look.points[grid.contains(grid.index_of(look.points)), 2] for look in looks)
+    if any((heights > _MIN_HEIGHT).sum() >= _MIN_READINGS for heights in inside):
         return
     raised = max(int((look.in_columns & (look.points[:, 2] > _MIN_HEIGHT)).sum()) for look in looks)
     on_table = max(int((look.in_columns & look.on_table).sum()) for look in looks)
     if raised < _MIN_READINGS and on_table >= _MIN_READINGS:
         return  # an empty table
     spans = np.array([np.percentile(look.points, (2, 98), axis=0) for look in looks])
-    grid, texts = looks[0].grid, []
     for low, high in ((grid.origin, grid.upper), (spans[:, 0].min(axis=0), spans[:, 1].max(axis=0))):
         texts.append(", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high, strict=True)))
     text = f"it spans {texts[0]} m, depth readings span {texts[1]} m"
@@ -321,7 +335,7 @@ class _Corners:
 
         points = frame.points
         with np.errstate(invalid="ignore"):
-            still = (np.abs(points[..., 2]) < _MIN_HEIGHT) | ~_in_columns(grid, points)
+            still = (np.abs(points[..., 2]) < _MIN_HEIGHT) | ~in_columns(grid, points)
         mask = cv2.erode((still & frame.valid).astype(np.uint8), np.ones((9, 9), np.uint8))
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners, self.features = cv2.ORB_create(1000, fastThreshold=4).detectAndCompute(grey, mask)  # type: ignore[attr-defined]
@@ -417,10 +431,9 @@ _BOX = np.ones((3, 3), np.uint8)
 def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
     """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
 
-    The first value is the best agreement minus the median over all shifts. The second value is the relative loss of
-    agreement without a shift. The third value is the best shift (rows, columns) in pixels of an image with 320
-    columns. The fourth value is the increase of the agreement if the depth images of different pauses are exchanged
-    and no image is shifted.
+    The first two values are the best agreement minus the median over all shifts, and its relative loss without a
+    shift. The third is the best shift (rows, columns) in pixels of an image with 320 columns. The fourth is the
+    increase of the agreement if the depth images of different pauses are exchanged.
     """
     edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -475,12 +488,3 @@ def _one_pause(frames: Sequence[Frame], pauses: Sequence[int]) -> Iterator[Findi
     if (np.abs(change - np.median(change)) > 20).mean() > 0.01:
         text = f"there is one pause in {len(frames)} frames, but the scene changes: the video is not used"
         yield _warning(text, "give a pause before and after each action: pauses=(0, 40, 85)")
-
-
-def _warn(message: str, *hints: str) -> None:
-    """Issue a warning that shows the line of code that called this package."""
-    level = 1
-    frame: FrameType | None = sys._getframe()
-    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("mstfilter", "functools"):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(InputWarning(message, *hints), stacklevel=level)

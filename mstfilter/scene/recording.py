@@ -10,7 +10,6 @@ If the camera pose is not given, the support plane at the first pause defines th
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -23,12 +22,12 @@ from typing import Any, ClassVar, overload
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, InputWarning, check_integer
+from mstfilter.errors import InputError, check_integer, warn_user
 from mstfilter.fields import Bounded
 from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
-from mstfilter.scene.frame import Clip, Frame
+from mstfilter.scene.frame import Clip, Frame, check_depth
 from mstfilter.scene.geometry import fit_support_plane, workspace
 from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
@@ -116,6 +115,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         n, pauses = len(self.frames), tuple(int(p) for p in self.pauses)
+        object.__setattr__(self, "times", _in_seconds(self.times, self.name))
         if n == 0 or not pauses:
             raise InputError(f"recording {self.name} has {n} frames and {len(pauses)} pauses, expected at least 1")
         if list(pauses) != sorted(set(pauses)) or pauses[0] < 0 or pauses[-1] >= n:
@@ -207,16 +207,13 @@ class Recording:
         for index, image in enumerate(depth):
             check_depth(image, f"depth image of frame {index} of {name}")
         cameras = _cameras(Camera(K, width, height), T_world_camera, n)
-        stamps = tuple(float(t) for t in (times if times is not None else range(n)))
+        stamps = _in_seconds(times if times is not None else range(n), name)
         if len(stamps) != n:
             raise InputError(f"there are {len(stamps)} times for {n} frames of {name}")
         if pauses is None and times is None and n > _LONG:
-            warnings.warn(
-                InputWarning(
-                    f"the {n} frames of {name} are one clip from the first to the last, since no pauses are given",
-                    "give pauses=(0, 40, 85), or times in seconds: pauses are then found where nothing moves",
-                ),
-                stacklevel=2,
+            warn_user(
+                f"the {n} frames of {name} are one clip from the first to the last, since no pauses are given",
+                "give pauses=(0, 40, 85), or times in seconds: pauses are then found where nothing moves",
             )
         if pauses is None:
             pauses = "still" if times is not None and n > 2 else "ends"
@@ -233,7 +230,9 @@ class Recording:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
         masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
         if len(masks) != n:
-            raise InputError(f"there are {len(masks)} robot masks for {n} frames of {name}")
+            raise InputError(
+                f"robot_masks has shape {np.asarray(robot_masks).shape}, expected {depth.shape} of {name}"
+            )
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
         posed, grid = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:
@@ -300,7 +299,7 @@ class Recording:
     @cached_property
     def _examined(self) -> None:
         """Check the frames at the pauses (`examine`), and warn or raise InputError. The checks run once."""
-        report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
+        report_findings(examine(self.frames, self.pauses, self.grid, self.times), f"recording {self.name}")
 
 
 class UsesFiles(ABC):
@@ -312,6 +311,18 @@ class UsesFiles(ABC):
     @abstractmethod
     def check_files(self, recording: Recording) -> None:
         """Raise InputError before a run if a file is missing or cannot be used for a recording."""
+
+
+def _in_seconds(times: Sequence[Any], name: str) -> tuple[float, ...]:
+    """Times as numbers. Dates of NumPy become the seconds since the first date."""
+    stamps = np.asarray(times)
+    if stamps.size and stamps.dtype.kind in "mM":
+        stamps = (stamps - stamps[0]) / np.timedelta64(1, "s")
+    try:
+        return tuple(float(t) for t in stamps)
+    except (TypeError, ValueError) as error:
+        hint = "for datetime objects: [(t - times[0]).total_seconds() for t in times]"
+        raise InputError(f"times of {name} begin with {stamps.flat[0]!r}, expected seconds", hint) from error
 
 
 def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
@@ -338,23 +349,6 @@ def _stacked(images: Any, what: str) -> np.ndarray:
     except ValueError as error:
         shapes = sorted({np.shape(image) for image in images})
         raise InputError(f"{what} have different shapes: {', '.join(map(str, shapes))}") from error
-
-
-def check_depth(depth: np.ndarray, where: str) -> None:
-    """Raise InputError if a depth image (H, W) has no reading, or if its median is not plausible in metres."""
-    with np.errstate(invalid="ignore"):
-        metres = depth[np.isfinite(depth) & (depth > 0)]
-    if metres.size == 0:
-        raise InputError(
-            f"{where} has no reading at all",
-            "0 and NaN are no reading; leave such frames out, for a video with start_s or stop_s",
-        )
-    median = float(np.median(metres))
-    if not 0.05 < median < 30:
-        raise InputError(
-            f"{where} has a median of {median:g} m, expected between 0.05 and 30 m",
-            "check the depth scale: millimetres need 0.001, TUM images 0.0002",
-        )
 
 
 def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid]:

@@ -59,10 +59,7 @@ class BeliefScore(NamedTuple):
 
 
 def score_belief(
-    questions: Questions,
-    hypotheses: Sequence[np.ndarray | Hypothesis],
-    weights: np.ndarray,
-    truth: np.ndarray,
+    questions: Questions, hypotheses: Sequence[np.ndarray | Hypothesis], weights: np.ndarray, truth: np.ndarray
 ) -> BeliefScore:
     """Score hypotheses by their answers to questions.
 

@@ -74,10 +74,7 @@ class Questions:
         return np.asarray((a == flat[self.second]) & (a > 0))
 
     def forecasts(
-        self,
-        hypotheses: Sequence[np.ndarray | Hypothesis],
-        weights: np.ndarray,
-        rates: Sequence[float] = (0.0,),
+        self, hypotheses: Sequence[np.ndarray | Hypothesis], weights: np.ndarray, rates: Sequence[float] = (0.0,)
     ) -> np.ndarray:
         """Forecasts (r, m) of hypotheses with noise of each rate (r,) at the border; (m,) for the default `rates`.
 

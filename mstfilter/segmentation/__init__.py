@@ -23,12 +23,7 @@ from mstfilter.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 
-__interfaces__ = {
-    "boundary": "BoundaryModel",
-    "tree": "TreeBuilder",
-    "value": "CutValue",
-    "sampler": "CutSampler",
-}
+__interfaces__ = {"boundary": "BoundaryModel", "tree": "TreeBuilder", "value": "CutValue", "sampler": "CutSampler"}
 __components__ = {
     "proposal": {"tree_cuts": "TreeCutProposal"},
     "boundary": {"colour_depth": "ColourDepthBoundary"},

@@ -180,11 +180,7 @@ class Tree:
 
 
 def _check_tree(
-    self: TreeBuilder,
-    found: Tree,
-    boundary: np.ndarray,
-    frame: Frame | None = None,
-    pixels: np.ndarray | None = None,
+    self: TreeBuilder, found: Tree, boundary: np.ndarray, frame: Frame | None = None, pixels: np.ndarray | None = None
 ) -> Tree:
     check_type(found, Tree, "a Tree")
     if found.leaves.shape != boundary.shape:

@@ -138,14 +138,7 @@ class SceneFamily(Bounded):
 
 
 _STUDIED = SceneFamily(
-    name="s1",
-    n_objects_min=5,
-    n_objects_max=5,
-    n_twins=1,
-    n_stacked=1,
-    contact=0.8,
-    catalogue="by seed",
-    n_actions=4,
+    name="s1", n_objects_min=5, n_objects_max=5, n_twins=1, n_stacked=1, contact=0.8, catalogue="by seed", n_actions=4
 )
 
 _DEMO = SceneFamily(

@@ -1,9 +1,5 @@
 from mstfilter.tracking.features import Matches as Matches, SiftMatching as SiftMatching
-from mstfilter.tracking.flow import (
-    ClipTracks as ClipTracks,
-    DenseFlow as DenseFlow,
-    FlowTracker as FlowTracker,
-)
+from mstfilter.tracking.flow import ClipTracks as ClipTracks, DenseFlow as DenseFlow, FlowTracker as FlowTracker
 from mstfilter.tracking.registration import (
     Registration as Registration,
     RegistrationResult as RegistrationResult,

@@ -25,6 +25,7 @@ from tests.formats.layouts import (
     PAUSES,
     SHIFTS,
     K,
+    units,
     video,
     write_redwood,
     write_tum,
@@ -91,7 +92,7 @@ def test_entries_of_the_intrinsics_that_are_not_read_are_named(tmp_path):
     path = write_redwood(tmp_path / "data")
     stored = json.loads((path / "intrinsic.json").read_text())
     (path / "intrinsic.json").write_text(json.dumps({**stored, "dist_coeffs": [0.1, 0, 0, 0]}))
-    with pytest.warns(InputWarning, match="dist_coeffs is not read"):
+    with pytest.warns(InputWarning, match="not read: dist_coeffs\n"):
         Redwood(fps=FPS).open(path)
 
 
@@ -202,6 +203,7 @@ NAMES = {
     "numbers": lambda part, k: str(k),
     "prefix": lambda part, k: f"cam0_{part}_{k:04d}",
     "seconds": lambda part, k: f"{STAMP + k / FPS + (part == 'depth') * 0.004:.6f}",
+    "milliseconds": lambda part, k: f"{STAMP * 1000 + k * 100 + (part == 'depth') * 4}.250",
     "nanoseconds": lambda part, k: str(STAMP * 10**9 + k * 10**8 + (part == "depth") * 4_000_000),
 }
 
@@ -410,3 +412,78 @@ def test_a_part_of_a_video(tmp_path):
     np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-9)
     with pytest.raises(InputError, match=r"lasts 1\.6 s"):
         Tum(K=K, start_s=9).open(path)
+
+
+@pytest.mark.parametrize("layout", VIDEOS)
+def test_robot_masks_beside_the_images_are_read(tmp_path, layout):
+    write, reader = VIDEOS[layout]
+    path = write(tmp_path / "data")
+    (path / "robot").mkdir()
+    left = np.where(np.arange(160) < 40, 255, np.zeros((120, 160))).astype(np.uint8)
+    colour = sorted((path / ("color" if layout == "redwood" else "rgb")).iterdir())
+    write_image(path / "robot" / f"{colour[3].stem}.png", left)
+    masks = [frame.robot_mask for frame in reader.open(path).frames]
+    assert [k for k, mask in enumerate(masks) if mask is not None] == [3] and masks[3].mean() == 0.25
+    (path / "robot" / f"{colour[3].stem}.png").rename(path / "robot" / "mask_3.png")
+    shutil.copytree(path / "robot", path / "robot_masks")
+    with pytest.warns(InputWarning, match="robot_masks is not read"):
+        reader.open(path)
+    with pytest.warns(InputWarning, match="robot: 1 masks of no colour image are not read, for example mask_3.png"):
+        reader.open(path)
+
+
+def test_depth_images_are_not_taken_for_colour(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    (path / "rgb.txt").write_text((path / "depth.txt").read_text())
+    with pytest.raises(InputError, match=r"colour image .* has type uint16, expected 8 bits"):
+        Tum(K=K).open(path)
+
+
+def test_the_largest_value_of_16_bits_is_no_reading(tmp_path):
+    _, (depth,), _ = video((0,))
+    write_image(tmp_path / "a.png", np.where(np.arange(160) < 9, 65535, units(depth, 0.001)).astype(np.uint16))
+    found = read_depth(tmp_path / "a.png", 0.001)
+    assert np.isnan(found[:, :9]).all() and not np.isnan(found[:, 9:][depth[:, 9:] > 0]).any()
+
+
+def test_a_second_colour_folder_is_named(tmp_path):
+    path = write_redwood(tmp_path / "data")
+    shutil.copytree(path / "color", path / "rgb")
+    with pytest.warns(InputWarning, match="colour folders color, rgb: color is read"):
+        Redwood(fps=FPS).open(path)
+
+
+def test_distortion_may_be_nested_and_must_be_numbers(tmp_path):
+    path = write_redwood(tmp_path / "data", (0, 1))
+    for stored, fault in (([[0.1, 0, 0, 0]], None), (["a", "b", "c", "d"], "intrinsic.json .*could not convert")):
+        edit(path / "intrinsic.json", lambda data, stored=stored: data.update(distortion=stored))
+        if fault is None:
+            assert Redwood().video(path).distortion == (0.1, 0, 0, 0)
+        else:
+            with pytest.raises(InputError, match=fault):
+                Redwood().video(path)
+
+
+def test_milliseconds_of_tum_lists_are_recognised(tmp_path):
+    path = write_tum(tmp_path / "tum")
+    expected = Tum(K=K, world=WORLD).open(path)
+    for name in ("rgb.txt", "depth.txt"):
+        rows = [line.split() for line in (path / name).read_text().splitlines()[1:]]
+        (path / name).write_text("".join(f"{float(t) * 1000:.3f} {file}\n" for t, file in rows))
+    found = Tum(K=K, world=WORLD).open(path)
+    assert found.pauses == expected.pauses
+    np.testing.assert_allclose(found.times, expected.times, atol=1e-5)
+
+
+def test_floating_point_depth_in_millimetres_is_not_blamed_on_the_scale(tmp_path):
+    path = write_rgb_and_depth(tmp_path / "mine", kind="npy")
+    for file in (path / "depth").iterdir():
+        np.save(file, 1000 * np.load(file))
+    rgb, depth, _ = video((0,))
+    for make in (
+        lambda: open_recording(path, options=["depth_scale=0.001"]),
+        lambda: Recording.from_arrays(rgb, 1000 * depth, CAMERA.K),
+    ):
+        with pytest.raises(InputError, match="has a median of 778 m") as caught:
+            make()
+        assert "per unit" not in caught.value.message and "multiply millimetres by 0.001" in caught.value.hints[0]

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats.image_folders import PairedImages, Redwood
 from mstfilter.formats.sources import detect_format, format_settings, open_recording
 from mstfilter.presets import REGISTRY
@@ -21,6 +21,16 @@ WRITERS = {
     "redwood": layouts.write_redwood,
     "recording": write,
 }
+
+
+def write_pairs(path, names=("a", "b")):
+    path.mkdir()
+    for shift, name in enumerate(names):
+        rgb, depth, _ = table_scene(5 * shift)
+        write_image(path / f"{name}_rgb.png", rgb)
+        write_image(path / f"{name}_depth.png", layouts.units(depth, 0.001))
+    (path / "info.json").write_text(json.dumps({"K": [131, 131, 79.5, 59.5], "depth_scale_m": 0.001}))
+    return path
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -86,6 +96,26 @@ def test_options_reach_the_reader(tmp_path):
             open_recording(path, options=wrong)
 
 
+def test_pairs_have_the_options_of_the_other_layouts(tmp_path):
+    path = write_pairs(tmp_path / "pairs", "abcd")
+    pose = ",".join(str(v) for v in CAMERA.pose.as_matrix().ravel())
+    options = [f"world.T_world_camera={pose}", "world.workspace=-0.3,-0.3,0,0.3,0.3,0.2", "max_pixels=5000"]
+    recording = open_recording(path, options=options, pauses="0,-1")
+    assert recording.pauses == (0, 3) and recording.grid.shape == (60, 60, 20)
+    np.testing.assert_allclose(recording.frames[3].camera.pose.as_matrix(), CAMERA.pose.as_matrix(), atol=1e-12)
+    write_image(path / "b_robot.png", np.where(np.arange(160) < 40, 255, np.zeros((120, 160))).astype(np.uint8))
+    write_image(path / "b_label.png", np.full((120, 160), 7, np.uint8))
+    masks = [frame.robot_mask for frame in open_recording(path).frames]
+    assert masks[0] is None and masks[1].mean() == 0.25
+    assert open_recording(path, options=options).instance(1).shape == (61, 82)
+    (path / "info.json").write_text(json.dumps({"K": [131, 131, 79.5, 59.5], "depth_scale": 1000}))
+    with (
+        pytest.warns(InputWarning, match="not read: depth_scale"),
+        pytest.raises(InputError, match="depth_scale_m is"),
+    ):
+        open_recording(path)
+
+
 def test_label_images_beside_pairs_are_true_instances(tmp_path):
     """The label of the table is no object."""
     rgb, depth, labels = table_scene(noise=np.random.default_rng(0))
@@ -98,10 +128,37 @@ def test_label_images_beside_pairs_are_true_instances(tmp_path):
     expected = np.where((objects > 0) & (np.arange(160) >= 5), objects + 1, 0)
     np.testing.assert_array_equal(open_recording(tmp_path).instance(0), expected)
     write_image(tmp_path / "a_label.png", objects[:50].astype(np.uint8))
-    with pytest.raises(InputError, match=r"a_label.png has shape \(50, 160\)"):
+    with pytest.raises(InputError, match=r"instance image of frame 0 of .* has shape \(50, 160\)"):
         open_recording(tmp_path).instance(0)
     (tmp_path / "a_label.png").unlink()
     assert open_recording(tmp_path).instance(0) is None
     (tmp_path / "info.json").write_text('{"depth_scale_m": 0.001}')
     with pytest.raises(InputError, match="'K' is missing"):
         open_recording(tmp_path)
+
+
+def test_a_folder_with_nearly_the_right_names_is_told_which(tmp_path):
+    for k, (part, wrong) in enumerate((("depth", "Depth"), ("depth", "depths"), ("color", "color_frames"))):
+        path = layouts.write_redwood(tmp_path / str(k), (0,))
+        (path / part).rename(path / wrong)
+        with pytest.raises(InputError, match="has no known format") as caught:
+            open_recording(path)
+        assert caught.value.hints[0] == f"{wrong} is there: is it {part}? rename it"
+
+
+@pytest.mark.parametrize(
+    ("write_layout", "lost", "message"),
+    [
+        (layouts.write_tum, "depth.txt", "depth.txt is missing"),
+        (layouts.write_redwood, "depth", "depth is missing"),
+        (write_pairs, "a_rgb.png", "a_rgb.png missing"),
+        (write_pairs, "info.json", "info.json: depth_scale_m is None"),
+        (write_pairs, "a_depth.png", "a_depth.png missing"),
+    ],
+)
+def test_what_is_missing_is_named_in_the_words_of_the_layout(tmp_path, write_layout, lost, message):
+    path = write_layout(tmp_path / "data")
+    (path / lost).rename(tmp_path / lost)
+    with pytest.raises(InputError, match=message) as caught:
+        open_recording(path, options=["K=131,131,79.5,59.5"])
+    assert not any("manifest" in hint for hint in caught.value.hints)

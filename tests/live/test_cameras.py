@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mstfilter
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.scene import Recording
 from tests.conftest import REPOSITORY
 from tests.formats.bags import COLOUR, DEPTH, scene_messages, topic_info
@@ -46,6 +46,15 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     assert sum(one["weight"] for one in belief["hypotheses"]) == pytest.approx(1, abs=1e-4)
     best = max(belief["hypotheses"], key=lambda one: one["weight"])
     assert set(best["objects"][0]) == {"label", "id", "voxels", "centre", "T_world_box", "sides"}
+
+
+def test_the_matrix_of_rectified_images_is_that_of_their_projection():
+    raw, projection = [500, 0, 320, 0, 500, 240, 0, 0, 1], [480, 0, 310, 0, 0, 480, 236, 0, 0, 0, 1, 0]
+    info = SimpleNamespace(k=raw, p=projection, d=[0.1, -0.2, 0, 0, 0])
+    rectified = NODE.camera_matrix(info, "/camera/color/image_rect_color")
+    np.testing.assert_allclose(rectified, [[480, 0, 310], [0, 480, 236], [0, 0, 1]])
+    with pytest.warns(InputWarning, match=r"image_raw have the distortion \[0.1, -0.2, 0.0, 0.0, 0.0\]"):
+        np.testing.assert_allclose(NODE.camera_matrix(info, "/camera/color/image_raw").ravel(), raw)
 
 
 def test_the_node_says_that_ros_is_missing(monkeypatch):

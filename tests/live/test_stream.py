@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import threading
 import time
+import warnings
 
 import numpy as np
 import pytest
 
 import mstfilter
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import Redwood, Settled, Still, open_format
 from mstfilter.live import filter_folder
 from mstfilter.presets import load_config
 from mstfilter.report import write_report
 from mstfilter.runs import filter_recording
-from mstfilter.scene import Recording, encode_hypotheses, scene_cache
+from mstfilter.scene import Recording, encode_hypotheses, scene_cache, write_image
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
+from tests.wrong_inputs import shifted_camera
 
 RULE = Settled(hold_s=0.3)
 FAST = mstfilter.preset("mst", "n=2", "n_proposed=4")
@@ -114,6 +117,42 @@ def test_a_long_clip_is_thinned_and_has_the_result_of_the_frames_that_remain():
     scene_cache.clear()
     kept = Recording(last.clip.frames, last.clip.grid, (0, len(last.clip) - 1), last.clip.times)
     assert arrays(last.state) == arrays([state for state, _ in FAST.iterate(kept.clips(), 4)][-1])
+
+
+def test_a_moved_camera_has_the_message_of_a_recording():
+    arrays = shifted_camera()
+    with pytest.raises(InputError) as recorded:
+        Recording.from_arrays(**arrays)
+    stream = mstfilter.Stream(arrays["K"], FAST, pauses=None)
+    for k in (0, 1):
+        stream.push(arrays["rgb"][k], arrays["depth"][k], float(k), pause=True)
+    with pytest.raises(InputError) as live:
+        stream.wait()
+    said = [error.value.message.partition(": ")[2] for error in (recorded, live)]
+    assert said[0] == said[1] and "the camera moves from frame 0 to 1, but not its pose" in said[1]
+    assert live.value.hints == recorded.value.hints
+    with contextlib.suppress(InputError):
+        stream.close()
+
+
+def test_a_fault_of_several_pauses_gives_one_warning():
+    grey = np.full_like(RGB[0], 90)
+    with warnings.catch_warnings(record=True) as caught, mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+        warnings.simplefilter("always")
+        for k, rgb in enumerate((RGB[0], grey, grey)):
+            stream.push(rgb, DEPTH[0], float(k), pause=True)
+        stream.wait()
+    assert [str(one.message).partition("\n")[0] for one in caught if one.category is InputWarning] == [
+        "stream: the colour image of frame 1 is uniform"
+    ]
+
+
+def test_a_live_folder_has_the_robot_masks(tmp_path):
+    path = write_redwood(tmp_path / "data", (0, 1))
+    (path / "robot").mkdir()
+    write_image(path / "robot" / "00001.png", np.where(DEPTH[0] < 0.7, 255, 0).astype(np.uint8))
+    (frame,) = [frame for _, frame in Redwood().arriving(path, idle_s=0.8)]
+    np.testing.assert_array_equal(frame.robot_mask, DEPTH[0] < 0.7)
 
 
 def test_a_full_queue_drops_frames_and_says_so():

@@ -272,11 +272,11 @@ def test_paired_images(tmp_path, folder):
         for part in ("rgb", "depth"):
             shutil.copy(folder / part / f"{index:06d}.png", tmp_path / f"{name}_{part}.png")
     (tmp_path / "info.json").write_text(json.dumps({"K": CAMERA.K.tolist(), "depth_scale_m": 0.001}))
-    pairs = PairedImages(("f2", "f0")).open(tmp_path)
+    pairs = PairedImages(frames=("f2", "f0")).open(tmp_path)
     assert pairs.pauses == (0, 1)
     np.testing.assert_array_equal(pairs.frames[1].rgb, recording.frames[0].rgb)
     with pytest.raises(InputError, match="no frame 'f9'"):
-        PairedImages(("f9",)).open(tmp_path)
+        PairedImages(frames=("f9",)).open(tmp_path)
     pairs = PairedImages().open(tmp_path)
     assert pairs.name == "f0-f10"  # f0, f2, f10
     # A mask of 0 and 255, the most common one of 8 bits, is an object: 255 would be the robot.
@@ -293,7 +293,7 @@ def test_real_frames_find_their_table(shared_data):
     path = shared_data("real/osd_learn")
     scores = []
     for name in ("learn0", "learn9", "learn17", "learn25", "learn33", "learn41"):
-        recording = PairedImages((name,)).open(path)
+        recording = PairedImages(frames=(name,)).open(path)
         label = cv2.imread(str(path / f"{name}_label.png"), cv2.IMREAD_UNCHANGED)
         table = fit_support_plane(recording.frames[0]).on_or_behind & (label > 0)
         scores.append((table & (label == 1)).sum() / (table | (label == 1)).sum())

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
+from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.geometry import in_columns, shares_with_depth
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
+from tests.formats.layouts import video
 from tests.scene.scenes import CAMERA, GRID, table_scene
 from tests.test_cli import call
 
@@ -164,3 +169,57 @@ def test_the_workspace_ends_at_a_wall_behind_the_table():
     grid = Recording.from_arrays(rgb, behind, CAMERA.K, T_world_camera=CAMERA.pose).grid
     assert alone.upper[1] > 0.8 and 0.5 <= grid.upper[1] <= 0.65
     assert grid.origin[1] == alone.origin[1]  # the end of the table near the camera
+
+
+def test_robot_masks_of_most_pixels_and_of_another_shape_are_named():
+    most = np.broadcast_to(np.arange(160) < 110, (1, 120, 160))
+    with pytest.warns(InputWarning, match="the robot mask of frame 0 covers 69% of the image"):
+        arrays(GRID, robot_masks=most[0])
+    rgb, depth, _ = video((0, 1))
+    with pytest.raises(InputError, match=r"robot_masks has shape \(120, 160\), expected \(2, 120, 160\)"):
+        Recording.from_arrays(rgb, depth, CAMERA.K, robot_masks=most[0])
+
+
+def test_the_pose_of_a_view_is_examined():
+    rgb, depth, _ = table_scene()
+    right, wrong = (Frame(rgb, depth, CAMERA.at(pose)) for pose in (CAMERA.pose, CAMERA.pose.inv()))
+    main = Frame(rgb, depth, CAMERA)
+    assert examine([replace(main, views=(right,))], [0], GRID) == examine([main], [0], GRID)
+    found = examine([replace(main, views=(right, wrong))], [0], GRID)
+    assert any(one.message.startswith("one of the views: no table is at z = 0") for one in found)
+    assert not any(one.stop for one in found)
+
+
+@pytest.mark.parametrize(("step", "silent"), [(0.1, True), (66.7, False)])
+def test_frames_that_are_far_apart_give_a_warning(step, silent):
+    rgb, depth, _ = video()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Recording.from_arrays(rgb, depth, CAMERA.K, times=step * np.arange(len(rgb)), pauses=(0, 13))
+    said = [str(one.message) for one in caught if "are their times in milliseconds?" in str(one.message)]
+    assert (said == []) == silent and all("frames are 66.7 s apart" in text for text in said)
+
+
+def test_times_are_numbers_or_dates_of_numpy():
+    rgb, depth, _ = video((0, 1))
+    seconds = [0.0, 0.25]
+    dates = np.datetime64("2024-05-01T10:00:00.000") + np.array([0, 250], "timedelta64[ms]")
+    made = [Recording.from_arrays(rgb, depth, CAMERA.K, times=times) for times in (seconds, dates)]
+    assert made[0].times == made[1].times == replace(made[0], times=tuple(dates)).times == (0.0, 0.25)
+    for wrong in (["10:00:00", "10:00:01"], [datetime(2024, 5, 1, 10), datetime(2024, 5, 1, 11)]):
+        with pytest.raises(InputError, match="times of arrays begin with .* expected seconds") as caught:
+            Recording.from_arrays(rgb, depth, CAMERA.K, times=wrong)
+        assert "total_seconds" in caught.value.hints[0]
+
+
+def test_depth_that_is_missing_in_the_workspace_alone_gives_a_warning():
+    rgb, depth, _ = table_scene()
+    grid = VoxelGrid((-0.1, -0.1, 0.0), 0.01, (20, 20, 20))
+    frame = Frame(rgb, depth, CAMERA)
+    assert min(shares_with_depth(frame, grid)) > 0.9
+    shown = in_columns(grid, frame.points)
+    holes = replace(frame, depth=np.where(shown & (np.arange(160) % 8 != 0), np.nan, depth))
+    found = [one for one in examine([holes], [0], grid) if "has depth readings" in one.message]
+    assert len(found) == 1 and not found[0].stop and "frame 0" in found[0].message
+    robot = replace(holes, robot_mask=np.isnan(holes.depth))
+    assert min(shares_with_depth(robot, grid)) > 0.9

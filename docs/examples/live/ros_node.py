@@ -2,7 +2,7 @@
 
 The node is started by ``python ros_node.py --ros-args -p colour:=/camera/color/image_raw``. Parameters:
 
-- ``colour``, ``depth``, ``camera_info``: topics of the camera. Depth is registered to colour.
+- ``colour``, ``depth``, ``camera_info``: topics of the camera. Colour is rectified, depth is registered to colour.
 - ``depth_scale``: metres per unit of 16-bit depth (0.001). ``tolerance_s``: largest difference of two stamps (0.02).
 - ``filter``: name of a preset. ``hold_s``: see `mstfilter.formats.Settled`.
 
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import missing_library
+from mstfilter.errors import missing_library, warn_user
 from mstfilter.formats import Settled
 from mstfilter.formats.bag import colour_image, depth_image
 from mstfilter.live import Pause, Stream
@@ -34,8 +34,16 @@ def stamp_of(message: Any) -> float:
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
-def camera_matrix(info: Any) -> np.ndarray:
-    """The matrix (3, 3) of a CameraInfo message of ROS 2."""
+def camera_matrix(info: Any, colour: str = "") -> np.ndarray:
+    """The matrix (3, 3) in a CameraInfo message of ROS 2 for the images of the topic `colour`.
+
+    Rectified images, whose topic contains "rect", have the matrix in P. Other images must have no distortion.
+    """
+    if "rect" in colour and info.p[0] > 0:
+        return np.reshape(np.asarray(info.p, float), (3, 4))[:, :3]
+    if any(info.d):
+        text = f"images of {colour or 'the colour topic'} have the distortion {[round(float(v), 4) for v in info.d]}"
+        warn_user(f"{text}, which is ignored", "use the topic of rectified images, for example image_rect_color")
     return np.reshape(np.asarray(info.k, float), (3, 3))
 
 
@@ -141,7 +149,7 @@ def main() -> None:
 
     def start(message: Any) -> None:
         if not streams:
-            streams.append(Stream(camera_matrix(message), name, pauses=rule, on_pause=publish))
+            streams.append(Stream(camera_matrix(message, colour), name, pauses=rule, on_pause=publish))
             pairs = ImagePairs(streams[0], *settings)
             node.create_subscription(Image, colour, pairs.add_colour, qos_profile_sensor_data)
             node.create_subscription(Image, depth, pairs.add_depth, qos_profile_sensor_data)
