@@ -124,8 +124,7 @@ def steps(smoke: bool) -> list[Step]:
     found += [plan("own folder", text) for text in folder]
     found.append(plan("live stream", "mstfilter run bedroom --live 3 --out run-live"))
     own = commands("own-component.md")
-    found += [plan("own component", text) for text in own if "two" not in text]
-    found += [plan("study", text) for text in own if "two" in text]
+    found += [plan("study" if " study" in text or " report" in text else "own component", text) for text in own]
     if not smoke:
         found += [plan("command line", text) for text in commands("tutorial.md")]
         found += [
@@ -163,11 +162,11 @@ def main(out: Path, smoke: bool) -> int:
     rows, outputs = [], []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        study = re.search(
-            r"^```toml\n(.*?)```", (DOCS / "own-component.md").read_text(), flags=re.DOTALL | re.MULTILINE
-        )
-        assert study is not None
-        (folder / "two.toml").write_text(study[1].replace('"0-1"', '"0"') if smoke else study[1])
+        page = (DOCS / "own-component.md").read_text(encoding="utf-8")
+        studies = re.findall(r"^```toml\n(.*?)```", page, flags=re.DOTALL | re.MULTILINE)
+        for file, text in zip(("two.toml", "best.toml"), studies, strict=True):
+            short = text.replace('"0-1"', '"0"') if smoke else text
+            (folder / file).write_text(short.replace('"20-31"', '"20"' if smoke else '"20-22"'))
         waiting = steps(smoke)
         while waiting:
             step = waiting.pop(0)

@@ -198,10 +198,8 @@ def _calibrated(
 ) -> Video:
     """The video of triples of files, with the options of a reader or else the entries of a file of intrinsics."""
     file, stored = source
-    K, distortion = (
-        reader.K or _stored_matrix(path, *source),
-        reader.distortion or tuple(stored.get("distortion", ())),
-    )
+    K = reader.K or _stored_matrix(path, *source)
+    distortion = reader.distortion or tuple(stored.get("distortion", ()))
     video = Video.of_files(name, times, files, K, path, scale, distortion=distortion)
     for side, n in zip(("height", "width"), video.read_rgb(0).shape, strict=False):
         if not reader.K and _stored(file, stored, side, n) != n:
