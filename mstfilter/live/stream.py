@@ -294,19 +294,22 @@ class Stream:
             self._world, self._grid = find_world(item.frame, self._grid)
         if item.frame.camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
-        if rests:
-            self._examine(item)
+        if rests and not self._clip:
+            self._examine(item, [item.time])  # an error ends the stream before the first step
         self._clip.append(item)
         for tracker in self._trackers:
             tracker.add(item.frame)
         if rests:
+            times = [one.time for one in self._clip]
             self._end_clip()
+            if len(times) > 1:
+                self._examine(item, times)
         elif len(self._clip) >= self._max:
             self._thin()
 
-    def _examine(self, item: _Item) -> None:
+    def _examine(self, item: _Item, times: list[float]) -> None:
         """Compare the frame of a pause with the first pause. A fault gives one warning, not one at every pause."""
-        grid, times = self._grid, [one.time for one in (*self._clip, item)]
+        grid = self._grid
         assert isinstance(grid, VoxelGrid)
         look, first = Look(item.frame, grid, item.number), self._first
         found = examine([item.frame], [0], grid) if first is None else examine_next(first, look, times)
