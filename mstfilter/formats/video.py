@@ -147,15 +147,15 @@ class Video:
         cls,
         name: str,
         times: tuple[float, ...],
-        files: Sequence[tuple[Path, ...]],
+        pairs: Sequence[tuple[Path, ...]],
         K: tuple[float, ...],
         path: Path,
         depth_scale: float,
         **more: Any,
     ) -> Video:
         """A video with a colour file, a depth file and an optional file of the robot mask for each frame."""
-        more["read_robot"] = lambda index: read_optional(*files[index][2:])
-        images = lambda k: read_rgb(files[k][0]), lambda k: read_depth(files[k][1], depth_scale)
+        more["read_robot"] = lambda index: read_optional(*pairs[index][2:])
+        images = lambda k: read_rgb(pairs[k][0]), lambda k: read_depth(pairs[k][1], depth_scale)
         return cls(name, times, *images, K, path, depth_scale, **more)
 
     def between(self, start_s: float, stop_s: float) -> Video:
