@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 # Colours of the style file that a page replaces by its own, which follow a light or a dark theme.
-_INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#1d2126", "#646b74", "#e1e2e0", "#2f6db4", "#b26a1c"
+_INK, _MUTED, _LINE, _ACCENT, _BASELINE = "#1d2126", "#646b74", "#e1e2e0", "#2f6db4", "#9c5a12"
 #: Colours of the compared methods (arms).
 SERIES = (
     *("#336fb9", "#ee9138", "#2ca281", "#93285c", "#a3d3eb", "#e8d34f"),
