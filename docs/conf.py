@@ -68,6 +68,17 @@ def add_mathml(display):
     return visit
 
 
+def link_to_modules(app, env):
+    """Links back from the source lead to the page of the module; viewcode names the package of the same object."""
+    entries = getattr(env, "_viewcode_modules", {})
+    for name, entry in list(entries.items()):
+        if entry and f"reference/modules/{name}" in env.found_docs:
+            entries[name] = (*entry[:3], name)
+        elif not entry:
+            del entries[name]  # without source, for example builtins
+
+
 def setup(app):
     app.add_html_math_renderer("mathml", (add_mathml("inline"), None), (add_mathml("block"), None))
     app.connect("doctree-resolved", show_pictures)
+    app.connect("env-updated", link_to_modules)
