@@ -240,7 +240,8 @@ def main() -> None:
     if options.check:
         page = (REPOSITORY / "README.md").read_text(encoding="utf-8")
         older = sorted(name for name in cited(page) if not found[name].is_current())
-        sys.exit(older and f"error: README.md cites studies that are older than the program: {', '.join(older)}")
+        text = f"error: README.md cites studies that are older than the program: {', '.join(older)}"
+        sys.exit(text if older else 0)
     for name, study in found.items():
         record = study.record()
         state = "current" if study.is_current() else "older" if record else "not measured"

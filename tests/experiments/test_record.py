@@ -159,3 +159,12 @@ def test_equal_fingerprints_keep_the_results(study, tmp_path, name, text, same):
     assert study.is_current() is same and study.record()["commit"] == made
     if same:  # a second change of structure is compared with the first
         assert study.base == record._git("rev-parse", "--short=8", "HEAD") != made
+
+
+@pytest.mark.parametrize("current", [True, False])
+def test_the_check_fails_if_the_front_page_cites_an_older_study(current, monkeypatch):
+    monkeypatch.setattr(record.Study, "is_current", lambda study: current)
+    monkeypatch.setattr("sys.argv", ["record.py", "--check"])
+    with pytest.raises(SystemExit) as end:
+        record.main()
+    assert end.value.code == 0 if current else "README.md cites" in end.value.code and "main" in end.value.code
