@@ -76,7 +76,7 @@ import re, sys
 from pathlib import Path
 import nbclient, nbformat
 text = Path(sys.argv[1]).read_text()
-cells = re.findall(r"^```{code-cell}\\n(.*?)```", text, flags=re.DOTALL | re.MULTILINE)
+cells = re.findall(r"^```{code-cell}\\n(?::[^\\n]*\\n)*(.*?)```", text, flags=re.DOTALL | re.MULTILINE)
 book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
 book = nbclient.NotebookClient(book, timeout=600, kernel_name="python3").execute()
 shown = [kind for cell in book.cells for output in cell.outputs for kind in output.get("data", {})]

@@ -50,7 +50,7 @@ def test_the_estimate_is_better_than_the_best_alternative(tmp_path, monkeypatch,
     recording = mstfilter.open_recording(cached_recording("demo", 0, n_actions=1))
     true = bind_truth(TrueMasks(), recording)
     masks = {clip.after.rgb.tobytes(): wrong(true.masks(clip.after, clip)) for clip in recording.clips()}
-    cells = re.findall(r"```\{code-cell\}\n(.*?)```", PAGE, flags=re.DOTALL)
+    cells = re.findall(r"```\{code-cell\}\n(?::[^\n]*\n)*(.*?)```", PAGE, flags=re.DOTALL)
     example = next(cell for cell in cells if "write_masks" in cell)
     assert len([line for line in example.splitlines() if line.strip()]) <= 10
     given = {"mstfilter": mstfilter, "recording": recording, "segment": lambda rgb: masks[rgb.tobytes()]}
