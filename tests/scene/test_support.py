@@ -27,7 +27,7 @@ def share(found: np.ndarray, true: np.ndarray) -> float:
 def test_without_noise_the_readings_above_the_table_are_the_foreground():
     frame = frame_of(TWO, width=640)
     found = foreground(frame, GRID)
-    assert found.frame is frame
+    assert found.frame.key == frame.key  # no depth is estimated
     assert (found.pixels != readings_above_table(frame, GRID)).sum() < 20  # single pixels at corners
 
 
