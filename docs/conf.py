@@ -36,6 +36,7 @@ html_theme = "furo"
 html_title = "mstfilter"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
+html_search_scorer = str(Path(__file__).parent / "_templates" / "search_scorer.js")
 exclude_patterns = ["_build"]
 suppress_warnings = ["ref.python", "mystnb.unknown_mime_type"]
 
