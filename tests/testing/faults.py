@@ -285,7 +285,7 @@ plant(
     selecting,
     _REPEATS,
     "come from `rng`",
-    GlobalIfMore=lambda rng, lw, n: by_weight(np.random if n > len(lw) else rng, lw, n),
+    GlobalIfMore=lambda rng, lw, n: multinomial(np.random if n > len(lw) else rng, normalise(lw), n),
     PythonGenerator=python_generator,
     OwnGenerator=lambda rng, lw, n: by_weight(np.random.default_rng(), lw, n),
     ModuleGenerator=lambda rng, lw, n: by_weight(_OWN, lw, n),
