@@ -120,10 +120,8 @@ def compare(first: Values, second: Values, adjusted: bool = False) -> Difference
         return Difference(nan, nan, nan, nan, nan, nan, 0)
     n_resamples = min(N_ADJUSTED, max(N_RESAMPLES, MOST_DRAWS // len(d))) if adjusted else N_RESAMPLES
     low, high, p = studentised_bootstrap(d, n_resamples)
-    flipped = sign_flip(d, n_resamples)
-    found = Difference(
-        float(d.mean()), *interval(d), low, high, flipped, len(d), p_bootstrap=p, skewness=_skewness(d)
-    )
+    limits = *interval(d), low, high
+    found = Difference(float(d.mean()), *limits, sign_flip(d, n_resamples), len(d), float("nan"), p, _skewness(d))
     return replace(found, p_holm=found.p_claim)
 
 

@@ -130,7 +130,7 @@ class Look:
         self.frame, self.edges = _sampled(frame, 160), _Edges(_sampled(frame, 320))
         self.corners = _Corners(_sampled(frame, 640), grid)
         self.points = self.frame.points[self.frame.valid]
-        self.known = shares_with_depth(frame, grid)
+        self.known = shares_with_depth(self.frame, grid)
 
     @cached_property
     def on_table(self) -> np.ndarray:
@@ -216,9 +216,8 @@ def _interval(times: Sequence[float], n_pauses: int) -> Iterator[Finding]:
     apart = float(np.median(np.diff(times))) if len(times) > n_pauses + 2 else 0.0
     if apart > _MAX_INTERVAL:
         text = f"the frames are {apart:.4g} s apart, so motion cannot be tracked: are their times in milliseconds?"
-        yield _warning(
-            text, "times are in seconds: multiply milliseconds by 0.001, or rename the images by time in s"
-        )
+        hint = "times are in seconds: multiply milliseconds by 0.001, or rename the images by time in s"
+        yield _warning(text, hint)
 
 
 def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
@@ -302,9 +301,7 @@ def _missing(looks: Sequence[Look]) -> Iterator[Finding]:
     least = min(looks, key=lambda look: min(look.known))
     if min(least.known) < _MIN_KNOWN:
         text = "frame {} has depth readings in {:.0%} of the image and {:.0%} of its part that shows the workspace"
-        hint = (
-            "objects without readings are missed: check exposure, distance and glare, and the colour format of depth"
-        )
+        hint = "objects without readings are missed: check exposure, distance, glare, and the colour format of depth"
         yield _warning(text.format(least.index, *least.known), hint)
 
 

@@ -91,7 +91,7 @@ class _Checked(Distribution):
     def __post_init__(self) -> None:
         for name in self.ranges:
             value = getattr(self, name)
-            if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub":  # would wrap
+            if _may_wrap(value):
                 object.__setattr__(self, name, value.astype(np.float64))
             if not (self.lazy and type(getattr(self, name)) is np.ndarray):
                 self._check(name, self.ranges[name])
@@ -180,10 +180,14 @@ def _sum_rows(log_prob: Any) -> np.ndarray:
     return out if out.ndim <= 1 else out.reshape(len(out), math.prod(out.shape[1:])).sum(axis=1)
 
 
+def _may_wrap(value: Any) -> bool:
+    """Whether a value is an array or number of a NumPy integer type, whose arithmetic may wrap."""
+    return isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub"
+
+
 def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
     """(value - loc) / scale with one temporary array."""
-    integers = isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub"  # would wrap
-    z = np.asarray(np.subtract(value, loc, dtype=np.float64 if integers else None), dtype=np.float64)
+    z = np.asarray(np.subtract(value, loc, dtype=np.float64 if _may_wrap(value) else None), dtype=np.float64)
     fits = (
         isinstance(scale, float)
         or np.shape(scale) == z.shape
@@ -412,7 +416,7 @@ class Categorical(Distribution):
 
     def log_prob(self, value: Any) -> np.ndarray:
         k = np.asarray(value)
-        k = k.astype(np.int64) if k.dtype.kind in "iub" else k  # numpy clips to the range of its type
+        k = k.astype(np.int64) if _may_wrap(k) else k  # numpy clips to the range of its type
         index = np.nan_to_num(np.clip(k, 0, self.probs.shape[-1] - 1)).astype(np.int64)
         with np.errstate(divide="ignore"):
             log_p = np.log(self.probs)

@@ -150,9 +150,12 @@ def coalesce(rng: np.random.Generator, log_weights: np.ndarray, classes: np.ndar
     classes, weights = np.asarray(classes), np.exp(lw - lw.max())
     positive = np.flatnonzero(weights)
     order = positive[np.argsort(classes[positive], kind="stable")]
-    groups = np.split(order, np.flatnonzero(np.diff(classes[order])) + 1)
-    drawn = [g[0] if len(g) == 1 else g[search(weights[g], rng.random(1))[0]] for g in groups]
-    representatives = np.sort(np.array(drawn))
+    first = np.flatnonzero(np.append(True, np.diff(classes[order]) > 0))
+    drawn, sizes = order[first], np.diff(np.append(first, len(order)))
+    for k in np.flatnonzero(sizes > 1):
+        members = order[first[k] : first[k] + sizes[k]]
+        drawn[k] = members[search(weights[members], rng.random(1))[0]]
+    representatives = np.sort(drawn)
     total = np.log(np.bincount(classes, weights)[classes[representatives]]) + lw.max()
     return representatives, total + np.log(len(representatives) / len(lw))
 
