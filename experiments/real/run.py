@@ -13,21 +13,26 @@ from __future__ import annotations
 
 import argparse
 import os
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
+from safetensors.numpy import load_file
 from scores import identities, image_scores, kept, witness_scores
-from sequences import Sequence, sequences
+from sequences import OSD_GROUPS, Sequence, sequences
 
 from mstfilter.files import read_csv, write_csv
 from mstfilter.presets import preset
 from mstfilter.scene import Clip, Hypothesis, project
+from mstfilter.segmentation import BorderTree
 from mstfilter.smc import State
 from mstfilter.statistics import compare
+from mstfilter.trained import open_model, write_model
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared")) / "real"
@@ -47,26 +52,51 @@ METHODS: dict[str, tuple[str, ...]] = {
     "floor_components": ("floor_components",),
     "floor_one_blob": ("floor_one_blob",),
 }
+#: Tensors of the corrections of the border model by fold (../segmentation_fit/correction.py)
+FOLDS = load_file(HERE / "folds.safetensors")
 _WORST = 12  # pauses on a contact sheet
+_SCRATCH = tempfile.TemporaryDirectory()
 
 
-def held_out(sequence: Sequence, method: str) -> list[str]:
-    """Constants of the segmentation that were chosen on OSD frames of the other camera set-ups.
+def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list[str]:
+    """Changes to a method that was fitted to the frames of a sequence: what was fitted without its camera set-up.
 
-    They replace the defaults on frames of OSD, which were chosen on all of them.
+    On frames of OSD, constants of the segmentation that were chosen on the other camera set-ups replace the defaults.
+    On frames of OSD and HOTS, the border model has the correction that was fitted without the camera set-up. With
+    `by_sequence`, the correction for a sequence of HOTS was fitted with the other sequences of the same camera.
     """
-    if sequence.source != "osd" or method.startswith("floor"):
+    if sequence.source not in ("osd", "hots") or method.startswith("floor"):
         return []
+    changes = []
+    if isinstance(preset(*METHODS[method]).proposal.tree, BorderTree):
+        group = [f"learn{first}-{last}" for first, last in OSD_GROUPS]
+        fold = sequence.name if by_sequence else "hots"
+        if sequence.source == "osd":
+            fold = "osd, odd" if group.index(sequence.name) % 2 else "osd, even"
+        changes = [f"proposal.tree.weights={_fold_model(fold)}"]
+    if sequence.source == "hots":
+        return changes
     row = next(r for r in read_csv(CONSTANTS) if r["frames"] == sequence.name)
     contour = method in ("paper", "authors")
     weight = row["colour_weight" if contour else "colour_weight_learned"]
-    changes = ["proposal.boundary.component=colour_depth", f"proposal.boundary.colour_weight={weight}"]
+    changes += ["proposal.boundary.component=colour_depth", f"proposal.boundary.colour_weight={weight}"]
     return changes + [f"proposal.tree.{field}={row[field]}" for field in ("centre", "slope") if contour]
 
 
-def run(sequence: Sequence, methods: list[str], seed: int, last: int | None) -> Iterator[dict[str, object]]:
+@cache
+def _fold_model(fold: str) -> str:
+    """A folder with the border model and the correction of a fold. The folder exists until the process ends."""
+    model, folder = open_model("border"), Path(_SCRATCH.name) / fold.replace(", ", "-")
+    own = {name.removeprefix(f"{fold}/"): t for name, t in FOLDS.items() if name.startswith(f"{fold}/")}
+    write_model(folder, model.description, {**model.tensors, **own})
+    return str(folder)
+
+
+def run(
+    sequence: Sequence, methods: list[str], seed: int, last: int | None, by_sequence: bool = False
+) -> Iterator[dict[str, object]]:
     """One row for each pause and method."""
-    filters = {name: preset(*METHODS[name], *held_out(sequence, name)) for name in methods}
+    filters = {name: preset(*METHODS[name], *held_out(sequence, name, by_sequence)) for name in methods}
     states: dict[str, State] = {name: f.start(seed) for name, f in filters.items()}
     histories: dict[str, list[list[dict[str, int]]]] = defaultdict(list)  # of each hypothesis and its ancestors
     for clip in sequence.recording.clips()[:last]:
@@ -167,6 +197,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="names of sequences or sources, separated by commas")
     parser.add_argument("--methods", default=",".join(METHODS).replace("mst, no past", "no past"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--by-sequence", action="store_true", help="for HOTS, fit with its other sequences")
     parser.add_argument("--sheets", type=Path, help="draw the worst pauses of `mst` into this folder")
     options = parser.parse_args()
     if options.smoke and options.out == parser.get_default("out"):
@@ -184,7 +215,11 @@ def main() -> None:
             continue
         done = {row["method"] for row in rows if row["sequence"] == sequence.name}
         rows += run(
-            sequence, [name for name in methods if name not in done], options.seed, 1 if options.smoke else None
+            sequence,
+            [name for name in methods if name not in done],
+            options.seed,
+            1 if options.smoke else None,
+            options.by_sequence,
         )
         columns = dict.fromkeys(key for row in rows for key in row)
         rows = [{key: str(row.get(key, "")) for key in columns} for row in rows]

@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from scenes import CHECKED, CHECKED_SEEDS, first_pause, small
+from scenes import CHECKED, CHECKED_SEEDS, Pause, first_pause, small
 
 from mstfilter.completion import Extrude
 from mstfilter.files import write_csv
@@ -57,7 +57,7 @@ def main(out: Path, smoke: bool, border: str) -> None:
     for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else CHECKED)):
         table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*arms, "true masks"]}
         for seed in CHECKED_SEEDS[: 1 if smoke else None]:
-            pause = first_pause(small(family) if smoke else family, seed)
+            pause, volume = first_pause(small(family) if smoke else family, seed)
             clip = Clip((pause.frame,), pause.grid, 0)
             for arm, proposal in arms.items():
                 n = 1 if isinstance(proposal.sampler, OptimalCut) else N
@@ -67,12 +67,12 @@ def main(out: Path, smoke: bool, border: str) -> None:
                 if n == 1:
                     labels = proposal.objects.label_image(tree, optimal_cut(tree, w), pause.frame, pause.grid)
                     image = weighted_coverage(labels, pause.image)
-                q = [weighted_coverage(h.labels, pause.volume) for h in population.particles]
+                q = [weighted_coverage(h.labels, volume) for h in population.particles]
                 distinct = population.notes["distinct_hypotheses"]
                 table[arm].append(
                     (image, float(np.mean(q)), float(np.max(q)), distinct, np.mean(population.notes["objects"]))
                 )
-            table["true masks"].append(_true_masks(pause))
+            table["true masks"].append(_true_masks(pause, volume))
         for arm, found in table.items():
             mean = [f"{x:.3f}" for x in np.array(found).mean(axis=0)]
             rows.append([name, arm, *mean])
@@ -81,12 +81,12 @@ def main(out: Path, smoke: bool, border: str) -> None:
     write_csv(out / "quality.csv", [dict(zip(header, row, strict=True)) for row in rows])
 
 
-def _true_masks(pause) -> tuple[float, ...]:
+def _true_masks(pause: Pause, volume: np.ndarray) -> tuple[float, ...]:
     from mstfilter.completion import arbitrate
 
     masks = [pause.image == k for k in range(1, int(pause.image.max()) + 1) if (pause.image == k).any()]
     completions = Extrude().complete(np.random.default_rng(0), pause.frame, masks, pause.grid)
-    q = weighted_coverage(arbitrate(completions, pause.grid), pause.volume)
+    q = weighted_coverage(arbitrate(completions, pause.grid), volume)
     return 1.0, q, q, 1, len(masks)
 
 

@@ -15,11 +15,11 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from scenes import FITTED, FITTED_SEEDS, first_pause, small
+from scenes import FITTED, FITTED_SEEDS, Pause, first_pause, small
 from scipy.optimize import minimize
 
 from mstfilter.resources import models_folder
@@ -33,6 +33,7 @@ from mstfilter.segmentation import (
     ColourDepthBoundary,
     LearnedTree,
     MergedTree,
+    PairNetwork,
     Regions,
     pair_features,
 )
@@ -50,29 +51,46 @@ Pairs = tuple[list[np.ndarray], list[bool], list[float]]
 def measured(
     families: Iterable[SceneFamily], seeds: Iterable[int], builder: MergedTree
 ) -> list[tuple[Regions, np.ndarray, float]]:
-    """For every scene: regions, numbers of pixels (R, K) of each region in each true object, and image scale."""
+    """`measured_image` of the first pause of every scene."""
     found = []
     for family in families:
         for seed in seeds:
             try:
-                pause = first_pause(family, seed)
+                pause, _ = first_pause(family, seed)
             except RuntimeError as error:  # no room for that many objects
                 print(family.name, seed, error)
                 continue
-            seen = foreground(pause.frame, pause.grid)
-            regions = builder.regions(ColourDepthBoundary().boundary(seen.frame), seen.frame, seen.pixels)
-            n, k = len(regions.sums), int(pause.image.max()) + 1
-            code = regions.image * k + pause.image
-            pixels = np.bincount(code.ravel(), minlength=n * k).reshape(n, k).astype(np.float64)
-            pixels[:, 0] += 0.1  # no region is empty
-            found.append((regions, pixels, pause.frame.camera.width / 640))
+            found.append(measured_image(pause, builder))
     return found
 
 
-def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: dict[str, float], pairs: Pairs) -> None:
+def measured_image(pause: Pause, builder: MergedTree) -> tuple[Regions, np.ndarray, float]:
+    """Regions of an image, numbers of pixels (R, K) of each region in each true object, and image scale."""
+    seen = foreground(pause.frame, pause.grid)
+    regions = builder.regions(ColourDepthBoundary().boundary(seen.frame), seen.frame, seen.pixels)
+    pixels = np.zeros((len(regions.sums), int(pause.image.max()) + 1))
+    known = pause.image >= 0
+    np.add.at(pixels, (regions.image[known], pause.image[known]), 1)
+    pixels[:, 0] += 0.1  # no region is empty
+    return regions, pixels, pause.frame.camera.width / 640
+
+
+def episode(
+    regions: Regions,
+    pixels: np.ndarray,
+    scale: float,
+    weights: Mapping[str, float],
+    pairs: Pairs,
+    correction: PairNetwork | None = None,
+) -> None:
     """Merge the regions of one scene by the ground truth, and append the evaluated pairs to `pairs`."""
     w = np.array(list(weights.values()))
-    growing = Agglomeration(regions, lambda *pair: pair_features(*pair, scale, weights) @ w)
+
+    def log_odds(*rows: np.ndarray) -> np.ndarray:
+        x = pair_features(*rows, scale, weights)
+        return x @ w + (0.0 if correction is None else correction(x))
+
+    growing = Agglomeration(regions, log_odds)
     true = np.zeros((2 * len(pixels), pixels.shape[1]))
     true[: len(pixels)] = pixels
     while (pair := growing.pop()) is not None:
@@ -80,7 +98,7 @@ def episode(regions: Regions, pixels: np.ndarray, scale: float, weights: dict[st
         rows = growing.sums[[i]], growing.sums[[j]], growing.borders[i][j][None]
         x = pair_features(*rows, growing.table[i][None], growing.table[j][None], scale, weights)[0]
         first, second = (int(true[r].argmax()) for r in (i, j))
-        if all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
+        if (first or second) and all(true[r].max() >= PURE * true[r].sum() for r in (i, j)):
             size = growing.sums[[i, j], REGION["pixels"].start].min() / scale**2
             # Large regions have more weight; pairs with a region of no object have less.
             weight = min(size / 200, 5) ** 0.5 * (1.0 if first and second else 0.3)

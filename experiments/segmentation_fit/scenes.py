@@ -1,12 +1,14 @@
-"""Simulated first pauses with true labels, for the fit of the learned tree and its check."""
+"""Simulated images with true labels, for the fits of the learned trees and their check."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.scene import Camera, Frame, VoxelGrid
+from mst_training.border_data import BorderSamples
+from mstfilter.scene import Frame, VoxelGrid
 from mstfilter.simulation import SCENE_FAMILIES, SceneFamily, SimulatedScene
 
 _TABLE, _DEMO = SCENE_FAMILIES["table"], SCENE_FAMILIES["demo"]
@@ -27,12 +29,11 @@ CHECKED_SEEDS = range(10)  # the tuning seeds of the protocol
 
 @dataclass(frozen=True, eq=False)
 class Pause:
-    """A frame with its true labels in the image (H, W) and in space (X, Y, Z); 0 is no object."""
+    """A frame with its true labels."""
 
     frame: Frame
-    image: np.ndarray
+    image: np.ndarray  #: (H, W) int, object of every pixel; 0 is no object, -1 is unknown
     grid: VoxelGrid
-    volume: np.ndarray
 
 
 def small(family: SceneFamily) -> SceneFamily:
@@ -40,12 +41,43 @@ def small(family: SceneFamily) -> SceneFamily:
     return replace(family, width=family.width // 2, height=family.height // 2, voxel_size=2 * family.voxel_size)
 
 
-def first_pause(family: SceneFamily, seed: int) -> Pause:
-    """The first pause of a scene."""
+def first_pause(family: SceneFamily, seed: int) -> tuple[Pause, np.ndarray]:
+    """The first pause of a scene, and the true labels of the voxels (X, Y, Z)."""
     scene = SimulatedScene(family, seed)
+    return _pause(scene), scene.truth()
+
+
+def later_pauses(family: SceneFamily, seed: int, pushes: tuple[int, ...] = (0, 1, 3)) -> Iterator[Pause]:
+    """The pauses of a scene after some numbers of pushes, in ascending order."""
+    scene = SimulatedScene(family, seed)
+    for action in range(pushes[-1] + 1):
+        if action in pushes:
+            yield _pause(scene)
+        if action < pushes[-1]:
+            scene.play(scene.choose_push(action), lambda _: None)
+
+
+def _pause(scene: SimulatedScene) -> Pause:
     seen = scene.frame_images(0)
     robot = seen["robot_mask"]
-    camera: Camera = scene.camera
-    frame = Frame(seen["rgb"], seen["depth"], camera, robot if robot.any() else None)
-    image = np.where(robot, 0, seen["instance"]).astype(np.int64)
-    return Pause(frame, image, scene.grid, scene.truth())
+    frame = Frame(seen["rgb"], seen["depth"], scene.camera, robot if robot.any() else None)
+    return Pause(frame, np.where(robot, 0, seen["instance"]).astype(np.int64), scene.grid)
+
+
+class PlainSamples(BorderSamples):
+    """Training images of the border network in which every surface has one colour."""
+
+    @staticmethod
+    def albedo(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
+        colour = rng.uniform(0.02, 0.95, 3) ** 1.5
+        if rng.uniform() < 0.4:  # grey, from black to white
+            colour[:] = colour.mean()
+        return np.broadcast_to(colour, points.shape).copy()
+
+
+def training_images(samples: type[BorderSamples], seed: int, index: int) -> Iterator[Pause]:
+    """Images of a scene of other kinds of objects, seen by random cameras; see `mst_training.border_data`."""
+    grid = VoxelGrid.from_bounds(np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 0.5]), 0.01)
+    found = samples.of_scene(seed, index)
+    for k in range(len(found)):
+        yield Pause(found.frame(k), found.instance[k].astype(np.int64), grid)

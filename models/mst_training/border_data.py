@@ -13,7 +13,9 @@ disparity, flying pixels between foreground and background, and holes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -32,6 +34,8 @@ _LEAST_PIXELS = 40  # of an object in an image
 _DISPARITY = 8.0 * 525.0 * 0.075  # sensor units (1/8 px) at one metre
 _STEP = 0.02  # metres within 3 x 3 pixels from which flying pixels occur
 
+Albedo = Callable[[np.random.Generator, np.ndarray], np.ndarray]  #: see `BorderSamples.albedo`
+
 
 @dataclass(frozen=True, eq=False)
 class BorderSamples(Samples):
@@ -46,10 +50,15 @@ class BorderSamples(Samples):
     scene: np.ndarray  #: (n,) int32, number of the scene
 
     @classmethod
-    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> BorderSamples | None:
-        rows = [row for _ in range(_N_VIEWS) if (row := _view(rng, world)) is not None]
+    def of_world(cls, rng: np.random.Generator, world: PhysicsWorld, index: int) -> Self | None:
+        rows = [row for _ in range(_N_VIEWS) if (row := _view(rng, world, cls.albedo)) is not None]
         columns = [np.stack(column) for column in zip(*rows, strict=True)]
-        return BorderSamples(*[*columns, np.full(len(rows), index, np.int32)]) if rows else None
+        return cls(*[*columns, np.full(len(rows), index, np.int32)]) if rows else None
+
+    @staticmethod
+    def albedo(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
+        """Albedo (n, 3) of the points (n, 3) of a surface, in metres and in the axes of the surface's object."""
+        return _pattern(rng, points)
 
     def frame(self, k: int) -> Frame:
         """Image k."""
@@ -74,7 +83,7 @@ def targets(instance: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.nd
     return border, instance > 0, np.where(instance > 0, offset, 0).astype(np.float32)
 
 
-def _view(rng: np.random.Generator, world: PhysicsWorld) -> tuple[np.ndarray, ...] | None:
+def _view(rng: np.random.Generator, world: PhysicsWorld, albedo: Albedo) -> tuple[np.ndarray, ...] | None:
     """The arrays of one image; None if it shows no object."""
     poses = world.poses()
     inside = on_table(poses)
@@ -86,7 +95,7 @@ def _view(rng: np.random.Generator, world: PhysicsWorld) -> tuple[np.ndarray, ..
     if np.bincount(view.instance.ravel())[1:].max(initial=0) < _LEAST_PIXELS:
         return None
     depth = _depth(rng, view)
-    rgb = _colours(rng, world, poses, view)
+    rgb = _colours(rng, world, poses, view, albedo)
     centre = np.zeros((_MOST_OBJECTS + 1, 2), np.float32)
     projected, _ = camera.project(poses[:, :3, 3])
     centre[1 : 1 + len(poses)] = np.nan_to_num(projected)
@@ -139,7 +148,9 @@ def _flying(rng: np.random.Generator, depth: np.ndarray) -> np.ndarray:
     return np.where(moved, between, depth).astype(np.float32)
 
 
-def _colours(rng: np.random.Generator, world: PhysicsWorld, poses: np.ndarray, view: View) -> np.ndarray:
+def _colours(
+    rng: np.random.Generator, world: PhysicsWorld, poses: np.ndarray, view: View, albedo_of: Albedo
+) -> np.ndarray:
     """A colour image (H, W, 3) uint8 with random patterns, lamp and exposure."""
     kind = rng.uniform()
     if kind < 0.12:
@@ -158,7 +169,7 @@ def _colours(rng: np.random.Generator, world: PhysicsWorld, poses: np.ndarray, v
         if k > 3:
             turn, at = poses[k - 4, :3, :3], poses[k - 4, :3, 3]
             local = (local - at) @ turn
-        albedo[pixels] = _pattern(rng, local)
+        albedo[pixels] = albedo_of(rng, local)
     direction = rng.normal(size=3) + np.array([0, 0, 1.5])
     direction /= np.linalg.norm(direction)
     direction[2] = abs(direction[2])

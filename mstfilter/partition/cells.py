@@ -20,7 +20,8 @@ f_prediction is the corresponding weighted share of the predictions. The log odd
 R is the probability that a prediction is valid. The update gives one prediction at a time a weight above 0, so
 f_prediction is 0 or 1 there. W <= R is the total weight of the predictions with an object at both
 cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,
-logit(f_image) is not scaled. The coefficients of the predictions were fitted in `experiments/partition_fit`.
+logit(f_image) is not scaled. The coefficient of the predictions was fitted in `experiments/partition_fit`, and the
+constants were chosen in `experiments/weights`.
 
 The alternatives of a component are its partitions in the samples and in the predictions. If a prediction has no
 object at a cell, each sample in turn determines which predicted object the cell joins. A mixture of the alternatives
@@ -313,10 +314,10 @@ class PairEvidence(PairOdds):
 
     image_only_constant: float = 0.0
     image_only: float = 1.0
-    constant: float = 0.0
+    constant: float = -0.5
     image: float = 1.0
     prediction: float = 0.62
-    prediction_constant: float = 0.96
+    prediction_constant: float = 0.0
 
     def log_odds(self, cells: Cells, weights: np.ndarray, clip: Clip) -> np.ndarray:
         return np.column_stack(self.terms(cells, weights)) @ np.array(astuple(self))

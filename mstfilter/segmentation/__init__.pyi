@@ -24,6 +24,7 @@ from mstfilter.segmentation.learned_tree import (
     pair_features as pair_features,
 )
 from mstfilter.segmentation.mh import MetropolisHastingsCuts as MetropolisHastingsCuts
+from mstfilter.segmentation.pair_network import PairNetwork as PairNetwork
 from mstfilter.segmentation.proposal import (
     ObjectRule as ObjectRule,
     Segments as Segments,

@@ -14,6 +14,7 @@ border, and that a pixel belongs to an object. Two other outputs are the offset 
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from torch.nn import functional
 
 from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, fill_from_nearest, posed_camera
 from mstfilter.segmentation.boundary import SENSOR_FOCAL
+from mstfilter.segmentation.pair_network import PREFIX, PairNetwork
 from mstfilter.segmentation.regions import SeenBorders
 from mstfilter.trained import TrainedModel, calibrated_network, open_model
 
@@ -135,12 +137,14 @@ class BorderNetwork:
     """A border network with loaded weights."""
 
     def __init__(self, model: TrainedModel) -> None:
+        own = {name: tensor for name, tensor in model.tensors.items() if not name.startswith(PREFIX)}
         self.net, self.scale, self.shift = calibrated_network(
-            model, IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
+            replace(model, tensors=own), IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
         )
         evidence = model.description.get("evidence", {})
         #: Weights of the features of the tree `border`; empty if they were not fitted.
         self.evidence = dict(zip(evidence.get("features", ()), evidence.get("weights", ()), strict=True))
+        self.correction = PairNetwork.of(model.tensors)  #: of the log odds of the tree `border`, or None
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:

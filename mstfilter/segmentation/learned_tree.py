@@ -1,8 +1,9 @@
 """Segmentation trees that merge regions by learned log odds that two regions are different objects.
 
 Watershed regions of a boundary map are merged in pairs. The pair with the lowest log odds is merged first. The log
-odds are linear in `FEATURES` of the border and of the union of two regions. The features are recomputed when a region
-grows. A model file has the weights of the features. The weights were fitted on simulated scenes only.
+odds are linear in `FEATURES` of the border and of the union of two regions. `BorderTree` adds the correction of a
+small network (`pair_network`). The features are recomputed when a region grows. A model file has the weights of the
+features. The weights were fitted on simulated scenes only, and the correction also on real frames.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees
@@ -30,6 +31,7 @@ from mstfilter.errors import InputError
 from mstfilter.reading import read_json
 from mstfilter.resources import models_folder
 from mstfilter.scene import Frame, pixels_above_table, scaled_length
+from mstfilter.segmentation.pair_network import PairNetwork
 from mstfilter.segmentation.regions import (
     BORDER,
     HEIGHT_BIN,
@@ -284,6 +286,21 @@ class MergedTree(TreeBuilder):
     def look(self, frame: Frame) -> SeenBorders | None:
         """The output of the border network for a frame; None if the tree uses no network."""
 
+    def correction(self) -> PairNetwork | None:
+        """A network that is added to the linear log odds, or None."""
+        return None
+
+    def log_odds(self, scale: float) -> PairLogOdds:
+        """The function that computes the log odds of pairs in an image of `scale` times 640 pixels per row."""
+        named, correction = self.model()[0], self.correction()
+        weights = np.array(list(named.values()))
+
+        def log_odds(a: np.ndarray, b: np.ndarray, ab: np.ndarray, at: np.ndarray, bt: np.ndarray) -> np.ndarray:
+            x = pair_features(a, b, ab, at, bt, scale, named)
+            return np.asarray(x @ weights + (0.0 if correction is None else correction(x)))
+
+        return log_odds
+
     @property
     def weights_key(self) -> str:
         """Hash of the contents of the model files."""
@@ -308,12 +325,8 @@ class MergedTree(TreeBuilder):
             raise InputError(
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
             )
-        named, _ = self.model()
         regions = self.regions(boundary, frame, pixels_above_table(frame) if pixels is None else pixels)
-        weights, scale = np.array(list(named.values())), scaled_length(1, frame.camera.width)
-        growing = Agglomeration(
-            regions, lambda a, b, ab, at, bt: pair_features(a, b, ab, at, bt, scale, named) @ weights
-        )
+        growing = Agglomeration(regions, self.log_odds(scaled_length(1, frame.camera.width)))
         growing.merge_all()
         return tree_of_merges(regions.image, len(regions.sums), growing.merges)
 
@@ -372,6 +385,9 @@ class BorderTree(MergedTree):
 
     def look(self, frame: Frame) -> SeenBorders | None:
         return self._network().look(frame)
+
+    def correction(self) -> PairNetwork | None:
+        return self._network().correction
 
     def _network(self) -> BorderNetwork:
         from mstfilter.segmentation.border_network import load_border_network

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import shutil
 
 import numpy as np
 import pytest
 
 from mstfilter import smc
 from mstfilter.files import read_csv
+from mstfilter.resources import models_folder
 from mstfilter.scene import read_rgb
-from mstfilter.segmentation import LearnedTree
+from mstfilter.segmentation import BorderTree, LearnedTree
 from tests.conftest import find_shared
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
 
@@ -161,6 +163,12 @@ def test_segmentation_fit(tmp_path):
     assert "misclassified" in run_script("segmentation_fit/run.py", "--smoke", "--out", tmp_path / "weights.json")
     made, _ = LearnedTree(weights=str(tmp_path / "weights.json")).model()
     assert made != LearnedTree().model()[0]
+
+    shutil.copytree(models_folder() / "border", tmp_path / "border")
+    run_script("segmentation_fit/correction.py", "--smoke", "--border", tmp_path / "border", "--out", tmp_path)
+    shipped, made = (BorderTree(weights=str(name)).correction() for name in ("border", tmp_path / "border"))
+    x = np.zeros((1, len(shipped.mean)))
+    assert np.isfinite(made(x)) and made(x) != shipped(x)
 
     run_script("segmentation_fit/check.py", "--smoke", "--out", tmp_path)
     rows = {r["arm"]: r for r in read_csv(tmp_path / "quality.csv")}

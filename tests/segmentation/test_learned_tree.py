@@ -18,6 +18,7 @@ from mstfilter.segmentation import (
     ColourDepthBoundary,
     LearnedTree,
     MergeLogOdds,
+    PairNetwork,
     SeenBorders,
     UcmTree,
     pair_features,
@@ -156,7 +157,7 @@ def test_perfect_evidence_tells_pairs_of_objects_from_parts():
     assert different[:, gap].min() > 1 and np.allclose(same[:, gap], 0, atol=1e-3)
 
 
-def write_network(folder, evidence: dict[str, float]) -> str:
+def write_network(folder, evidence: dict[str, float], correction: PairNetwork | None = None) -> str:
     torch.manual_seed(0)
     net = BorderNet(8)
     torch.nn.init.normal_(net.head.weight, std=0.5)
@@ -166,8 +167,47 @@ def write_network(folder, evidence: dict[str, float]) -> str:
         "calibration": {"scale": 1.0, "shift": 0.0},
         "evidence": {"features": list(evidence), "weights": list(evidence.values())},
     }
-    write_model(folder, description, {name: t.numpy() for name, t in net.state_dict().items()})
+    own = {} if correction is None else correction.tensors()
+    write_model(folder, description, {name: t.numpy() for name, t in net.state_dict().items()} | own)
     return str(folder)
+
+
+def perceptron(rng: np.random.Generator, n_features: int, n_hidden: int = 5) -> PairNetwork:
+    shapes = (n_features, n_hidden), (n_hidden, 1)
+    weights = tuple(rng.normal(size=shape) for shape in shapes)
+    biases = tuple(rng.normal(size=shape[1]) for shape in shapes)
+    return PairNetwork(rng.normal(size=n_features), rng.uniform(0.5, 2, n_features), weights, biases)
+
+
+def test_the_correction_is_a_bounded_perceptron(tmp_path):
+    network = perceptron(np.random.default_rng(0), 3)
+    for x in np.random.default_rng(1).normal(scale=5, size=(20, 3)):
+        z = [min(max((x[i] - network.mean[i]) / network.scale[i], -4), 4) for i in range(3)]
+        hidden = [
+            max(sum(z[i] * network.weights[0][i, k] for i in range(3)) + network.biases[0][k], 0) for k in range(5)
+        ]
+        odds = sum(hidden[k] * network.weights[1][k, 0] for k in range(5)) + network.biases[1][0]
+        assert network(x[None]) == pytest.approx([odds])
+    far = np.array([[1e9, -1e9, 1e9], [1e12, -1e12, 1e12]])
+    assert network(far)[0] == network(far)[1]  # bounded
+    again = PairNetwork.of(network.tensors())
+    assert np.array_equal(again(far), network(far)) and PairNetwork.of({"other": far}) is None
+
+
+def test_the_correction_is_added_to_the_log_odds_of_the_border_tree(tmp_path):
+    learned, _ = LearnedTree().model()
+    evidence = {**learned, **dict.fromkeys(EVIDENCE_FEATURES, 0.0)}
+    n = len(evidence)
+    shift = PairNetwork(np.zeros(n), np.ones(n), (np.zeros((n, 1)),), (np.array([-2.0]),))
+    frame = frame_of(TOUCHING, noise=0.4)
+    boundary, leaves = ColourDepthBoundary().boundary(frame), UcmTree(max_leaves=100)
+    one, other = (
+        BorderTree(leaves, write_network(tmp_path / str(k), evidence, network)).build(boundary, frame)
+        for k, network in enumerate((None, shift))
+    )
+    assert np.array_equal(one.parent, other.parent)
+    merged = slice(one.n_leaves, -1)  # without the root
+    assert np.allclose(other.odds[merged], one.odds[merged] - 2)
 
 
 def test_weights_of_zero_for_the_evidence_give_the_learned_tree(tmp_path):
