@@ -1,6 +1,7 @@
 """Fit the network that corrects the log odds of a border model, on simulated images and on real frames.
 
     python experiments/segmentation_fit/correction.py --border models/border
+    python experiments/segmentation_fit/correction.py --linear FOLDER    # copy without the correction
     python experiments/segmentation_fit/correction.py --smoke --border FOLDER --out DIR    # few images: a quick test
 
 The linear weights of the border model stay as they are. The pairs of regions are those of two rounds of merging
@@ -32,6 +33,7 @@ from scenes import FITTED, FITTED_SEEDS, Pause, PlainSamples, first_pause, later
 from mst_training.border_data import BorderSamples
 from mstfilter.files import atomic_path, write_csv
 from mstfilter.segmentation import BorderTree, PairNetwork, Regions
+from mstfilter.segmentation.pair_network import PREFIX
 from mstfilter.simulation import SCENE_FAMILIES
 from mstfilter.trained import open_model, write_model
 
@@ -218,7 +220,13 @@ if __name__ == "__main__":
     parser.add_argument("--border", default="border", help="folder of the border model to write into")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results of the folds")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--linear", type=Path, help="copy the border model without its correction into this folder")
     options = parser.parse_args()
+    if options.linear:
+        model = open_model(options.border)
+        own = {name: tensor for name, tensor in model.tensors.items() if not name.startswith(PREFIX)}
+        write_model(options.linear, model.description, own)
+        parser.exit()
     if options.smoke and (options.out == RESULTS or options.border == "border"):
         parser.error("--smoke would overwrite the results: name other folders with --out and --border")
     main(options.border, options.out, options.smoke, options.workers)
