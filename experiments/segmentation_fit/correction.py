@@ -205,7 +205,7 @@ def main(border: str, out: Path, smoke: bool, workers: int) -> None:
             rows.append({"fold": fold, "sequence": name} | {key: f"{value:.4f}" for key, value in losses.items()})
             print(*rows[-1].values())
     model = open_model(border)
-    write_model(border, model.description, {**model.tensors, **fitted(pairs).tensors()})
+    write_model(model.folder, model.description, {**model.tensors, **fitted(pairs).tensors()})
     if rows:
         write_csv(out / "folds.csv", rows)
         arrays = {f"{fold}/{name}": t for fold, network in folds.items() for name, t in network.tensors().items()}

@@ -179,7 +179,7 @@ def perceptron(rng: np.random.Generator, n_features: int, n_hidden: int = 5) -> 
     return PairNetwork(rng.normal(size=n_features), rng.uniform(0.5, 2, n_features), weights, biases)
 
 
-def test_the_correction_is_a_bounded_perceptron(tmp_path):
+def test_the_correction_is_a_bounded_perceptron():
     network = perceptron(np.random.default_rng(0), 3)
     for x in np.random.default_rng(1).normal(scale=5, size=(20, 3)):
         z = [min(max((x[i] - network.mean[i]) / network.scale[i], -4), 4) for i in range(3)]
