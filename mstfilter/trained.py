@@ -13,9 +13,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -36,6 +36,13 @@ class TrainedModel:
     description: Mapping[str, Any]  #: contents of ``model.toml``
     tensors: Mapping[str, np.ndarray]  #: name -> float32
     key: str  #: hash of description and weights
+
+    def split(self, prefix: str) -> tuple[Self, Self]:
+        """The model without the tensors whose names begin with `prefix`, and the model with only these tensors."""
+        parts: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] = ({}, {})
+        for name, tensor in self.tensors.items():
+            parts[name.startswith(prefix)][name] = tensor
+        return replace(self, tensors=parts[0]), replace(self, tensors=parts[1])
 
     def check_tensors(self, expected: Mapping[str, tuple[int, ...]]) -> None:
         """Raise InputError unless the tensors have the names and shapes of the architecture."""

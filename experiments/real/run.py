@@ -12,7 +12,6 @@ each pause), sequences.csv (means over pauses), summary.csv (`mst` minus each me
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
 from collections import defaultdict
@@ -24,7 +23,7 @@ import cv2
 import numpy as np
 from safetensors.numpy import load_file
 from scores import identities, image_scores, kept, witness_scores
-from sequences import OSD_GROUPS, Sequence, sequences
+from sequences import FOLDS, SHARED, Sequence, sequences
 
 from mstfilter.files import read_csv, write_csv
 from mstfilter.presets import preset
@@ -35,7 +34,6 @@ from mstfilter.statistics import compare
 from mstfilter.trained import open_model, write_model
 
 HERE = Path(__file__).resolve().parent
-SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared")) / "real"
 
 CONSTANTS = HERE.parent / "osd_frames" / "results" / "constants.csv"
 #: Name -> preset and changes. `no past` starts again at every pause.
@@ -53,7 +51,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "floor_one_blob": ("floor_one_blob",),
 }
 #: Tensors of the corrections of the border model by fold (../segmentation_fit/correction.py)
-FOLDS = load_file(HERE / "folds.safetensors")
+CORRECTIONS = load_file(HERE / "folds.safetensors")
 _WORST = 12  # pauses on a contact sheet
 _SCRATCH = tempfile.TemporaryDirectory()
 
@@ -69,11 +67,8 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list
         return []
     changes = []
     if isinstance(preset(*METHODS[method]).proposal.tree, BorderTree):
-        group = [f"learn{first}-{last}" for first, last in OSD_GROUPS]
-        fold = sequence.name if by_sequence else "hots"
-        if sequence.source == "osd":
-            fold = "osd, odd" if group.index(sequence.name) % 2 else "osd, even"
-        changes = [f"proposal.tree.weights={_fold_model(fold)}"]
+        folds = [fold for fold, left_out in FOLDS.items() if sequence.name in left_out]
+        changes = [f"proposal.tree.weights={_fold_model(folds[-1 if by_sequence else 0])}"]
     if sequence.source == "hots":
         return changes
     row = next(r for r in read_csv(CONSTANTS) if r["frames"] == sequence.name)
@@ -87,7 +82,7 @@ def held_out(sequence: Sequence, method: str, by_sequence: bool = False) -> list
 def _fold_model(fold: str) -> str:
     """A folder with the border model and the correction of a fold. The folder exists until the process ends."""
     model, folder = open_model("border"), Path(_SCRATCH.name) / fold.replace(", ", "-")
-    own = {name.removeprefix(f"{fold}/"): t for name, t in FOLDS.items() if name.startswith(f"{fold}/")}
+    own = {name.removeprefix(f"{fold}/"): t for name, t in CORRECTIONS.items() if name.startswith(f"{fold}/")}
     write_model(folder, model.description, {**model.tensors, **own})
     return str(folder)
 

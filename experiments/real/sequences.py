@@ -10,6 +10,7 @@ HOTS and OSD (the groups of frames of one camera set-up) have label images at ev
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,8 +24,16 @@ from mstfilter import open_recording
 from mstfilter.formats import PairedImages
 from mstfilter.scene import Camera, Frame, Recording, VoxelGrid, read_depth, read_labels, read_rgb
 
+SHARED = Path(os.environ.get("MSTFILTER_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "real"
+HOTS = ("mix_1", "office_6", "office_9", "table_7")
 #: First and last frame of each group of OSD with one camera set-up.
 OSD_GROUPS = ((0, 1), (2, 4), (6, 16), (17, 24), (25, 26), (27, 29), (31, 32), (33, 44))
+#: Fold of the fit of the border model -> sequences that are left out: all of one camera set-up, or one sequence.
+FOLDS = {
+    "hots": HOTS,
+    "osd, even": tuple(f"learn{a}-{b}" for a, b in OSD_GROUPS[::2]),
+    "osd, odd": tuple(f"learn{a}-{b}" for a, b in OSD_GROUPS[1::2]),
+} | {name: (name,) for name in HOTS}
 #: A pixel (column, row) on each of the four objects of `two_cameras`, at every pause, marked by hand.
 POINTS = {
     "carton": ((243, 299),) * 3

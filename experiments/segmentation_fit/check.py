@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from scenes import CHECKED, CHECKED_SEEDS, Pause, first_pause, small
+from scenes import CHECKED, CHECKED_SEEDS, Pause, pauses, small
 
 from mstfilter.completion import Extrude
 from mstfilter.files import write_csv
@@ -30,7 +30,7 @@ from mstfilter.segmentation import (
     UcmTree,
     optimal_cut,
 )
-from mstfilter.simulation import SCENE_FAMILIES
+from mstfilter.simulation import SCENE_FAMILIES, SimulatedScene
 
 OLD = {"tree": UcmTree(), "value": SceneCutObjectness()}
 NEW = {"tree": LearnedTree(), "value": MergeLogOdds()}
@@ -57,7 +57,8 @@ def main(out: Path, smoke: bool, border: str) -> None:
     for name, family in ((name, SCENE_FAMILIES[name]) for name in (("demo",) if smoke else CHECKED)):
         table: dict[str, list[tuple[float, ...]]] = {arm: [] for arm in [*arms, "true masks"]}
         for seed in CHECKED_SEEDS[: 1 if smoke else None]:
-            pause, volume = first_pause(small(family) if smoke else family, seed)
+            shown = small(family) if smoke else family
+            [pause], volume = pauses(shown, seed), SimulatedScene(shown, seed).truth()
             clip = Clip((pause.frame,), pause.grid, 0)
             for arm, proposal in arms.items():
                 n = 1 if isinstance(proposal.sampler, OptimalCut) else N

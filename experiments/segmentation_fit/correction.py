@@ -14,7 +14,6 @@ pairs that a fold has not seen, are written to ../real/folds.safetensors and res
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -28,34 +27,30 @@ from typing import NamedTuple
 import numpy as np
 from run import episode, measured_image
 from safetensors.numpy import save
-from scenes import FITTED, FITTED_SEEDS, Pause, PlainSamples, first_pause, later_pauses, small, training_images
+from scenes import FITTED, FITTED_SEEDS, Pause, PlainSamples, pauses, small, training_images
 
 from mst_training.border_data import BorderSamples
 from mstfilter.files import atomic_path, write_csv
 from mstfilter.segmentation import BorderTree, PairNetwork, Regions
-from mstfilter.segmentation.pair_network import PREFIX
+from mstfilter.segmentation.border_network import PAIR_TENSORS
 from mstfilter.simulation import SCENE_FAMILIES
 from mstfilter.trained import open_model, write_model
 
 HERE = Path(__file__).resolve().parent
 RESULTS, REAL = HERE / "results", HERE.parent / "real"
 sys.path.append(str(REAL))
-from sequences import OSD_GROUPS, sequences  # noqa: E402
+from sequences import FOLDS, SHARED, sequences  # noqa: E402
 
-SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared")) / "real"
 SHARE = 0.5  # of the fitted correction that is used
 HIDDEN = (24, 12)  # units of the hidden layers
 DECAY = 3e-4  # weight of the squared weights in the loss
 STEPS, BATCH, RATE = 2000, 8192, 5e-3
 LATER_SEEDS, TRAINING_SCENES = range(20, 58), range(60)
+LATER = (0, 1, 3)  # numbers of pushes after which a simulated image is taken
 #: Samples and seed of the images of training scenes by kind; the seeds are of no training.
 TRAINING: dict[str, tuple[type[BorderSamples], int]] = {"patterned": (BorderSamples, 77), "plain": (PlainSamples, 78)}
 #: Weight of a pair by kind of image. The simulated families have weight 1.
 WEIGHTS = {"patterned": 2.0, "plain": 2.0, "real": 3.0}
-_GROUPS = [f"learn{first}-{last}" for first, last in OSD_GROUPS]
-_HOTS = ("mix_1", "office_6", "office_9", "table_7")
-#: Fold -> sequences that are left out: all of HOTS, half of OSD, or one sequence of HOTS.
-FOLDS = {"hots": _HOTS, "osd, even": tuple(_GROUPS[::2]), "osd, odd": tuple(_GROUPS[1::2])} | {k: (k,) for k in _HOTS}
 
 
 class Pairs(NamedTuple):
@@ -82,9 +77,9 @@ def simulated(job: tuple[str, int], smoke: bool) -> list[tuple[str, Pause]]:
     kind, seed = job
     if kind in SCENE_FAMILIES:
         family = SCENE_FAMILIES[kind]
-        return [("later", pause) for pause in later_pauses(small(family) if smoke else family, seed)]
+        return [("later", pause) for pause in pauses(small(family) if smoke else family, seed, LATER)]
     if kind in FITTED:
-        return [("first", first_pause(small(FITTED[kind]) if smoke else FITTED[kind], seed)[0])]
+        return [("first", pause) for pause in pauses(small(FITTED[kind]) if smoke else FITTED[kind], seed)]
     samples, training_seed = TRAINING[kind]
     return [(kind, pause) for pause in training_images(samples, training_seed, seed)]
 
@@ -179,7 +174,7 @@ def main(border: str, out: Path, smoke: bool, workers: int) -> None:
     with ProcessPoolExecutor(workers) as pool:
         images = [image for found in pool.map(measure, jobs) for image in found]
     print(f"{len(images)} images measured, {time.time() - began:.0f} s")
-    of_real = {*_HOTS, *_GROUPS}
+    of_real = set().union(*FOLDS.values())
     linear_weights = np.array(list(BorderTree(weights=border).model()[0].values()))
 
     def weighted(pairs: Pairs) -> Pairs:
@@ -224,8 +219,7 @@ if __name__ == "__main__":
     options = parser.parse_args()
     if options.linear:
         model = open_model(options.border)
-        own = {name: tensor for name, tensor in model.tensors.items() if not name.startswith(PREFIX)}
-        write_model(options.linear, model.description, own)
+        write_model(options.linear, model.description, model.split(PAIR_TENSORS)[0].tensors)
         parser.exit()
     if options.smoke and (options.out == RESULTS or options.border == "border"):
         parser.error("--smoke would overwrite the results: name other folders with --out and --border")

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from scenes import FITTED, FITTED_SEEDS, Pause, first_pause, small
+from scenes import FITTED, FITTED_SEEDS, Pause, pauses, small
 from scipy.optimize import minimize
 
 from mstfilter.resources import models_folder
@@ -36,6 +36,7 @@ from mstfilter.segmentation import (
     PairNetwork,
     Regions,
     pair_features,
+    pair_log_odds,
 )
 from mstfilter.simulation import SceneFamily
 from mstfilter.trained import open_model, write_model
@@ -56,7 +57,7 @@ def measured(
     for family in families:
         for seed in seeds:
             try:
-                pause, _ = first_pause(family, seed)
+                [pause] = pauses(family, seed)
             except RuntimeError as error:  # no room for that many objects
                 print(family.name, seed, error)
                 continue
@@ -84,13 +85,7 @@ def episode(
     correction: PairNetwork | None = None,
 ) -> None:
     """Merge the regions of one scene by the ground truth, and append the evaluated pairs to `pairs`."""
-    w = np.array(list(weights.values()))
-
-    def log_odds(*rows: np.ndarray) -> np.ndarray:
-        x = pair_features(*rows, scale, weights)
-        return x @ w + (0.0 if correction is None else correction(x))
-
-    growing = Agglomeration(regions, log_odds)
+    growing = Agglomeration(regions, pair_log_odds(weights, correction, scale))
     true = np.zeros((2 * len(pixels), pixels.shape[1]))
     true[: len(pixels)] = pixels
     while (pair := growing.pop()) is not None:

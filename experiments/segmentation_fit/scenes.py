@@ -41,27 +41,17 @@ def small(family: SceneFamily) -> SceneFamily:
     return replace(family, width=family.width // 2, height=family.height // 2, voxel_size=2 * family.voxel_size)
 
 
-def first_pause(family: SceneFamily, seed: int) -> tuple[Pause, np.ndarray]:
-    """The first pause of a scene, and the true labels of the voxels (X, Y, Z)."""
-    scene = SimulatedScene(family, seed)
-    return _pause(scene), scene.truth()
-
-
-def later_pauses(family: SceneFamily, seed: int, pushes: tuple[int, ...] = (0, 1, 3)) -> Iterator[Pause]:
+def pauses(family: SceneFamily, seed: int, pushes: tuple[int, ...] = (0,)) -> Iterator[Pause]:
     """The pauses of a scene after some numbers of pushes, in ascending order."""
     scene = SimulatedScene(family, seed)
     for action in range(pushes[-1] + 1):
         if action in pushes:
-            yield _pause(scene)
+            seen = scene.frame_images(0)
+            robot = seen["robot_mask"]
+            frame = Frame(seen["rgb"], seen["depth"], scene.camera, robot if robot.any() else None)
+            yield Pause(frame, np.where(robot, 0, seen["instance"]).astype(np.int64), scene.grid)
         if action < pushes[-1]:
             scene.play(scene.choose_push(action), lambda _: None)
-
-
-def _pause(scene: SimulatedScene) -> Pause:
-    seen = scene.frame_images(0)
-    robot = seen["robot_mask"]
-    frame = Frame(seen["rgb"], seen["depth"], scene.camera, robot if robot.any() else None)
-    return Pause(frame, np.where(robot, 0, seen["instance"]).astype(np.int64), scene.grid)
 
 
 class PlainSamples(BorderSamples):

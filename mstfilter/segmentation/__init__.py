@@ -13,7 +13,6 @@
 `tree`            the tree and its helpers; the ultrametric contour map
 `regions`         measurements of regions and of their borders
 `learned_tree`    trees from learned log odds, also with the evidence of a trained network, `border_network`
-`pair_network`    a network that corrects the learned log odds
 `cuts`            node values, the optimal cut, exact samples
 `mh`              Metropolis-Hastings samples
 `proposal`        which regions are objects; the proposal of the filter

@@ -1,3 +1,4 @@
+from mstfilter.segmentation.border_network import PairNetwork as PairNetwork
 from mstfilter.segmentation.boundary import (
     BoundaryModel as BoundaryModel,
     ClipBoundary as ClipBoundary,
@@ -22,9 +23,9 @@ from mstfilter.segmentation.learned_tree import (
     LearnedTree as LearnedTree,
     MergedTree as MergedTree,
     pair_features as pair_features,
+    pair_log_odds as pair_log_odds,
 )
 from mstfilter.segmentation.mh import MetropolisHastingsCuts as MetropolisHastingsCuts
-from mstfilter.segmentation.pair_network import PairNetwork as PairNetwork
 from mstfilter.segmentation.proposal import (
     ObjectRule as ObjectRule,
     Segments as Segments,

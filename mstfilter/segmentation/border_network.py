@@ -9,12 +9,16 @@ frame. The three levels of the U-Net have a half, a quarter and an eighth of the
 the output, blocks of 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's
 border, and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre
 (Neven et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+
+A model may also have a `PairNetwork`, which corrects the linear log odds of the tree `border`.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Self
 
 import cv2
 import numpy as np
@@ -24,11 +28,12 @@ from torch.nn import functional
 
 from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, fill_from_nearest, posed_camera
 from mstfilter.segmentation.boundary import SENSOR_FOCAL
-from mstfilter.segmentation.pair_network import PREFIX, PairNetwork
 from mstfilter.segmentation.regions import SeenBorders
 from mstfilter.trained import TrainedModel, calibrated_network, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
+PAIR_TENSORS = "pairs."  #: prefix of the names of the tensors of a pair network in a border model
+_MOST_DEVIATION = 4.0  # standard deviations
 RASTER = 320  # pixels per row of the network's images
 CENTRE_UNIT = 32.0  #: pixels of the network's raster, unit of the offsets to the centres
 #: Channels of the input: disparity above the table, compressed; disparity against the mean of the surroundings; the
@@ -133,18 +138,65 @@ class BorderNet(nn.Module):
         return functional.pixel_shuffle(self.head(functional.silu(y)).float(), 2)
 
 
+@dataclass(frozen=True, eq=False)
+class PairNetwork:
+    """A small network whose output is added to the linear log odds that two regions are different objects.
+
+    The network is a multilayer perceptron with rectified linear units. The features are standardised, and limited to
+    4 standard deviations. So the correction stays bounded for features that the fit has not seen.
+    """
+
+    mean: np.ndarray  #: (f,) of the features in the fit
+    scale: np.ndarray  #: (f,) standard deviations
+    weights: tuple[np.ndarray, ...]  #: (inputs, outputs) of each layer
+    biases: tuple[np.ndarray, ...]  #: (outputs,) of each layer
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        """Corrections (k,) of the log odds for features (k, f)."""
+        x = self.standardised(features)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = np.maximum(x @ weight + bias, 0)
+        return np.asarray((x @ self.weights[-1] + self.biases[-1])[:, 0])
+
+    def standardised(self, features: np.ndarray) -> np.ndarray:
+        """The input (k, f) of the first layer."""
+        return np.clip((features - self.mean) / self.scale, -_MOST_DEVIATION, _MOST_DEVIATION)
+
+    @classmethod
+    def of(cls, model: TrainedModel, n_features: int) -> Self | None:
+        """The network in a model for `n_features` features, or None. Raises InputError for unfit tensors."""
+        own = model.split(PAIR_TENSORS)[1]
+        if not own.tensors:
+            return None
+        n = sum(name.startswith(f"{PAIR_TENSORS}weight") for name in own.tensors)
+        sizes = [n_features, *(np.size(own.tensors.get(f"{PAIR_TENSORS}bias{k}", ())) for k in range(n - 1)), 1]
+        empty = [np.empty(shape) for shape in pairwise(sizes)]
+        row = np.empty(n_features)
+        expected = cls(row, row, tuple(empty), tuple(np.empty(s) for s in sizes[1:]))
+        own.check_tensors({name: t.shape for name, t in expected.tensors().items()})
+        found = {name.removeprefix(PAIR_TENSORS): t.astype(np.float64) for name, t in own.tensors.items()}
+        weights, biases = (tuple(found[f"{part}{k}"] for k in range(n)) for part in ("weight", "bias"))
+        return cls(found["mean"], found["scale"], weights, biases)
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """The arrays of the network by name, as `of` expects them."""
+        layers = {f"weight{k}": w for k, w in enumerate(self.weights)} | {
+            f"bias{k}": b for k, b in enumerate(self.biases)
+        }
+        return {PAIR_TENSORS + name: t for name, t in {"mean": self.mean, "scale": self.scale, **layers}.items()}
+
+
 class BorderNetwork:
     """A border network with loaded weights."""
 
     def __init__(self, model: TrainedModel) -> None:
-        own = {name: tensor for name, tensor in model.tensors.items() if not name.startswith(PREFIX)}
         self.net, self.scale, self.shift = calibrated_network(
-            replace(model, tensors=own), IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
+            model.split(PAIR_TENSORS)[0], IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
         )
         evidence = model.description.get("evidence", {})
         #: Weights of the features of the tree `border`; empty if they were not fitted.
         self.evidence = dict(zip(evidence.get("features", ()), evidence.get("weights", ()), strict=True))
-        self.correction = PairNetwork.of(model.tensors)  #: of the log odds of the tree `border`, or None
+        self.correction = PairNetwork.of(model, len(self.evidence))  #: of the log odds of the tree `border`, or None
         self.key = model.key
 
     def look(self, frame: Frame) -> SeenBorders:

@@ -2,7 +2,7 @@
 
 Watershed regions of a boundary map are merged in pairs. The pair with the lowest log odds is merged first. The log
 odds are linear in `FEATURES` of the border and of the union of two regions. `BorderTree` adds the correction of a
-small network (`pair_network`). The features are recomputed when a region grows. A model file has the weights of the
+small network (`PairNetwork`). The features are recomputed when a region grows. A model file has the weights of the
 features. The weights were fitted on simulated scenes only, and the correction also on real frames.
 
 >>> tree = LearnedTree().build(boundary, frame)
@@ -31,7 +31,6 @@ from mstfilter.errors import InputError
 from mstfilter.reading import read_json
 from mstfilter.resources import models_folder
 from mstfilter.scene import Frame, pixels_above_table, scaled_length
-from mstfilter.segmentation.pair_network import PairNetwork
 from mstfilter.segmentation.regions import (
     BORDER,
     HEIGHT_BIN,
@@ -44,7 +43,7 @@ from mstfilter.segmentation.regions import (
 from mstfilter.segmentation.tree import Tree, TreeBuilder, UcmTree
 
 if TYPE_CHECKING:
-    from mstfilter.segmentation.border_network import BorderNetwork
+    from mstfilter.segmentation.border_network import BorderNetwork, PairNetwork
 
 #: Log odds (k,) that the regions of k pairs belong to different objects:
 #: (rows of a, rows of b, borders, table borders of a, of b).
@@ -195,6 +194,17 @@ def pair_features(
     return np.stack([FEATURES[name](pair) for name in names], axis=1)
 
 
+def pair_log_odds(weights: Mapping[str, float], correction: PairNetwork | None, scale: float) -> PairLogOdds:
+    """The function that computes the log odds of pairs in an image of `scale` times 640 pixels per row."""
+    values = np.array(list(weights.values()))
+
+    def log_odds(a: np.ndarray, b: np.ndarray, ab: np.ndarray, at: np.ndarray, bt: np.ndarray) -> np.ndarray:
+        x = pair_features(a, b, ab, at, bt, scale, weights)
+        return np.asarray(x @ values + (0.0 if correction is None else correction(x)))
+
+    return log_odds
+
+
 def check_weights(weights: Mapping[str, float], names: Iterable[str], where: object, hint: str) -> None:
     """Raise InputError unless every feature in `names` has one finite weight."""
     if not isinstance(weights, Mapping):
@@ -290,17 +300,6 @@ class MergedTree(TreeBuilder):
         """A network that is added to the linear log odds, or None."""
         return None
 
-    def log_odds(self, scale: float) -> PairLogOdds:
-        """The function that computes the log odds of pairs in an image of `scale` times 640 pixels per row."""
-        named, correction = self.model()[0], self.correction()
-        weights = np.array(list(named.values()))
-
-        def log_odds(a: np.ndarray, b: np.ndarray, ab: np.ndarray, at: np.ndarray, bt: np.ndarray) -> np.ndarray:
-            x = pair_features(a, b, ab, at, bt, scale, named)
-            return np.asarray(x @ weights + (0.0 if correction is None else correction(x)))
-
-        return log_odds
-
     @property
     def weights_key(self) -> str:
         """Hash of the contents of the model files."""
@@ -326,7 +325,9 @@ class MergedTree(TreeBuilder):
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
             )
         regions = self.regions(boundary, frame, pixels_above_table(frame) if pixels is None else pixels)
-        growing = Agglomeration(regions, self.log_odds(scaled_length(1, frame.camera.width)))
+        scale = scaled_length(1, frame.camera.width)
+        log_odds = pair_log_odds(self.model()[0], self.correction(), scale)
+        growing = Agglomeration(regions, log_odds)
         growing.merge_all()
         return tree_of_merges(regions.image, len(regions.sums), growing.merges)
 

@@ -12,7 +12,7 @@ from mstfilter import smc
 from mstfilter.files import read_csv
 from mstfilter.resources import models_folder
 from mstfilter.scene import read_rgb
-from mstfilter.segmentation import LearnedTree, PairNetwork
+from mstfilter.segmentation import FEATURES, LearnedTree, PairNetwork
 from mstfilter.trained import open_model
 from tests.conftest import find_shared
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
@@ -167,8 +167,9 @@ def test_segmentation_fit(tmp_path):
 
     shutil.copytree(models_folder() / "border", tmp_path / "border")
     run_script("segmentation_fit/correction.py", "--smoke", "--border", tmp_path / "border", "--out", tmp_path)
-    shipped, made = (PairNetwork.of(open_model(str(name)).tensors) for name in ("border", tmp_path / "border"))
-    x = np.zeros((1, len(shipped.mean)))
+    n = len(FEATURES)
+    shipped, made = (PairNetwork.of(open_model(str(name)), n) for name in ("border", tmp_path / "border"))
+    x = np.zeros((1, n))
     assert np.isfinite(made(x)) and made(x) != shipped(x)
 
     run_script("segmentation_fit/check.py", "--smoke", "--out", tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from mstfilter.segmentation import (
 from mstfilter.segmentation.border_network import BORDER_ARCHITECTURE, IMAGE_CHANNELS, BorderNet
 from mstfilter.segmentation.learned_tree import Agglomeration, quadric_residual, tree_of_merges
 from mstfilter.segmentation.regions import BORDER, REGION, measure_regions, object_leaves
-from mstfilter.trained import write_model
+from mstfilter.trained import TrainedModel, write_model
 from tests.segmentation.scenes import GRID, TOUCHING, TWO, camera, frame_of
 
 
@@ -190,8 +191,28 @@ def test_the_correction_is_a_bounded_perceptron():
         assert network(x[None]) == pytest.approx([odds])
     far = np.array([[1e9, -1e9, 1e9], [1e12, -1e12, 1e12]])
     assert network(far)[0] == network(far)[1]  # bounded
-    again = PairNetwork.of(network.tensors())
-    assert np.array_equal(again(far), network(far)) and PairNetwork.of({"other": far}) is None
+
+
+def test_the_correction_is_read_from_a_model_and_checked(tmp_path):
+    network = perceptron(np.random.default_rng(0), 3)
+    tensors = {name: t.astype(np.float32) for name, t in network.tensors().items()}
+    model = TrainedModel(tmp_path, {}, {"other": np.ones(2), **tensors}, "key")
+    plain, own = model.split("pairs.")
+    assert set(plain.tensors) == {"other"} and set(own.tensors) == set(tensors)
+    x = np.random.default_rng(1).normal(size=(4, 3))
+    again = PairNetwork.of(model, 3)
+    assert again is not None and np.allclose(again(x), network(x), atol=1e-5)
+    assert PairNetwork.of(plain, 3) is None
+    wrong = [
+        ({name: t for name, t in tensors.items() if name != missing}, 3, missing)
+        for missing in ("pairs.mean", "pairs.bias0", "pairs.bias1")
+    ]
+    wrong.append((tensors, 4, "pairs.mean"))
+    wrong.append(({**tensors, "pairs.weight1": np.ones((5, 2))}, 3, "pairs.weight1"))
+    wrong.append(({**tensors, "pairs.bias0": np.ones(6)}, 3, "pairs.weight0"))
+    for found, n_features, name in wrong:
+        with pytest.raises(InputError, match=f"tensor '{name}' is .*the architecture has"):
+            PairNetwork.of(replace(model, tensors=found), n_features)
 
 
 def test_the_correction_is_added_to_the_log_odds_of_the_border_tree(tmp_path):
