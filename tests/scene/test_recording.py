@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
 from mstfilter.scene import Frame, Hypothesis, check_grid, render, write_image
 from mstfilter.scene.camera import Camera, look_at
@@ -101,6 +101,13 @@ def change(folder, name, edit):
 
 def cut_file(path, n):
     path.write_bytes(path.read_bytes()[:n])
+
+
+@pytest.mark.parametrize("name", ["T_world_cam", "t_world_camera", "camera_pose", "T_camera_world", "pose"])
+def test_a_pose_of_a_frame_under_another_name_gives_a_warning(folder, name):
+    change(folder, "manifest.json", lambda m: m["frames"][1].update({name: np.eye(4).tolist(), "action": 3}))
+    with pytest.warns(InputWarning, match=f"manifest.json: not read in the frames: {name}\n.*T_world_camera"):
+        open_recording(folder)
 
 
 def camera(**entries):
