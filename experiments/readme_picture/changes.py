@@ -109,7 +109,11 @@ def segmentation(scene: Scene) -> Rows:
             rng(), scene.clip, 1
         )
         titles = ["most probable segmentation", *[f"sample {k}" for k in (1, 2, 3)]]
-        rows[name] = dict(zip(titles, scene.images([best.best, *drawn.particles[:3]]), strict=True))
+        shown = [best.best, *drawn.particles[:3]]
+        print(
+            f"segmentation, {name}: {[h.n_objects for h in shown]} segments, {scene.truth[-1].n_objects} true objects"
+        )
+        rows[name] = dict(zip(titles, scene.images(shown), strict=True))
     return rows
 
 
@@ -149,6 +153,15 @@ def fusion(scene: Scene, before: Population) -> Rows:
 
 def result(scene: Scene, last: Mapping[str, Hypothesis]) -> Rows:
     """The most probable hypotheses of both methods at the last pause."""
+    true = scene.truth[-1]
+    seen = np.bincount(project(true, scene.frame.camera).ravel(), minlength=true.labels.max() + 1)
+    for name, h in last.items():
+        print(f"result, {name}: {h.n_objects} objects, {true.n_objects} true objects")
+        for k, volume in true.volumes().items():
+            common = np.bincount(h.labels[true.labels == k], minlength=h.labels.max() + 1)
+            overlaps = {j: common[j] / (volume + found - common[j]) for j, found in h.volumes().items()}
+            j = max(overlaps, key=overlaps.__getitem__)
+            print(f"  {volume} voxels, {seen[k]} pixels: {h.volumes()[j]} voxels, overlap {overlaps[j]:.2f}")
     return scene.both({f"{n}, {scene.quality(h)}": h for n, h in last.items()} | {"truth": scene.truth[-1]})
 
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mstfilter.errors import InputError, check_choice, naming, warn_user
+from mstfilter.errors import InputError, check_choice, naming
 from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat, check_images, read_optional, warn_of_unread
 from mstfilter.reading import read_arrays, read_json, read_model
@@ -323,10 +323,9 @@ class RecordingFolder(RecordingFormat):
         manifest, manifest_data = _load(path / "manifest.json", _Manifest)
         camera_file, stored = _load(path / "camera.json", _CameraFile)
         warn_of_unread(path / "camera.json", stored, _CameraFile.model_fields)
-        others = {key for entry in manifest_data["frames"] for key in entry} - {*_FrameEntry.model_fields}
-        if wrong := sorted(key for key in others if "cam" in key.lower() or key.lower() == "pose"):
-            text = f"{path / 'manifest.json'}: not read in the frames: {', '.join(wrong)}"
-            warn_user(text, "the pose of the camera is T_world_camera, a 4 x 4 matrix")
+        keys = {key for entry in manifest_data["frames"] for key in entry}
+        notes = (key for key in keys if "cam" not in key.lower() and key.lower() != "pose")
+        warn_of_unread(path / "manifest.json", keys, _FrameEntry.model_fields, notes)
         entries, scale = manifest.frames, camera_file.depth_scale
 
         with reading(path / "camera.json", "a recording"):
