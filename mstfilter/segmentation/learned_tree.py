@@ -292,9 +292,9 @@ class MergedTree(TreeBuilder):
     def model(self) -> tuple[Mapping[str, float], str]:
         """Weights of the features, and key of the model files. Raises InputError for unknown or missing features."""
 
-    @abstractmethod
     def look(self, frame: Frame) -> SeenBorders | None:
         """The output of the border network for a frame; None if the tree uses no network."""
+        return None
 
     def correction(self) -> PairNetwork | None:
         """A network that is added to the linear log odds, or None."""
@@ -348,9 +348,6 @@ class LearnedTree(MergedTree):
 
     def model(self) -> tuple[Mapping[str, float], str]:
         return read_tree_weights(self.weights)
-
-    def look(self, frame: Frame) -> SeenBorders | None:
-        return None
 
 
 @functools.lru_cache(maxsize=4)

@@ -106,7 +106,7 @@ def cut_file(path, n):
 @pytest.mark.parametrize("name", ["T_world_cam", "t_world_camera", "camera_pose", "T_camera_world", "pose"])
 def test_a_pose_of_a_frame_under_another_name_gives_a_warning(folder, name):
     change(folder, "manifest.json", lambda m: m["frames"][1].update({name: np.eye(4).tolist(), "action": 3}))
-    with pytest.warns(InputWarning, match=f"manifest.json: not read in the frames: {name}\n.*T_world_camera"):
+    with pytest.warns(InputWarning, match=f"manifest.json: not read: {name}\n.*T_world_camera"):
         open_recording(folder)
 
 
