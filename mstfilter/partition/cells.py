@@ -83,9 +83,11 @@ class Readings:
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
         """Label (m,) of the nearest occupied voxel within `reach` voxels of each reading; 0 if there is none."""
         occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
-        _, nearest = cKDTree(occupied).query(voxels, distance_upper_bound=reach + 1e-6)
-        found = np.append(labels[tuple(occupied.T)], 0).astype(np.int64)  # the last one is that of no neighbour
-        return found[nearest][of_reading]
+        found = labels[tuple(voxels.T)].astype(np.int64)
+        beside = found == 0
+        _, nearest = cKDTree(occupied).query(voxels[beside], distance_upper_bound=reach + 1e-6)
+        found[beside] = np.append(labels[tuple(occupied.T)], 0)[nearest]  # the last one is that of no neighbour
+        return found[of_reading]
 
     def share_voxel(self, chosen: np.ndarray) -> np.ndarray:
         """Whether the voxel of each reading (m,) contains a chosen reading (m,) bool."""
@@ -264,9 +266,10 @@ def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -
     expectation maximisation for the proportions of a mixture.
     """
     q = np.full(len(joined), 1 / len(joined))
+    divided, one_object, two_objects = 1 - joined, weights * same, weights * (1 - same)
     for _ in range(_STEPS):
         together = np.clip(q @ joined, _LEAST_SHARE, 1 - _LEAST_SHARE)
-        factor = joined @ (weights * same / together) + (1 - joined) @ (weights * (1 - same) / (1 - together))
+        factor = joined @ (one_object / together) + divided @ (two_objects / (1 - together))
         q = q * factor
         q /= q.sum()
         if np.abs(factor - 1)[q > _LEAST_SHARE].max() < _TOLERANCE:

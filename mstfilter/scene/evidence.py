@@ -18,7 +18,6 @@ from numbers import Real
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from mstfilter.errors import InputError
 from mstfilter.fields import Bounds, NonNegativeFloat
@@ -179,11 +178,14 @@ def surface_agreement(hypothesis: Hypothesis, frame: Frame) -> tuple[np.ndarray,
 
 def _interior(rendered: Rendering, size: float) -> np.ndarray:
     """Pixels (H, W) bool at least half a voxel inside object outlines. A voxel edge is `size` / depth pixels long."""
+    import cv2
+
     shown = rendered.labels > 0
     if not shown.any():
         return shown
     width = 2 * max(1, round(size / 2 / float(np.median(rendered.depth[shown])))) + 1
-    return shown & (minimum_filter(rendered.labels, width) == maximum_filter(rendered.labels, width))
+    square = np.ones((width, width), np.uint8)
+    return np.asarray(shown & (cv2.erode(rendered.labels, square) == cv2.dilate(rendered.labels, square)))
 
 
 class Evidence(Checked, ABC):

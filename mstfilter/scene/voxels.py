@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -298,12 +298,24 @@ class Occupancy:
     _probabilities: np.ndarray  # (k,) float16
 
     def __init__(self, owner: np.ndarray, probability: np.ndarray) -> None:
-        owners, p = np.asarray(owner, np.uint16), np.asarray(probability, np.float16)
-        voxels = np.flatnonzero((owners > 0) | (p > 0)).astype(np.int32)
-        object.__setattr__(self, "shape", owners.shape)
-        object.__setattr__(self, "_voxels", read_only(voxels))
-        object.__setattr__(self, "_owners", read_only(owners.ravel()[voxels]))
-        object.__setattr__(self, "_probabilities", read_only(p.ravel()[voxels]))
+        owner, p = np.asarray(owner), np.asarray(probability)
+        voxels = np.flatnonzero((owner > 0) | (p > 0))
+        self._store(owner.shape, voxels, owner.ravel()[voxels], p.ravel()[voxels])
+
+    def _store(self, shape: tuple[int, ...], voxels: np.ndarray, owners: np.ndarray, p: np.ndarray) -> Self:
+        """Store the voxels (k,) that have an owner or a probability in half precision."""
+        owners, p = owners.astype(np.uint16), p.astype(np.float16)
+        kept = (owners > 0) | (p > 0)
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "_voxels", read_only(voxels[kept].astype(np.int32)))
+        object.__setattr__(self, "_owners", read_only(owners[kept]))
+        object.__setattr__(self, "_probabilities", read_only(p[kept]))
+        return self
+
+    @property
+    def stored(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Flat indices (k,) of the stored voxels in ascending order, their owners (k,) and probabilities (k,)."""
+        return self._voxels, self._owners, self._probabilities
 
     @property
     def owner(self) -> np.ndarray:
@@ -327,15 +339,23 @@ class Occupancy:
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
         """The occupancy for new labels. Changed voxels get probability 0 or 1. Owners outside `known` are removed."""
-        changed = before != after
-        owner = np.where(changed | (after > 0), after, self.owner)
-        p = np.where(changed, after > 0, self.probability)
-        gone = ~np.isin(owner, known)
-        return Occupancy(np.where(gone, 0, owner), np.where(gone, 0, p))
+        labelled = (before > 0) | (after > 0)
+        labelled.ravel()[self._voxels] = True
+        voxels = np.flatnonzero(labelled)
+        at = np.searchsorted(voxels, self._voxels)
+        owner, p = np.zeros(len(voxels), np.uint16), np.zeros(len(voxels), np.float16)
+        owner[at], p[at] = self._owners, self._probabilities
+        new = after.ravel()[voxels]
+        changed = before.ravel()[voxels] != new
+        owner, p = np.where(changed | (new > 0), new, owner), np.where(changed, new > 0, p)
+        kept = np.isin(owner, known)
+        return Occupancy.__new__(Occupancy)._store(self.shape, voxels[kept], owner[kept], p[kept])
 
     def without(self, voxels: np.ndarray) -> Occupancy:
         """The occupancy with some `voxels` (X, Y, Z) bool set to free."""
-        return Occupancy(np.where(voxels, 0, self.owner), np.where(voxels, 0, self.probability))
+        kept = ~voxels.ravel()[self._voxels]
+        stored = (values[kept] for values in self.stored)
+        return Occupancy.__new__(Occupancy)._store(self.shape, *stored)
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,10 +446,22 @@ class Hypothesis:
 
     def crop(self, label: int) -> Crop:
         """The voxels of an object, with probabilities if the hypothesis has probabilities."""
-        mask = self.labels == label
         if self.occupancy is None:
-            return Crop.of(mask)
-        return Crop.of(mask, np.where(self.occupancy.owner == label, self.occupancy.probability, np.float16(0)))
+            return Crop.of(self.labels == label)
+        labelled = np.flatnonzero(self.labels == label)
+        voxels, owners, p = self.occupancy.stored
+        own = (owners == label) & (p > 0)
+        index = np.stack(np.unravel_index(np.concatenate([labelled, voxels[own]]), self.grid.shape), axis=1)
+        if not len(index):
+            return Crop.of(np.zeros((0, 0, 0), bool))
+        offset = index.min(axis=0)
+        shape = tuple(index.max(axis=0) - offset + 1)
+        at = tuple((index - offset).T)
+        occupied, probability = np.zeros(shape, bool), np.zeros(shape, np.float16)
+        n = len(labelled)
+        occupied[tuple(axis[:n] for axis in at)] = True
+        probability[tuple(axis[n:] for axis in at)] = p[own]
+        return Crop(occupied, offset, probability)
 
     @cached_property
     def key(self) -> bytes:
@@ -438,8 +470,8 @@ class Hypothesis:
 
     @cached_property
     def _volumes(self) -> Mapping[int, int]:
-        counts = np.bincount(self.labels.ravel())
-        return {int(k): int(counts[k]) for k in np.flatnonzero(counts) if k > 0}
+        counts = np.bincount(self.labels[self.labels > 0])
+        return {int(k): int(counts[k]) for k in np.flatnonzero(counts)}
 
     def volumes(self) -> dict[int, int]:
         """Number of voxels of each object, by label in ascending order."""

@@ -19,7 +19,6 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.ndimage import value_indices
 from scipy.spatial import cKDTree
 
 from mstfilter.results import Checked, check_array, check_list, returns
@@ -76,7 +75,11 @@ def _interior(labels: np.ndarray) -> np.ndarray:
 
 def _indices_by_label(labels: np.ndarray) -> dict[int, np.ndarray]:
     """Ascending flat indices of each non-zero label of an array."""
-    return {int(k): index for k, (index,) in value_indices(labels.ravel(), ignore_value=0).items()}
+    index = np.flatnonzero(labels)
+    index = index[np.argsort(labels.ravel()[index], kind="stable")]
+    values = labels.ravel()[index]
+    parts = np.split(index, np.flatnonzero(values[1:] != values[:-1]) + 1) if len(index) else []
+    return {int(labels.ravel()[part[0]]): part for part in parts}
 
 
 @dataclass(frozen=True, eq=False)

@@ -163,9 +163,11 @@ def _moved_occupancy(
     The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label.
     Labelled voxels have a probability of at least one half, and other voxels at most one half.
     """
-    owner = before.owner
-    still = np.isin(owner, [r.label for r in kept if r.label not in moving]) & ((labels == 0) | (labels == owner))
-    owner, p = np.where(still, owner, labels), np.where(still, before.probability, labels > 0)
+    owner, p = labels.copy(), (labels > 0).astype(np.float16)
+    voxels, owners, stored = before.stored
+    holder = labels.ravel()[voxels]
+    still = np.isin(owners, [r.label for r in kept if r.label not in moving]) & ((holder == 0) | (holder == owners))
+    owner.ravel()[voxels[still]], p.ravel()[voxels[still]] = owners[still], stored[still]
     for record in kept:
         crop = record.source
         if record.label not in moving or crop is None or crop.probability is None:
