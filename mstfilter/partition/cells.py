@@ -82,7 +82,8 @@ class Readings:
 
     def labels(self, labels: np.ndarray, reach: float) -> np.ndarray:
         """Label (m,) of the nearest occupied voxel within `reach` voxels of each reading; 0 if there is none."""
-        occupied, (voxels, of_reading) = np.argwhere(labels), self._distinct
+        occupied = np.stack(np.unravel_index(np.flatnonzero(labels), labels.shape), axis=1)  # faster than argwhere
+        voxels, of_reading = self._distinct
         found = labels[tuple(voxels.T)].astype(np.int64)
         beside = found == 0
         _, nearest = cKDTree(occupied).query(voxels[beside], distance_upper_bound=reach + 1e-6)

@@ -284,7 +284,7 @@ class PartitionUpdate(Update):
         tracks = {new[k]: (record,) for k, record in again.items()}
         objects = [one._replace(tracks=tracks.get(k, one.tracks)) for k, one in enumerate(objects)]
         labels = arbitrate(completions, clip.grid, self.threshold)
-        present = set(np.unique(labels).tolist())
+        present = set(np.unique(labels[labels > 0]).tolist())
         records = [
             self._record(label, *one, clip.index)
             for label, one in enumerate(zip(objects, completions, strict=True), start=1)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -163,26 +164,34 @@ def _moved_occupancy(
     The probabilities of an object are those of its source, interpolated. Every object keeps the voxels of its label.
     Labelled voxels have a probability of at least one half, and other voxels at most one half.
     """
+    labels = labels.ravel()
     owner, p = labels.copy(), (labels > 0).astype(np.float16)
     voxels, owners, stored = before.stored
-    holder = labels.ravel()[voxels]
+    holder = labels[voxels]
     still = np.isin(owners, [r.label for r in kept if r.label not in moving]) & ((holder == 0) | (holder == owners))
-    owner.ravel()[voxels[still]], p.ravel()[voxels[still]] = owners[still], stored[still]
+    owner[voxels[still]], p[voxels[still]] = owners[still], stored[still]
     for record in kept:
         crop = record.source
         if record.label not in moving or crop is None or crop.probability is None:
             continue
-        index, at_source = _moved_box(crop, record.motion.as_matrix(), grid)
-        inside = grid.contains(index)
-        value = map_coordinates(
-            np.pad(crop.probability.astype(np.float32), 1), at_source[inside].T + 0.5, order=1, mode="constant"
-        )
-        at = tuple(index[inside].T)
+        total = record.motion.as_matrix()
+        moved = content_key("probabilities", crop.probability, crop.offset, total, grid.key)
+        at, value = memo("probabilities", moved, partial(_moved_probabilities, crop, total, grid))
         own, free = labels[at] == record.label, labels[at] == 0
         more = free & (value > p[at]) & (value > _LEAST_PROBABILITY)
         p[at] = np.where(own, np.maximum(value, 0.5), np.where(more, np.minimum(value, 0.5), p[at]))
         owner[at] = np.where(more, record.label, owner[at])
-    return Occupancy(owner, p)
+    return Occupancy(owner.reshape(grid.shape), p.reshape(grid.shape))
+
+
+def _moved_probabilities(crop: Crop, T: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat voxels (N,) int32 of the grid in and beside the box of the moved source, and their probabilities (N,)."""
+    assert crop.probability is not None
+    index, at_source = _moved_box(crop, T, grid)
+    inside = grid.contains(index)
+    flat = np.ravel_multi_index(tuple(index[inside].T), grid.shape).astype(np.int32)
+    p = np.pad(crop.probability.astype(np.float32), 1)
+    return flat, map_coordinates(p, at_source[inside].T + 0.5, order=1, mode="constant")
 
 
 def _resting_claims(hypothesis: Hypothesis, labels: np.ndarray, claims: list[_Claim]) -> list[_Claim]:
