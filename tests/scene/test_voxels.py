@@ -137,6 +137,11 @@ def test_probabilities_follow_the_labels(before, after):
     gone = ~np.isin(start.occupancy.owner, [o.label for o in end.objects])
     np.testing.assert_array_equal(p[same & ~gone], start.occupancy.probability[same & ~gone])
     assert not p[same & gone].any() and not owner[same & gone].any()
+    for label in end.volumes():
+        crop, dense = end.crop(label), Crop.of(after == label, np.where(owner == label, p, np.float16(0)))
+        for found, expected in ((crop.offset, dense.offset), (crop.occupied, dense.occupied)):
+            np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(crop.probability, dense.probability)
     cleared = rng.random(GRID.shape) < 0.5
     free = start.without(cleared)
     assert not free.labels[cleared].any() and not free.occupancy.probability[cleared].any()
