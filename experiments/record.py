@@ -16,7 +16,8 @@ machine, the libraries, the date and the processor time, without that of interru
 is older than the program.
 
 An interrupted study continues with the next call. If the program has changed in between, the study starts again. The
-former results, which git keeps, and the intermediate files are deleted first.
+former results, which git keeps, and the intermediate files are deleted first. `started.json` in the folder of the
+study lists the finished commands. If this file and the results are committed, another machine can continue the study.
 
 A change of structure makes all results older. `--same` computes the hashes of `experiments/fingerprints` with the
 program of the results and with the present program. Where all agree, the results are current again, and `record.json`

@@ -1,6 +1,12 @@
 """Write the small tables of a study from the folder that `mstfilter study` wrote.
 
     python experiments/tables.py studies/NAME experiments/NAME/results [--reference "true masks: mst"] [--pooled]
+    python experiments/tables.py studies/NAME-s1 experiments/NAME/results --rows s1    # one family, see below
+    python experiments/tables.py experiments/NAME/study.toml experiments/NAME/results [--pooled]
+
+A long study can run family by family (`mstfilter study --family`), also on different machines. With --rows, all
+scores of each run and pause are written to runs_FAMILY.csv.xz. From the TOML file of the study and these files of all
+families, the third command makes the tables of all families.
 
 The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
 scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
@@ -18,17 +24,19 @@ the change from pause 1 to the last pause with its 95 % interval over scenes.
 from __future__ import annotations
 
 import argparse
+import csv
+import lzma
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from mstfilter.files import write_csv
 from mstfilter.statistics import interval
-from mstfilter.study import ENDPOINTS, StudyFolder, Summary, cost_columns, summarise
+from mstfilter.study import ENDPOINTS, StudyFolder, Summary, cost_columns, load_study, make_plan, summarise
 
 Row = Mapping[str, Any]
 
@@ -179,28 +187,66 @@ def markdown(rows: list[dict[str, str]]) -> str:
     return "".join(head + body)
 
 
+class Source(NamedTuple):
+    """What the tables are made from."""
+
+    name: str
+    reference: str
+    arms: dict[str, bool]  #: name -> whether the arm is only reported
+    rows: list[dict[str, Any]]  #: one for each pause of a run
+
+    @classmethod
+    def of(cls, study: Path, out: Path) -> Self:
+        """A study folder, or the TOML file of a study whose rows are in `out`."""
+        if study.suffix != ".toml":
+            folder = StudyFolder.open(study)
+            arms = {arm["name"]: arm["reported_only"] for arm in folder.description["arms"]}
+            return cls(folder.description["name"], folder.description["reference"], arms, folder.rows())
+        plan = make_plan(load_study(study))
+        arms = {arm.name: arm.reported_only for arm in plan.arms}
+        files = [out / f"runs_{family}.csv.xz" for family in dict.fromkeys(scene.group for scene in plan.scenes)]
+        return cls(plan.config.name, plan.reference, arms, [row for file in files for row in read_rows(file)])
+
+
+def read_rows(file: Path) -> list[dict[str, Any]]:
+    """The rows that `write_rows` wrote. Empty cells are None."""
+    with lzma.open(file, "rt", encoding="utf-8", newline="") as table:
+        return [{key: _value(key, text) for key, text in row.items()} for row in csv.DictReader(table)]
+
+
+def _value(key: str, text: str) -> Any:
+    if key in ("family", "scene", "arm"):
+        return text
+    return None if text == "" else int(text) if key in ("seed", "pause") else float(text)
+
+
+def write_rows(rows: Sequence[Row], file: Path) -> None:
+    """Write all scores of each run and pause."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    with lzma.open(file, "wt", encoding="utf-8", newline="") as table:
+        writer = csv.DictWriter(table, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
     """Read the study, write the tables, print the differences."""
-    folder = StudyFolder.open(study)
-    name, rows, tables = folder.description["name"], folder.rows(), {}
+    source = Source.of(study, out)
+    name, rows, tables = source.name, source.rows, {}
+    arms_reported_only = [arm for arm, reported_only in source.arms.items() if reported_only]
     if reference:
-        reported_only = [
-            arm["name"]
-            for arm in folder.description["arms"]
-            if arm["name"].startswith("true masks") != reference.startswith("true masks")
-        ]
-        found = summarise(rows, reference, reported_only=reported_only)
+        of_truth = reference.startswith("true masks")
+        others = [arm for arm in source.arms if arm.startswith("true masks") != of_truth]
+        found = summarise(rows, reference, reported_only=others)
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
     elif pooled:
-        found = summarise(
-            [{**row, "family": "all"} for row in rows],
-            folder.description["reference"],
-            reported_only=folder.reported_only,
-        )
+        of_all = [{**row, "family": "all"} for row in rows]
+        found = summarise(of_all, source.reference, reported_only=arms_reported_only)
         name += "_pooled"
         tables = {f"{name}_described": differences(found, DESCRIBED), f"{name}_pauses": by_pause(rows)}
     else:
-        found = summarise(rows, folder.description["reference"], cost_columns(rows), folder.reported_only)
+        found = summarise(rows, source.reference, cost_columns(rows), arms_reported_only)
         tables |= {name: means(found), f"{name}_scenes": by_scene(found)}
         tables |= {f"{name}_cases": cases(rows), f"{name}_time": times(rows)}
     tables[f"{name}_differences"] = differences(found)
@@ -216,11 +262,16 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", type=Path)
+    parser.add_argument("study", type=Path, help="study folder, or TOML file")
     parser.add_argument("out", type=Path)
+    parser.add_argument("--rows", metavar="FAMILY", help="write only the scores of this family")
     parser.add_argument("--reference", default="", help="another arm than the study's own reference")
     parser.add_argument("--pooled", action="store_true", help="differences over the scenes of all families together")
     given = parser.parse_args()
     if given.pooled and given.reference:
         parser.error("--pooled and --reference do not go together")
+    if given.rows:
+        found = [row for row in Source.of(given.study, given.out).rows if row["family"] == given.rows]
+        write_rows(found, given.out / f"runs_{given.rows}.csv.xz")
+        parser.exit()
     main(given.study, given.out, given.reference, given.pooled)

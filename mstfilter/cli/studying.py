@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from mstfilter.cli.root import app
+from mstfilter.errors import InputError
 from mstfilter.files import check_output
 from mstfilter.report.progress import study_bars
 
@@ -22,6 +23,9 @@ def study(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,
+    family: Annotated[
+        list[str] | None, typer.Option(help="Only the scenes of this family, by its name in the tables; repeatable.")
+    ] = None,
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the small form that the table `smoke` of the file describes.")
     ] = False,
@@ -30,6 +34,13 @@ def study(
     from mstfilter.study import check_arm_names, load_study
 
     wanted = load_study(config, smoke=smoke)
+    if family:
+        names = [scene.group or scene.family or "recordings" for scene in wanted.scenes]
+        if unknown := [name for name in family if name not in names]:
+            known = ", ".join(dict.fromkeys(names))
+            raise InputError(f"the study has no family {unknown[0]!r}", f"its families are {known}")
+        chosen = (scene for scene, name in zip(wanted.scenes, names, strict=True) if name in family)
+        wanted = wanted.model_copy(update={"scenes": tuple(chosen)})
     check_arm_names(wanted, overrides or ())  # before any large library is imported
     from mstfilter.study import Local, run_study
 

@@ -84,6 +84,38 @@ def test_main_study_runs_and_resumes(tmp_path, capsys):
     assert {row["arm"] for row in rows} == set(arms) and len(rows) == len(arms) * 2
 
 
+def test_a_study_by_families_has_the_tables_of_the_whole_study(tmp_path, capsys):
+    config = tmp_path / "two.toml"
+    small = "{ width = 160, height = 120, n_actions = 1, frames_per_clip = 8, voxel_size = 0.02 }"
+    families = ("demo", "table")
+    config.write_text(
+        'seeds = [0]\nkeep = "tables"\narms = [{ preset = "single_frame, floor_image" }]\n'
+        + "".join(f'[[scenes]]\nfamily = "{name}"\nseeds = "1-2"\nset = {small}\n' for name in families)
+    )
+
+    def study(folder, *options):
+        with mock.patch("mstfilter.study.Local", lambda workers, logs: InProcess()), pytest.raises(SystemExit) as end:
+            main(["study", str(config), *options, "--out", str(tmp_path / folder)])
+        return end.value.code
+
+    assert study("none", "--family", "s1")
+    assert "no family 's1'" in (said := capsys.readouterr().err) and "demo, table" in said
+    assert not study("both")
+    whole = write_tables(tmp_path / "both", tmp_path / "whole")
+    rows = tmp_path / "rows"
+    for name in families:
+        assert not study(name, "--family", name)
+        assert {row["family"] for row in read_csv(tmp_path / name / "runs.csv")} == {name}
+        run_script("tables.py", tmp_path / name, rows, "--rows", name)
+    run_script("tables.py", config, rows)
+    for name in ("two_scenes", "two_cases"):
+        for row, expected in zip(read_csv(rows / f"{name}.csv"), whole[name], strict=True):
+            assert row.keys() == expected.keys()
+            for key, text in expected.items():
+                same = row[key] == text or float(row[key]) == pytest.approx(float(text), abs=2e-4)
+                assert same, (name, key)
+
+
 @pytest.mark.parametrize("config, first", [(MAIN, 1000), (EXPERIMENTS / "fusion/study.toml", 1100)])
 def test_reported_seeds_are_no_tuning_seeds(config, first):
     """The long form uses seeds that no rule was tuned on; the small form uses tuning seeds only."""
