@@ -17,7 +17,7 @@ is older than the program.
 
 An interrupted study continues with the next call. If the program has changed in between, the study starts again. The
 former results, which git keeps, and the intermediate files are deleted first. `started.json` in the folder of the
-study lists the finished commands. If this file and the results are committed, another machine can continue the study.
+study lists the finished commands. If this file and the folder `rows` are committed, another machine can continue.
 
 A change of structure makes all results older. `--same` computes the hashes of `experiments/fingerprints` with the
 program of the results and with the present program. Where all agree, the results are current again, and `record.json`
@@ -116,7 +116,8 @@ class Study:
 
     def _clear(self) -> None:
         """Delete the results of the study and its intermediate files."""
-        shutil.rmtree(self.folder / "results", ignore_errors=True)
+        for name in ("results", "rows"):
+            shutil.rmtree(self.folder / name, ignore_errors=True)
         for path in (*self.folder.glob("*.csv"), self.folder / "started.json"):
             path.unlink(missing_ok=True)
         for folder in re.findall(r"--out (studies/\S+)", " ".join(self.commands)):

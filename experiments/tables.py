@@ -1,12 +1,12 @@
 """Write the small tables of a study from the folder that `mstfilter study` wrote.
 
     python experiments/tables.py studies/NAME experiments/NAME/results [--reference "true masks: mst"] [--pooled]
-    python experiments/tables.py studies/NAME-s1 experiments/NAME/results --rows s1    # one family, see below
+    python experiments/tables.py studies/NAME-s1 experiments/NAME/rows --rows    # one family, see below
     python experiments/tables.py experiments/NAME/study.toml experiments/NAME/results [--pooled]
 
 A long study can run family by family (`mstfilter study --family`), also on different machines. With --rows, all
-scores of each run and pause are written to runs_FAMILY.csv.xz. From the TOML file of the study and these files of all
-families, the third command makes the tables of all families.
+scores of each run and pause are written to FAMILY.csv.xz. With the TOML file of a study, the tables are made from
+these files of all families, in the folder `rows` beside the TOML file.
 
 The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
 scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
@@ -196,15 +196,16 @@ class Source(NamedTuple):
     rows: list[dict[str, Any]]  #: one for each pause of a run
 
     @classmethod
-    def of(cls, study: Path, out: Path) -> Self:
-        """A study folder, or the TOML file of a study whose rows are in `out`."""
+    def of(cls, study: Path) -> Self:
+        """A study folder, or the TOML file of a study with rows beside it."""
         if study.suffix != ".toml":
             folder = StudyFolder.open(study)
             arms = {arm["name"]: arm["reported_only"] for arm in folder.description["arms"]}
             return cls(folder.description["name"], folder.description["reference"], arms, folder.rows())
         plan = make_plan(load_study(study))
         arms = {arm.name: arm.reported_only for arm in plan.arms}
-        files = [out / f"runs_{family}.csv.xz" for family in dict.fromkeys(scene.group for scene in plan.scenes)]
+        families = dict.fromkeys(scene.group for scene in plan.scenes)
+        files = [study.parent / "rows" / f"{family}.csv.xz" for family in families]
         return cls(plan.config.name, plan.reference, arms, [row for file in files for row in read_rows(file)])
 
 
@@ -232,7 +233,7 @@ def write_rows(rows: Sequence[Row], file: Path) -> None:
 
 def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
     """Read the study, write the tables, print the differences."""
-    source = Source.of(study, out)
+    source = Source.of(study)
     name, rows, tables = source.name, source.rows, {}
     arms_reported_only = [arm for arm, reported_only in source.arms.items() if reported_only]
     if reference:
@@ -264,14 +265,15 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("study", type=Path, help="study folder, or TOML file")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--rows", metavar="FAMILY", help="write only the scores of this family")
+    parser.add_argument("--rows", action="store_true", help="write only all scores, one file for each family")
     parser.add_argument("--reference", default="", help="another arm than the study's own reference")
     parser.add_argument("--pooled", action="store_true", help="differences over the scenes of all families together")
     given = parser.parse_args()
     if given.pooled and given.reference:
         parser.error("--pooled and --reference do not go together")
     if given.rows:
-        found = [row for row in Source.of(given.study, given.out).rows if row["family"] == given.rows]
-        write_rows(found, given.out / f"runs_{given.rows}.csv.xz")
+        rows = Source.of(given.study).rows
+        for family in dict.fromkeys(row["family"] for row in rows):
+            write_rows([row for row in rows if row["family"] == family], given.out / f"{family}.csv.xz")
         parser.exit()
     main(given.study, given.out, given.reference, given.pooled)

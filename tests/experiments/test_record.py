@@ -99,13 +99,18 @@ def test_a_stopped_study_resumes_and_starts_again_after_a_change(study, tmp_path
     with pytest.raises(SystemExit, match="exit status 1: echo second"):
         study.run()
     assert not study.record() and log.read_text().split() == ["first", "second"]
+    rows = study.folder / "rows/s1.csv.xz"  # that the first command might have written
+    rows.parent.mkdir()
+    rows.touch()
     with pytest.raises(SystemExit):
         study.run()  # the first command is not run again
+    assert rows.exists()
     assert log.read_text().split() == ["first", "second", "second"]
     (tmp_path / "mstfilter/a.py").write_text("x = 2\n")
     stop.unlink()
     study.run()
     assert log.read_text().split() == ["first", "second", "second", "first", "second"] and study.is_current()
+    assert not rows.exists()
 
 
 def test_intermediate_files_survive_an_interruption_of_the_first_command(study, tmp_path, monkeypatch):

@@ -102,14 +102,14 @@ def test_a_study_by_families_has_the_tables_of_the_whole_study(tmp_path, capsys)
     assert "no family 's1'" in (said := capsys.readouterr().err) and "demo, table" in said
     assert not study("both")
     whole = write_tables(tmp_path / "both", tmp_path / "whole")
-    rows = tmp_path / "rows"
+    joined = tmp_path / "joined"
     for name in families:
         assert not study(name, "--family", name)
         assert {row["family"] for row in read_csv(tmp_path / name / "runs.csv")} == {name}
-        run_script("tables.py", tmp_path / name, rows, "--rows", name)
-    run_script("tables.py", config, rows)
+        run_script("tables.py", tmp_path / name, tmp_path / "rows", "--rows")
+    run_script("tables.py", config, joined)
     for name in ("two_scenes", "two_cases"):
-        for row, expected in zip(read_csv(rows / f"{name}.csv"), whole[name], strict=True):
+        for row, expected in zip(read_csv(joined / f"{name}.csv"), whole[name], strict=True):
             assert row.keys() == expected.keys()
             for key, text in expected.items():
                 same = row[key] == text or float(row[key]) == pytest.approx(float(text), abs=2e-4)
