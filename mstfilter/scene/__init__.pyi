@@ -43,6 +43,7 @@ from mstfilter.scene.geometry import (
     frame_geometry as frame_geometry,
     table_residual as table_residual,
 )
+from mstfilter.scene.occupancy import Occupancy as Occupancy
 from mstfilter.scene.partitions import (
     CommonRefinement as CommonRefinement,
     canonical as canonical,
@@ -88,7 +89,6 @@ from mstfilter.scene.voxels import (
     Hypothesis as Hypothesis,
     ObjectRecord as ObjectRecord,
     ObjectView as ObjectView,
-    Occupancy as Occupancy,
     Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,

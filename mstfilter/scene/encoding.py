@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
-from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, Occupancy, VoxelGrid
+from mstfilter.scene.occupancy import Occupancy
+from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, VoxelGrid
 
 
 def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]:

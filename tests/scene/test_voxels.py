@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError
 from mstfilter.scene.encoding import decode_hypotheses, encode_hypotheses
-from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, Occupancy, VoxelGrid
+from mstfilter.scene.occupancy import Occupancy
+from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, VoxelGrid
 
 GRID = VoxelGrid((-0.3, -0.3, -0.05), 0.01, (6, 5, 4))
 
