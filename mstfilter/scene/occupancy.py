@@ -75,8 +75,8 @@ class Occupancy:
 
     def relabelled(self, before: np.ndarray, after: np.ndarray, known: np.ndarray) -> Occupancy:
         """The occupancy for new labels. Changed voxels get probability 0 or 1. Owners outside `known` are removed."""
-        labelled = (before > 0) | (after > 0)
-        labelled.ravel()[self._voxels] = True
+        labelled = ((before > 0) | (after > 0)).ravel()
+        labelled[self._voxels] = True
         voxels = np.flatnonzero(labelled)
         at = np.searchsorted(voxels, self._voxels)
         owner, p = np.zeros(len(voxels), np.uint16), np.zeros(len(voxels), np.float16)

@@ -131,6 +131,8 @@ def test_probabilities_follow_the_labels(before, after):
     assert start.key == Hypothesis.from_labels(before, GRID).key  # random streams do not depend on probabilities
     after = np.where(np.isin(after, list(start.volumes())), after, 0).astype(np.uint16)
     end = start.with_labels(after)
+    columns = Hypothesis(np.asfortranarray(before), GRID, start.objects, start.occupancy)  # another order in memory
+    assert columns.with_labels(np.asfortranarray(after)).occupancy.key == end.occupancy.key
     owner, p = end.occupancy.owner, end.occupancy.probability
     np.testing.assert_array_equal(owner[after > 0], after[after > 0])
     same = before == after
