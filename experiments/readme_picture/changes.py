@@ -21,7 +21,7 @@ import mstfilter
 from mstfilter.completion import Extrude
 from mstfilter.report import match_objects, overlay, viewpoint, voxel_picture
 from mstfilter.scene import Clip, Hypothesis, project
-from mstfilter.scoring import weighted_coverage
+from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.simulation import scene_family, simulate_recording
 from mstfilter.smc import Population, Systematic
 
@@ -158,10 +158,10 @@ def result(scene: Scene, last: Mapping[str, Hypothesis]) -> Rows:
     for name, h in last.items():
         print(f"result, {name}: {h.n_objects} objects, {true.n_objects} true objects")
         for k, volume in true.volumes().items():
-            common = np.bincount(h.labels[true.labels == k], minlength=h.labels.max() + 1)
-            overlaps = {j: common[j] / (volume + found - common[j]) for j, found in h.volumes().items()}
-            j = max(overlaps, key=overlaps.__getitem__)
-            print(f"  {volume} voxels, {seen[k]} pixels: {h.volumes()[j]} voxels, overlap {overlaps[j]:.2f}")
+            own = overlap(true.labels == k, h.labels)
+            best = own.jaccard()[-1, 1:].argmax() + 1  # without free space
+            found, share = own.sizes_b[best], own.jaccard()[-1, best]
+            print(f"  {volume} voxels, {seen[k]} pixels: {found} voxels, overlap {share:.2f}")
     return scene.both({f"{n}, {scene.quality(h)}": h for n, h in last.items()} | {"truth": scene.truth[-1]})
 
 

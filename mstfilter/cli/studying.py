@@ -35,12 +35,10 @@ def study(
 
     wanted = load_study(config, smoke=smoke)
     if family:
-        names = [scene.group or scene.family or "recordings" for scene in wanted.scenes]
+        names = dict.fromkeys(scene.group_name for scene in wanted.scenes)
         if unknown := [name for name in family if name not in names]:
-            known = ", ".join(dict.fromkeys(names))
-            raise InputError(f"the study has no family {unknown[0]!r}", f"its families are {known}")
-        chosen = (scene for scene, name in zip(wanted.scenes, names, strict=True) if name in family)
-        wanted = wanted.model_copy(update={"scenes": tuple(chosen)})
+            raise InputError(f"the study has no family {unknown[0]!r}", f"its families are {', '.join(names)}")
+        wanted = wanted.model_copy(update={"scenes": tuple(s for s in wanted.scenes if s.group_name in family)})
     check_arm_names(wanted, overrides or ())  # before any large library is imported
     from mstfilter.study import Local, run_study
 

@@ -379,11 +379,10 @@ class Hypothesis:
             return Crop.of(np.zeros((0, 0, 0), bool))
         offset = index.min(axis=0)
         shape = tuple(index.max(axis=0) - offset + 1)
-        at = tuple((index - offset).T)
         occupied, probability = np.zeros(shape, bool), np.zeros(shape, np.float16)
-        n = len(labelled)
-        occupied[tuple(axis[:n] for axis in at)] = True
-        probability[tuple(axis[n:] for axis in at)] = p[own]
+        inside, known = np.split(index - offset, [len(labelled)])
+        occupied[tuple(inside.T)] = True
+        probability[tuple(known.T)] = p[own]
         return Crop(occupied, offset, probability)
 
     @cached_property

@@ -325,8 +325,7 @@ class MergedTree(TreeBuilder):
                 f"{type(self).__name__} needs the frame of the boundary map", "tree.build(boundary, frame)"
             )
         regions = self.regions(boundary, frame, pixels_above_table(frame) if pixels is None else pixels)
-        scale = scaled_length(1, frame.camera.width)
-        log_odds = pair_log_odds(self.model()[0], self.correction(), scale)
+        log_odds = pair_log_odds(self.model()[0], self.correction(), scaled_length(1, frame.camera.width))
         growing = Agglomeration(regions, log_odds)
         growing.merge_all()
         return tree_of_merges(regions.image, len(regions.sums), growing.merges)

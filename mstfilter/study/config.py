@@ -62,6 +62,11 @@ class SceneEntry(_Entry):
     pauses: str = ""
     group: str = ""  #: name of the family in the tables. Default: the family's name, ``recordings`` for folders
 
+    @property
+    def group_name(self) -> str:
+        """Name of the family in the tables."""
+        return self.group or self.family or "recordings"
+
     @model_validator(mode="after")
     def _one_kind(self) -> SceneEntry:
         if bool(self.family) == bool(self.recordings):

@@ -140,10 +140,9 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
         family = scene_family(entry.family)
         family = REGISTRY.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)
         changed = {name: getattr(family, name) for name in entry.set}
-        group = entry.group or entry.family
         for seed in entry.seeds:
             source = {"family": entry.family, "seed": seed, "set": changed}
-            yield StudyScene(f"{group}-{seed}", group, source, recipe_key(family, seed))
+            yield StudyScene(f"{entry.group_name}-{seed}", entry.group_name, source, recipe_key(family, seed))
         return
     for pattern in entry.recordings:
         paths = sorted(glob.glob(str(folder / pattern)))
@@ -155,7 +154,7 @@ def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
             recording = open_recording(Path(path), entry.format, entry.options, entry.pauses)
             # Metrics and oracles depend on the ground truth.
             key = content_key(recording.key, recording.truth_key).hex()
-            yield StudyScene(Path(path).name, entry.group or "recordings", source, key)
+            yield StudyScene(Path(path).name, entry.group_name, source, key)
 
 
 def _unique_names(scenes: list[StudyScene]) -> tuple[StudyScene, ...]:

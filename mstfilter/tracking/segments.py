@@ -75,11 +75,11 @@ def _interior(labels: np.ndarray) -> np.ndarray:
 
 def _indices_by_label(labels: np.ndarray) -> dict[int, np.ndarray]:
     """Ascending flat indices of each non-zero label of an array."""
-    index = np.flatnonzero(labels)
-    index = index[np.argsort(labels.ravel()[index], kind="stable")]
-    values = labels.ravel()[index]
-    parts = np.split(index, np.flatnonzero(values[1:] != values[:-1]) + 1) if len(index) else []
-    return {int(labels.ravel()[part[0]]): part for part in parts}
+    flat = labels.ravel()
+    index = np.flatnonzero(flat)
+    index = index[np.argsort(flat[index], kind="stable")]
+    parts = np.split(index, np.flatnonzero(np.diff(flat[index].astype(np.int64))) + 1)
+    return {int(flat[part[0]]): part for part in parts if len(part)}
 
 
 @dataclass(frozen=True, eq=False)
