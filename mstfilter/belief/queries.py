@@ -267,7 +267,7 @@ class Belief:
         p_both, p_same = self._mass @ both, self._mass @ same
         one = np.divide(p_same, p_both, out=np.ones_like(p_same), where=p_both > at_least)
         borders: dict[bytes, list[int]] = {}  # pixels that ask the same question, about the same object
-        for k in np.flatnonzero((one >= at_least) & (one <= 1 - at_least)).tolist():
+        for k in np.flatnonzero((p_both > at_least) & (one >= at_least) & (one <= 1 - at_least)).tolist():
             borders.setdefault(np.concatenate([both[:, k], same[:, k], of_a[same[:, k], k]]).tobytes(), []).append(k)
         doubt = {key: p_both[k[0]] * float(binary_entropy(one[k[0]])) for key, k in borders.items()}
         order = sorted(doubt, key=lambda key: -doubt[key])

@@ -32,7 +32,7 @@ from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architectu
 from mstfilter.completion.observed import ObservedBox, encode_box
 from mstfilter.errors import InputError, describe_error, missing_library
 from mstfilter.reading import MAX_WEIGHTS, read_bytes
-from mstfilter.trained import calibrated_network, open_model
+from mstfilter.trained import calibrated_network, load_once, open_model
 
 ARCHITECTURE = "completion-unet"
 
@@ -179,7 +179,7 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@functools.lru_cache(maxsize=4)
+@load_once
 def load_network(name: str, architecture: Architecture | None = None) -> TrainedNetwork:
     """Load a network by the name or folder of its model (see `mstfilter.trained.open_model`), or from an ONNX file.
 

@@ -256,6 +256,8 @@ class Frame:
         depth = depth.astype(np.float32, copy=True)
         with np.errstate(invalid="ignore"):
             depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+        if np.isfinite(some := depth[::4, ::4]).any():
+            check_depth(some, "depth image of the frame")
         object.__setattr__(self, "rgb", frozen(rgb))
         object.__setattr__(self, "depth", read_only(depth))
         if self.robot_mask is not None:

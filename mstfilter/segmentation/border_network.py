@@ -15,7 +15,6 @@ A model may also have a `PairNetwork`, which corrects the linear log odds of the
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
@@ -29,7 +28,7 @@ from torch.nn import functional
 from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, fill_from_nearest, posed_camera
 from mstfilter.segmentation.boundary import SENSOR_FOCAL
 from mstfilter.segmentation.regions import SeenBorders
-from mstfilter.trained import TrainedModel, calibrated_network, open_model
+from mstfilter.trained import TrainedModel, calibrated_network, load_once, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
 PAIR_TENSORS = "pairs."  #: prefix of the names of the tensors of a pair network in a border model
@@ -221,7 +220,7 @@ def reduced(frame: Frame) -> Frame:
     return frame.resized(camera if camera.width == RASTER else camera.scaled(RASTER / camera.width))
 
 
-@functools.lru_cache(maxsize=4)
+@load_once
 def load_border_network(name: str) -> BorderNetwork:
     """Load the network of a trained model, given by name or folder. See `mstfilter.trained.open_model`."""
     return BorderNetwork(open_model(name, BORDER_ARCHITECTURE))

@@ -33,6 +33,8 @@ def _seeds(value: Any) -> Any:
         first, dash, last = part.strip().partition("-")
         if not first.isdigit() or (dash and not last.strip().isdigit()):
             raise ValueError(f"{value!r} is not of the form 0-4, 7")
+        if dash and int(last) < int(first):
+            raise ValueError(f"{part.strip()!r} ends before it starts")
         found.extend(range(int(first), int(last if dash else first) + 1))
     return tuple(found)
 
