@@ -125,9 +125,7 @@ class Recording:
             raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
         for k, (a, b) in enumerate(pairwise(self.times)):
             if b <= a:
-                raise InputError(
-                    f"times of recording {self.name} do not ascend: frames {k}, {k + 1} at {a}, {b} s"
-                )
+                raise InputError(f"times of recording {self.name} do not ascend: frames {k}, {k + 1} at {a}, {b} s")
         object.__setattr__(self, "pauses", pauses)
 
     def __repr__(self) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, render
-from mstfilter.scoring.log_loss import check_weights, score_belief
+from mstfilter.scoring.log_loss import check_normalised, score_belief
 from mstfilter.scoring.metrics import diversity, least_loss, pairwise_quality, pause_metrics
 from mstfilter.scoring.quality import FORMS, connected_components, object_status, one_blob, weighted_coverage
 from mstfilter.scoring.questions import Questions, ask
@@ -54,7 +54,7 @@ class PauseEstimate:
     grid: VoxelGrid | None = None
 
     def __post_init__(self) -> None:
-        check_weights(self.weights, len(self.hypotheses), f"hypotheses at frame {self.frame}")
+        check_normalised(self.weights, len(self.hypotheses), f"hypotheses at frame {self.frame}")
         grids = [one.grid for one in self.hypotheses if isinstance(one, Hypothesis)]
         object.__setattr__(self, "grid", self.grid or next(iter(grids), None))
 
