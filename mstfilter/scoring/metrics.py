@@ -37,6 +37,7 @@ from mstfilter.scoring.quality import (
     quality_of,
     weighted_coverage,
 )
+from mstfilter.smc import first_seen
 
 _MOST = 0.5
 _FRAGMENT = 0.1
@@ -58,7 +59,8 @@ def pause_metrics(
         True label -> visible, hidden or unseen; empty if unknown.
     """
     (truth, *labels), n_free = _cropped([truth, *labels])
-    distinct, which = _distinct(labels)
+    which = first_seen(one.tobytes() for one in labels)
+    distinct = [labels[k] for k in np.unique(which, return_index=True)[1]]
     tables = [overlap(one, truth) for one in distinct]
     if n_free:  # the cropped grids have free voxels, too
         for table in tables:
@@ -106,23 +108,9 @@ def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
     return cut, occupied.size - cut[0].size
 
 
-def _distinct(labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """The distinct arrays, and the index (n,) of each array among them."""
-    found: dict[bytes, int] = {}
-    which = np.array([found.setdefault(one.tobytes(), len(found)) for one in labels])
-    return [labels[int(np.flatnonzero(which == k)[0])] for k in range(len(found))], which
-
-
-def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Intersections (na, nb), sizes (na,) and (nb,), and intersections over union of objects, without label 0."""
-    rows, columns = table.labels_a > 0, table.labels_b > 0
-    box = np.ix_(rows, columns)
-    return table.counts[box], table.sizes_a[rows], table.sizes_b[columns], table.jaccard()[box]
-
-
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
     """Largest IoU of each true object in `labels` with an object, averaged by size; NaN without such objects."""
-    _, _, sizes, jaccard = _objects(table)
+    _, _, sizes, jaccard = table.objects()
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():
         return float("nan")
@@ -143,7 +131,7 @@ def object_metrics(table: Overlap) -> dict[str, float]:
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
     (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if neither the truth nor the hypothesis has objects.
     """
-    counts, sizes_a, sizes_b, jaccard = _objects(table)
+    counts, sizes_a, sizes_b, jaccard = table.objects()
     found, true, both = float(sizes_a.sum()), float(sizes_b.sum()), float(counts.sum())
     n = len(sizes_a) + len(sizes_b)
     lies = counts > _MOST * sizes_a[:, None]
