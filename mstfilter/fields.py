@@ -125,3 +125,11 @@ def bound_to(component: _Component, **attributes: Any) -> _Component:
     for name, value in attributes.items():
         object.__setattr__(bound, name, value)
     return bound
+
+
+def copied(component: Any) -> Any:
+    """A deep copy. Functions, and objects that cannot be copied, are returned unchanged."""
+    try:
+        return copy.deepcopy(component)
+    except Exception:  # for example a lock or a module in a field
+        return component

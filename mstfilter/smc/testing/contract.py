@@ -25,6 +25,7 @@ from unittest import SkipTest
 import numpy as np
 
 from mstfilter.errors import InputError, describe_error
+from mstfilter.fields import copied
 from mstfilter.smc import Population, as_matrix
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -165,14 +166,6 @@ def _selected(population: Population) -> list[np.ndarray]:
     """Arrays that describe the particles of a result: parents, and coordinates of array particles."""
     numbers = isinstance(population.particles, (np.ndarray, Mapping))
     return [*population.parents.values(), *([as_matrix(population.particles)] if numbers else [])]
-
-
-def copied(component: Any) -> Any:
-    """A deep copy of a component, or the component if copying fails."""
-    try:
-        return copy.deepcopy(component)
-    except Exception:  # for example a lock or a module in a field
-        return component
 
 
 def skip_unless_properly_weighted(component: Any) -> Any:
