@@ -155,7 +155,7 @@ class Belief:
             raise InputError(
                 f"point {points[outside][0].tolist()} m lies outside the grid "
                 f"(so do {outside.sum()} of {outside.size} points)",
-                _extent(self.grid),
+                f"the grid extends from {self.grid.origin.tolist()} to {self.grid.upper.tolist()} m",
             )
         return index
 
@@ -416,7 +416,3 @@ def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found.append((np.minimum(one[at], next_one[at]), np.maximum(one[at], next_one[at]), pixels))
     a, b, pixels = (np.concatenate(column) for column in zip(*found, strict=True))
     return a, b, pixels
-
-
-def _extent(grid: VoxelGrid) -> str:
-    return f"the grid extends from {grid.origin.tolist()} to {grid.upper.tolist()} m"

@@ -208,7 +208,10 @@ def place_shape(path: Path, data: bytes, T: np.ndarray, grid: VoxelGrid) -> np.n
     Raises InputError if the file is invalid, or the shape is outside the grid or larger than two grid diagonals.
     """
     if path.suffix == ".npz":
-        arrays = _arrays(path, data)
+        with reading(path, "a shape", "expected arrays of numbers from numpy.savez"):
+            arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
+        if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
+            raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
         if "occupancy" in arrays:
             volume = _resample(path, arrays, T, grid)
         else:
@@ -236,14 +239,6 @@ def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> 
     if extent > limit:
         raise InputError(f"{path} is {extent:.3g} m large, the workspace {limit / 2:.3g} m", "shapes are in metres")
     return points @ T[:3, :3].T + T[:3, 3]
-
-
-def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
-    with reading(path, "a shape", "expected arrays of numbers from numpy.savez"):
-        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
-    if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
-        raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
-    return arrays
 
 
 def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, fill_from_nearest, posed_camera
-from mstfilter.segmentation.boundary import SENSOR_FOCAL
+from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, posed_camera
+from mstfilter.segmentation.boundary import SENSOR_FOCAL, filled_disparity
 from mstfilter.segmentation.regions import SeenBorders
 from mstfilter.trained import TrainedModel, calibrated_network, load_once, open_model
 
@@ -46,8 +46,7 @@ _MULTIPLE = 8  # image sizes that the network works on
 def encode_image(frame: Frame) -> np.ndarray:
     """The input (9, H, W) float32 of the network for a frame with a camera pose."""
     h, w = frame.depth.shape
-    disparity = 8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)
-    disparity = disparity.astype(np.float32) if frame.valid.any() else np.zeros((h, w), np.float32)
+    disparity = filled_disparity(frame) if frame.valid.any() else np.zeros((h, w), np.float32)
     camera = frame.camera
     matrix = camera.pose.as_matrix()
     up = matrix[2, :3]  # of the table, in the camera's axes
