@@ -39,13 +39,9 @@ def _seeds(value: Any) -> Any:
     return tuple(found)
 
 
-def _texts(value: Any) -> Any:
-    """A text as a tuple with this text; other values are unchanged."""
-    return (value,) if isinstance(value, str) else value
-
-
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seeds)]
-Texts = Annotated[tuple[str, ...], BeforeValidator(_texts)]
+#: A text stands for a tuple of this text.
+Texts = Annotated[tuple[str, ...], BeforeValidator(lambda given: (given,) if isinstance(given, str) else given)]
 
 
 class _Entry(BaseModel):
