@@ -42,11 +42,6 @@ class FrameGeometry:
         with np.errstate(invalid="ignore"):
             return self.signed < -np.asarray(margin, dtype=np.float32)
 
-    @property
-    def unknown(self) -> np.ndarray:
-        """(X, Y, Z) bool: voxel centres at pixels without a measured depth."""
-        return np.isnan(self.signed)
-
 
 def frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
     """The projection of the voxel centres of a grid into the image of a frame. The result is cached."""
@@ -82,7 +77,6 @@ class SupportPlane:
     #: Camera pose in world axes of the plane: the plane is at z = 0, z is its normal; the origin is at the
     #: median of its pixels, y points away from the camera.
     T_world_camera: RigidTransform
-    on_or_behind: np.ndarray  #: (H, W) bool, readings on the plane or behind it
     #: (H, W) float32, measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it),
     #: NaN is unknown.
     residual: np.ndarray
@@ -95,7 +89,6 @@ def disparity(depth: np.ndarray) -> np.ndarray:
 
 _N_TRIALS = 400  # minimal sets of RANSAC
 _INLIER = 1.5  # largest residual of an inlier, in 1/8 pixels
-_TOLERANCE = 2.0  # readings up to this much in front of the plane count as on it, in 1/8 pixels
 _SHIFTS = 16  # pixels of an image of 320 columns
 _MIN_EDGES = 120  # pixels of depth edges; fewer are taken for noise
 _BOX = np.ones((3, 3), np.uint8)
@@ -144,10 +137,8 @@ def _fit(frame: Frame) -> SupportPlane:
         )
     rows, columns = np.mgrid[: D.shape[0], : D.shape[1]]
     residual = (D - (plane[0] * columns + plane[1] * rows + plane[2])).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        on_or_behind = residual < _TOLERANCE
     pose = _pose(frame.camera, plane, np.stack([u, v], axis=1)[close])
-    return SupportPlane(pose, read_only(on_or_behind), read_only(residual))
+    return SupportPlane(pose, read_only(residual))
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
