@@ -29,7 +29,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
+from mstfilter.completion import ClipCompleter, Completer, Completion, SurfaceOnly, observed_box
 from mstfilter.completion.observed import frame_points
 from mstfilter.errors import InputError
 from mstfilter.fields import bound_to
@@ -70,7 +70,7 @@ class ObjectShapes:
 
 
 @dataclass(frozen=True)
-class ExternalCompletion(ClipCompleter, UsesFiles):
+class ExternalCompletion(ClipCompleter, SurfaceOnly, UsesFiles):
     """Completion by the shapes in a folder.
 
     A mask gets the shapes of the stored mask with the highest IoU, which must be at least 0.5. If the object has
@@ -105,10 +105,6 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         found = read_shapes(self.folder, clip.index, clip.after.depth.shape)
         other = self.other.at(clip) if isinstance(self.other, ClipCompleter) else self.other
         return bound_to(self, _shapes=found, other=other)
-
-    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probabilities: 1 on the visible surface, 0 elsewhere. `complete_each` adds the external shape."""
-        return seen.surface.astype(np.float32)
 
     def complete_each(
         self,
