@@ -206,7 +206,8 @@ def check_properties(
     failure: str | None
     skipped: str | None
     stopped = False
-    for name in _test_names(tests):
+    names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
+    for name in dict.fromkeys(names):  # those of base classes first
         test = getattr(tests, name)
         if stopped:
             failure, skipped = None, "not tested: first fix what is broken above"
@@ -219,12 +220,6 @@ def check_properties(
         statistical = getattr(test, "statistical", False)
         results.append(CheckResult(name.removeprefix("test_"), statement, statistical, failure, skipped))
     return results
-
-
-def _test_names(tests: type) -> list[str]:
-    """The names of the test methods, those of base classes first."""
-    names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
-    return list(dict.fromkeys(names))
 
 
 def _outcome(test: Callable[[], None]) -> tuple[str | None, str | None]:
