@@ -168,7 +168,8 @@ def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[A
 
 
 def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator[ArmRequest]:
-    presets = [_preset_path(folder, name.strip()) for text in entry.preset for name in text.split(",")]
+    names = [name.strip() for text in entry.preset for name in text.split(",")]  # or files in the study's folder
+    presets = [str(folder / n) if n.endswith(".toml") and (folder / n).is_file() else n for n in names]
     grids = [split_grid(text) for text in (*entry.set, *overrides)]
     if not presets or not all(presets):
         raise InputError(f"an arm names no preset: {list(entry.preset)}")
@@ -181,11 +182,6 @@ def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator
                 shown = [k for k in range(len(grids)) if k < len(entry.set) or k in varied]
                 words = [_stem(preset), *(chosen[k] for k in shown)]
             yield ArmRequest(" ".join(words), preset, chosen, entry.reported_only)
-
-
-def _preset_path(folder: Path, name: str) -> str:
-    """The path of a preset file in the study's folder if the file exists, or else the name."""
-    return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
 
 
 def _stem(preset: str) -> str:
