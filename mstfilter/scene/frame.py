@@ -341,7 +341,8 @@ class Clip:
     grid : VoxelGrid
         The workspace.
     index : int
-        Number of the pause at the end of the clip, starting from 0.
+        Number of the pause at the end of the clip, starting from 0. The identities of new objects depend on this
+        number, so the numbers of successive clips have to ascend.
     times : tuple of float, optional
         Time of each frame in seconds.
     """

@@ -309,11 +309,6 @@ class Hypothesis:
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
-        if len({o.id for o in self.objects}) < len(numbers):
-            raise InputError(
-                f"two object records have one id: {sorted(o.id for o in self.objects)}",
-                "give successive clips ascending values of the field index",
-            )
         if numbers != list(self.volumes()):
             no_record = sorted(set(self.volumes()) - set(numbers))
             no_voxel = sorted(set(numbers) - set(self.volumes()))
