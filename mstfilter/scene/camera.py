@@ -236,7 +236,7 @@ def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform
         )
     R = matrix[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        left_handed = np.linalg.det(R) < 0
+        left_handed = bool(np.linalg.det(R) < 0)
         raise InputError(
             f"{where} is not a rigid transform{', its axes are left-handed' * left_handed}: {matrix.tolist()}",
             "expected a 4x4 matrix with a rotation in its upper left and last row 0 0 0 1",
