@@ -144,7 +144,7 @@ def cases(rows: Sequence[Row]) -> list[dict[str, str]]:
         line = {"family": family, "arm": arm}
         seeds = len({row["seed"] for row in mine})
         for kind in ("visible", "hidden", "unseen"):
-            pairs = [(row[f"n_{kind}"], row[f"quality_{kind}"]) for row in mine if row[f"n_{kind}"]]
+            pairs = [(row[f"n_{kind}"], row[f"quality_{kind}"]) for row in mine if row.get(f"n_{kind}")]
             n = sum(count for count, _ in pairs)
             line[kind] = f"{n / seeds:g}"
             line[f"quality_{kind}"] = f"{sum(count * q for count, q in pairs) / n:.4f}" if n else ""
@@ -206,7 +206,14 @@ class Source(NamedTuple):
         arms = {arm.name: arm.reported_only for arm in plan.arms}
         families = dict.fromkeys(scene.group for scene in plan.scenes)
         files = [study.parent / "rows" / f"{family}.csv.xz" for family in families]
-        return cls(plan.config.name, plan.reference, arms, [row for file in files for row in read_rows(file)])
+        rows = [row for file in files for row in read_rows(file)]
+        planned = {(run.scene.group, run.scene.name, run.arm.name, run.seed) for run in plan.runs}
+        found = {(row["family"], row["scene"], row["arm"], row["seed"]) for row in rows}
+        if found - planned:
+            sys.exit(f"error: {study} has no run {min(found - planned)}\nhint: write the rows of its families again")
+        if planned - found:
+            print(f"warning: rows of {len(planned - found)} of {len(planned)} runs are missing", file=sys.stderr)
+        return cls(plan.config.name, plan.reference, arms, rows)
 
 
 def read_rows(file: Path) -> list[dict[str, Any]]:
@@ -242,7 +249,7 @@ def main(study: Path, out: Path, reference: str, pooled: bool) -> None:
         found = summarise(rows, reference, reported_only=others)
         name += f"_{reference.split(':')[0].replace(' ', '_')}"
     elif pooled:
-        of_all = [{**row, "family": "all"} for row in rows]
+        of_all = [{**row, "family": "all", "scene": f"{row['family']}/{row['scene']}"} for row in rows]
         found = summarise(of_all, source.reference, reported_only=arms_reported_only)
         name += "_pooled"
         tables = {f"{name}_described": differences(found, DESCRIBED), f"{name}_pauses": by_pause(rows)}

@@ -59,22 +59,19 @@ class Bounded:
         super().__init_subclass__(**named)
         own = cls.__dict__.get("__post_init__")
         if own is not None:
-            cls.__post_init__ = _after_checks(own)  # type: ignore[method-assign, assignment]
+
+            @functools.wraps(own)
+            def after_checks(self: Any) -> None:
+                Bounded.__post_init__(self)
+                own(self)
+
+            cls.__post_init__ = after_checks  # type: ignore[method-assign]
 
     def __post_init__(self) -> None:
         """Raise InputError if a field is outside of its bounds."""
         cls: type = type(self)
         for name, check in _checks(cls):
             check(name, getattr(self, name))
-
-
-def _after_checks(own: Callable[[Any], None]) -> Callable[[Any], None]:
-    @functools.wraps(own)
-    def __post_init__(self: Any) -> None:
-        Bounded.__post_init__(self)
-        own(self)
-
-    return __post_init__
 
 
 _Check = Callable[[str, Any], None]
@@ -125,3 +122,11 @@ def bound_to(component: _Component, **attributes: Any) -> _Component:
     for name, value in attributes.items():
         object.__setattr__(bound, name, value)
     return bound
+
+
+def copied(component: Any) -> Any:
+    """A deep copy. Functions, and objects that cannot be copied, are returned unchanged."""
+    try:
+        return copy.deepcopy(component)
+    except Exception:  # for example a lock or a module in a field
+        return component

@@ -65,9 +65,8 @@ class ForecastTable:
     @classmethod
     def pooled(cls, tables: Sequence[ForecastTable]) -> ForecastTable:
         """A table in which the numbers of outcomes of several tables are summed."""
-        p, no, yes = (np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes"))
-        count = no + yes
-        return cls.of(p, np.divide(yes, count, out=np.zeros_like(yes), where=count > 0), count)
+        every = cls(*(np.concatenate([getattr(t, name) for t in tables]) for name in ("p", "no", "yes")))
+        return every.with_forecasts(every.p)
 
     @cached_property
     def count(self) -> np.ndarray:

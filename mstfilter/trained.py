@@ -10,12 +10,13 @@ does not match. Weights are stored in half precision. No file is unpickled.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
@@ -57,13 +58,37 @@ class TrainedModel:
             )
 
 
+def _folder(name: str) -> Path:
+    given, packaged = Path(name), models_folder() / name
+    return packaged if (given.name == name and packaged.is_dir()) or not given.is_dir() else given
+
+
+_Load = TypeVar("_Load", bound=Callable[..., Any])
+
+
+def load_once(load: _Load) -> _Load:
+    """Cache `load(name, ...)` until a file of the model changes. `name` is a model, its folder, or one file."""
+
+    @functools.lru_cache(maxsize=4)
+    def of_version(_version: tuple[tuple[str, int, int], ...], *arguments: Any) -> Any:
+        return load(*arguments)
+
+    @functools.wraps(load)
+    def found(name: str, *others: Any) -> Any:
+        files = [Path(name)] if Path(name).is_file() else sorted(_folder(name).glob("*"))
+        stats = [(str(file), file.stat()) for file in files]
+        return of_version(tuple((file, stat.st_mtime_ns, stat.st_size) for file, stat in stats), name, *others)
+
+    found.cache_clear = of_version.cache_clear  # type: ignore[attr-defined]
+    return cast(_Load, found)
+
+
 def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     """The model in the package that has this name, or else the model in the folder with this path.
 
     Raises InputError if the model is missing, damaged, or of another architecture.
     """
-    given, packaged = Path(name), models_folder() / name
-    folder = packaged if (given.name == name and packaged.is_dir()) or not given.is_dir() else given
+    given, folder = Path(name), _folder(name)
     for file in (DESCRIPTION, WEIGHTS):
         if not (folder / file).is_file():
             where = f"in the folder {given}" if folder == given else f"in the package, and no folder {name!r}"

@@ -8,6 +8,7 @@ import struct
 import numpy as np
 import pytest
 
+from mstfilter.completion import NetworkCompleter
 from mstfilter.errors import InputError
 from mstfilter.trained import DESCRIPTION, WEIGHTS, open_model, write_model
 
@@ -75,3 +76,14 @@ def test_wrong_descriptions(folder):
     (folder / DESCRIPTION).write_text("architecture = [")
     with pytest.raises(InputError, match="not valid TOML"):
         open_model(str(folder))
+
+
+def test_a_network_that_is_written_again_is_read_again(tmp_path):
+    pytest.importorskip("torch")
+    model = open_model("completion")
+    keys = []
+    for factor in (1.0, 0.5):
+        write_model(tmp_path / "mine", model.description, {k: factor * v for k, v in model.tensors.items()})
+        keys.append(NetworkCompleter(weights=str(tmp_path / "mine")).weights_key)
+        assert keys[-1] == open_model(str(tmp_path / "mine")).key
+    assert keys[0] != keys[1]

@@ -49,6 +49,13 @@ def shifted_camera():
     return changed(rgb=np.r_[arrays["rgb"][:1], rgb], depth=np.r_[arrays["depth"][:1], depth])
 
 
+def marked(depth):
+    """Depth with the value 8 m at the left tenth of the image."""
+    found = depth.copy()
+    found[..., : depth.shape[-1] // 10] = 8.0
+    return found
+
+
 def beyond_the_table(surface):
     """The exact scene; `surface` gives the depth (H, W) of what is beyond the table from pose and directions."""
     pose = look_at((0.0, -0.9, 0.45), (0, 0, 0.2))
@@ -124,6 +131,8 @@ WRONG = {
     "depth 4 times too large (RealSense L515, 0.25 mm)": depth_times(4),
     "depth without any reading": depth_times(np.nan),
     "depth at a fifth of the pixels": lambda: changed(depth=sparse(right()[0]["depth"], 0.2)),
+    "a constant for missing depth": lambda: changed(depth=marked(right()[0]["depth"])),
+    "inverse depth, without a pose": lambda: changed(depth=0.5 / right()[0]["depth"]),
     "constant depth": lambda: changed(depth=np.full_like(right()[0]["depth"], 0.8)),
     "depth not registered to colour": lambda: changed(
         depth=warped(right()[0]["depth"], [[1, 0, 8], [0, 1, -6]], np.nan)
@@ -132,6 +141,10 @@ WRONG = {
     "uniform colour": lambda: changed(rgb=np.full_like(right()[0]["rgb"], 90)),
     "a robot mask over all pixels": lambda: posed(robot_masks=np.ones(right()[0]["depth"].shape, bool)),
     "workspace in millimetres": lambda: posed(grid=VoxelGrid((-400, -400, 0), 10.0, (80, 80, 30))),
+    "the camera or its pose leaves the table": lambda: changed(
+        T_world_camera=np.stack([right()[1].as_matrix(), np.eye(4), np.eye(4)])
+    ),
+    "workspace that starts above the table": lambda: posed(grid=VoxelGrid((-0.4, -0.4, 0.05), 0.01, (80, 80, 30))),
     "workspace beside the table": lambda: posed(grid=VoxelGrid((2.0, -3.0, 0.0), 0.01, (80, 80, 30))),
     "workspace below the objects' tops": lambda: posed(grid=VoxelGrid((-0.4, -0.4, 0.0), 0.01, (80, 80, 2))),
     "the same images at all pauses": lambda: changed(

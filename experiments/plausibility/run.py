@@ -25,7 +25,8 @@ from mstfilter.errors import InputError
 from mstfilter.files import write_csv
 from mstfilter.formats import PairedImages, open_recording
 from mstfilter.scene import Camera, Frame, Recording, VoxelGrid, examine, find_world
-from mstfilter.scene.plausibility import Look, drift, edge_agreement
+from mstfilter.scene.geometry import edge_agreement
+from mstfilter.scene.plausibility import Look, drift
 from mstfilter.simulation import cached_recording
 
 HERE = Path(__file__).resolve().parent
@@ -203,6 +204,13 @@ def with_poses(change: Callable[[Scene], Scene]) -> Callable[[Scene], Scene | No
     return lambda scene: None if scene.poses is None else change(scene)
 
 
+def marked(depth: np.ndarray) -> np.ndarray:
+    """Depth with 8 m at all pixels without readings and at the left twentieth of the image."""
+    found = np.where(np.isfinite(depth), depth, np.float32(8))
+    found[..., : depth.shape[-1] // 20] = 8
+    return found
+
+
 def several(change: Callable[[Scene], Scene]) -> Callable[[Scene], Scene | None]:
     return lambda scene: None if len(scene.rgb) < 2 else change(scene)
 
@@ -241,6 +249,14 @@ INPUTS: dict[str, Callable[[Scene], Scene | None]] = {
     "depth of the next pause": several(lambda s: replace(s, depth=np.roll(s.depth, -1, axis=0))),
     "robot mask everywhere": with_poses(lambda s: replace(s, masks=np.ones(s.depth.shape, bool))),
     "constant depth": with_poses(lambda s: replace(s, depth=np.full_like(s.depth, 0.8))),
+    "8 m for missing depth": lambda s: replace(s, depth=marked(s.depth)),
+    "inverse depth, without pose": lambda s: None if s.poses else replace(s, depth=np.float32(0.5) / s.depth),
+    "no pose from pause 1 on": with_poses(
+        several(lambda s: replace(s, poses=(s.poses or ())[:1] + (RigidTransform.identity(),) * (len(s.rgb) - 1)))
+    ),
+    "workspace 5 cm above the table": with_poses(
+        lambda s: replace(s, grid=VoxelGrid(s.grid.origin + [0, 0, 0.05], 0.01, s.grid.shape)) if s.grid else s
+    ),
     "uniform colour": lambda s: replace(s, rgb=np.full_like(s.rgb, 120)),
     "pauses all identical": several(
         lambda s: replace(s, rgb=s.rgb[[0] * len(s.rgb)], depth=s.depth[[0] * len(s.rgb)])
@@ -254,9 +270,9 @@ def statistics(looks: list[Look]) -> dict[str, float]:
     tilt, height = first.table or (np.nan, np.nan)
     drifts = np.array([drift(first, look) for look in looks[1:]]).reshape(-1, 3)
     corners = [first.corners.moved(look.corners) for look in looks[1:]]
-    peak, lost, _, rise = edge_agreement(looks)
+    peak, lost, _, rise = edge_agreement([look.edges for look in looks])
     return {
-        "distance": first.distance,
+        "distance": float(np.median(first.frame.depth[first.frame.valid])),
         "tilt": tilt,
         "height": abs(height),
         "field": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.K[0, 0])))),

@@ -112,8 +112,7 @@ def _logits(net: CompletionNet, samples: CompletionSamples, device: torch.device
         for start in range(0, len(samples), 32):
             part = slice(start, min(start + 32, len(samples)))
             bits, signed = torch.from_numpy(samples.bits[part]), torch.from_numpy(samples.signed[part])
-            features, prior = net.encode(channels(bits, signed, _heights()).to(device))
-            yield part, net.decode(features, prior.mean).cpu()
+            yield part, net(channels(bits, signed, _heights()).to(device)).cpu()
 
 
 def evaluate(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> dict[str, float]:

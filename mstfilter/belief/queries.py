@@ -155,7 +155,7 @@ class Belief:
             raise InputError(
                 f"point {points[outside][0].tolist()} m lies outside the grid "
                 f"(so do {outside.sum()} of {outside.size} points)",
-                _extent(self.grid),
+                f"the grid extends from {self.grid.origin.tolist()} to {self.grid.upper.tolist()} m",
             )
         return index
 
@@ -267,7 +267,7 @@ class Belief:
         p_both, p_same = self._mass @ both, self._mass @ same
         one = np.divide(p_same, p_both, out=np.ones_like(p_same), where=p_both > at_least)
         borders: dict[bytes, list[int]] = {}  # pixels that ask the same question, about the same object
-        for k in np.flatnonzero((one >= at_least) & (one <= 1 - at_least)).tolist():
+        for k in np.flatnonzero((p_both > at_least) & (one >= at_least) & (one <= 1 - at_least)).tolist():
             borders.setdefault(np.concatenate([both[:, k], same[:, k], of_a[same[:, k], k]]).tobytes(), []).append(k)
         doubt = {key: p_both[k[0]] * float(binary_entropy(one[k[0]])) for key, k in borders.items()}
         order = sorted(doubt, key=lambda key: -doubt[key])
@@ -416,7 +416,3 @@ def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found.append((np.minimum(one[at], next_one[at]), np.maximum(one[at], next_one[at]), pixels))
     a, b, pixels = (np.concatenate(column) for column in zip(*found, strict=True))
     return a, b, pixels
-
-
-def _extent(grid: VoxelGrid) -> str:
-    return f"the grid extends from {grid.origin.tolist()} to {grid.upper.tolist()} m"

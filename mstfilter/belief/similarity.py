@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.fields import PositiveInt
 from mstfilter.scene import Hypothesis
-from mstfilter.scene.partitions import canonical, common_refinement
+from mstfilter.scene.partitions import canonical
+from mstfilter.scoring import pairwise_quality
 from mstfilter.smc import Equivalence, Similarity, first_seen
 
 
@@ -46,15 +46,4 @@ class WeightedCoverage(Similarity):
         grids = [h.labels[step, step, step] for h in particles]
         if len({g.shape for g in grids}) != 1:
             raise InputError("hypotheses have label grids of different shapes, expected the same for all")
-        refined = common_refinement(grids)
-        common = refined.overlaps()[1:, 1:]
-        sizes = common.diagonal().copy()
-        jaccard = common / (sizes[:, None] + sizes - common)
-        objects = [slice(a, b) for a, b in pairwise(refined.first)]  # of each hypothesis
-        best = np.stack([jaccard[:, k].max(axis=1, initial=0.0) for k in objects], axis=1)
-        volumes = np.array([sizes[k].sum() for k in objects])
-        covered = np.stack([sizes[k] @ best[k] for k in objects]) / np.maximum(volumes, 1)[:, None]
-        quality = (covered + covered.T) / 2
-        empty = volumes == 0
-        quality[np.ix_(empty, empty)] = 1.0  # an empty and another hypothesis have quality 0
-        return quality
+        return pairwise_quality(grids)

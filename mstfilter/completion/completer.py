@@ -83,15 +83,11 @@ def _check_completions(
     self: Completer, found: Any, rngs: Any, frame: Frame, masks: Any, grid: VoxelGrid, views: Any = None
 ) -> Any:
     for one in check_list(found, len(masks), Completion, "Completion"):
-        _check_completion(one, grid)
+        shape = one.points.shape
+        check_probabilities(one.probability, shape)
+        if len(shape) != 3 or (np.add(one.offset, shape) > grid.shape).any() or np.min(one.offset) < 0:
+            raise InputError(f"returns a box of shape {shape} at {one.offset}, the grid has {grid.shape}")
     return found
-
-
-def _check_completion(one: Completion, grid: VoxelGrid) -> None:
-    check_type(one, Completion, "a Completion")
-    check_probabilities(one.probability, one.points.shape)
-    if one.points.ndim != 3 or (np.add(one.offset, one.points.shape) > grid.shape).any() or np.min(one.offset) < 0:
-        raise InputError(f"returns a box of shape {one.points.shape} at {one.offset}, the grid has {grid.shape}")
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,9 @@ class NetworkCompleter(Completer, UsesFiles):
         grid: VoxelGrid,
         views: Sequence[tuple[ObjectView, ...]] | None = None,
     ) -> list[Completion]:
-        lattice = grid if abs(grid.voxel_size - LATTICE) < 1e-6 else _lattice(grid)  # views have boxes of it
+        lattice = grid  # of the network, over the workspace; views have boxes of it
+        if abs(grid.voxel_size - LATTICE) >= 1e-6:
+            lattice = VoxelGrid.from_bounds(grid.origin, grid.upper, LATTICE)
         found = super().complete_each(rngs, frame, masks, lattice, views)
         if lattice is not grid:
             found = [self._on_grid(one, frame, m, grid, lattice) for one, m in zip(found, masks, strict=True)]
@@ -139,9 +141,3 @@ class NetworkCompleter(Completer, UsesFiles):
         if n < _LARGE_SURFACE or np.count_nonzero(p[layer] >= 0.5) >= self.least_surface * n:
             return p
         return np.where(layer, np.maximum(p, np.float32(0.5)), p)
-
-
-def _lattice(grid: VoxelGrid) -> VoxelGrid:
-    """The network's lattice over the workspace of a grid."""
-    upper = np.asarray(grid.origin) + np.array(grid.shape) * grid.voxel_size
-    return VoxelGrid.from_bounds(np.asarray(grid.origin), upper, LATTICE)

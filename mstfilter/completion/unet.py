@@ -21,7 +21,6 @@ import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,16 +31,9 @@ from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architectu
 from mstfilter.completion.observed import ObservedBox, encode_box
 from mstfilter.errors import InputError, describe_error, missing_library
 from mstfilter.reading import MAX_WEIGHTS, read_bytes
-from mstfilter.trained import calibrated_network, open_model
+from mstfilter.trained import calibrated_network, load_once, open_model
 
 ARCHITECTURE = "completion-unet"
-
-
-class LatentLaw(NamedTuple):
-    """Diagonal normal distribution of z."""
-
-    mean: Tensor  #: (b, d)
-    log_std: Tensor  #: (b, d)
 
 
 def to_channels(x: Tensor) -> Tensor:
@@ -108,15 +100,15 @@ class CompletionNet(nn.Module):
         #: Logit of a voxel that is not extruded, and what extrusion adds: the network starts from this rule.
         self.rule = nn.Parameter(torch.tensor([-3.0, 4.4]))
 
-    def encode(self, x: Tensor) -> tuple[list[Tensor], LatentLaw]:
-        """Features of an input (b, channels, X, Y, Z), and the prior of z. X, Y and Z are multiples of 8."""
+    def encode(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
+        """Features of an input (b, channels, X, Y, Z), and the mode of z. X, Y and Z are multiples of 8."""
         fine = self.fine(self.stem(to_channels(x)))
         middle = self.middle(self.down1(fine))
         coarse = self.down2(middle)
         for block in self.coarse:
             coarse = block(coarse)
-        mean, log_std = self.prior(coarse.mean(dim=(2, 3, 4)).float()).chunk(2, dim=1)
-        return [fine, middle, coarse, x[:, -1]], LatentLaw(mean, log_std.clamp(-4, 2))
+        mode, _ = self.prior(coarse.mean(dim=(2, 3, 4)).float()).chunk(2, dim=1)  # and the logs of deviations
+        return [fine, middle, coarse, x[:, -1]], mode
 
     def decode(self, features: list[Tensor], z: Tensor) -> Tensor:
         """Logits (b, X, Y, Z) of a latent vector (b, latent)."""
@@ -132,8 +124,7 @@ class CompletionNet(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z), with the mode of z."""
-        features, prior = self.encode(x)
-        return self.decode(features, prior.mean)
+        return self.decode(*self.encode(x))
 
 
 class TrainedNetwork:
@@ -179,7 +170,7 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@functools.lru_cache(maxsize=4)
+@load_once
 def load_network(name: str, architecture: Architecture | None = None) -> TrainedNetwork:
     """Load a network by the name or folder of its model (see `mstfilter.trained.open_model`), or from an ONNX file.
 

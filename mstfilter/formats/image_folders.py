@@ -14,6 +14,7 @@ import time
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -237,12 +238,13 @@ def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()
     files = [p for p in new if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     if not files and not known:
         raise InputError(f"{folder} has no image", f"expected {', '.join(suffixes)}")
-    if len({_number(file) for file in files}) < len(files):
-        raise InputError(
-            f"{folder}: names of images have no numbers that differ: {', '.join(sorted(p.name for p in files)[:3])}",
-            "name them 000000, 000001, ..., or by time in seconds",
-        )
     ordered = sorted(files, key=_number)
+    for a, b in pairwise(ordered):
+        if _number(a) == _number(b):
+            raise InputError(
+                f"{folder}: names of images have no numbers that differ: {a.name}, {b.name}",
+                "name them 000000, 000001, ..., or by time in seconds",
+            )
     for before, after in zip(ordered, sorted(files, key=_numbers), strict=True):
         if before != after:
             raise InputError(
@@ -285,9 +287,11 @@ def _paired(
         chosen = pair_stamps(stamps[0], stamps[1], tolerance_s, str(path))
         return [(colour[i], depth[j]) for i, j in chosen], tuple(stamps[0][i] for i, _ in chosen)
     if len(colour) != len(depth):
+        alone = min(set(numbers[0]) ^ set(numbers[1]), default=None)
+        first_alone = next((file.name for file in (*colour, *depth) if _number(file) == alone), colour[-1].name)
         raise InputError(
             f"{path}: there are {len(colour)} colour images and {len(depth)} depth images",
-            f"each frame needs both; colour ends with {colour[-1].name}, depth with {depth[-1].name}",
+            f"each frame needs both; {first_alone} has no partner",
         )
     for a, b, first, second in zip(colour, depth, *numbers, strict=True):
         if first != second:

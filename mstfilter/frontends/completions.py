@@ -29,7 +29,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.completion import ClipCompleter, Completer, Completion, ObservedBox, observed_box
+from mstfilter.completion import ClipCompleter, Completer, Completion, SurfaceOnly, observed_box
 from mstfilter.completion.observed import frame_points
 from mstfilter.errors import InputError
 from mstfilter.fields import bound_to
@@ -70,7 +70,7 @@ class ObjectShapes:
 
 
 @dataclass(frozen=True)
-class ExternalCompletion(ClipCompleter, UsesFiles):
+class ExternalCompletion(ClipCompleter, SurfaceOnly, UsesFiles):
     """Completion by the shapes in a folder.
 
     A mask gets the shapes of the stored mask with the highest IoU, which must be at least 0.5. If the object has
@@ -105,10 +105,6 @@ class ExternalCompletion(ClipCompleter, UsesFiles):
         found = read_shapes(self.folder, clip.index, clip.after.depth.shape)
         other = self.other.at(clip) if isinstance(self.other, ClipCompleter) else self.other
         return bound_to(self, _shapes=found, other=other)
-
-    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probabilities: 1 on the visible surface, 0 elsewhere. `complete_each` adds the external shape."""
-        return seen.surface.astype(np.float32)
 
     def complete_each(
         self,
@@ -208,7 +204,10 @@ def place_shape(path: Path, data: bytes, T: np.ndarray, grid: VoxelGrid) -> np.n
     Raises InputError if the file is invalid, or the shape is outside the grid or larger than two grid diagonals.
     """
     if path.suffix == ".npz":
-        arrays = _arrays(path, data)
+        with reading(path, "a shape", "expected arrays of numbers from numpy.savez"):
+            arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
+        if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
+            raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
         if "occupancy" in arrays:
             volume = _resample(path, arrays, T, grid)
         else:
@@ -236,14 +235,6 @@ def _checked(path: Path, points: np.ndarray, T: np.ndarray, grid: VoxelGrid) -> 
     if extent > limit:
         raise InputError(f"{path} is {extent:.3g} m large, the workspace {limit / 2:.3g} m", "shapes are in metres")
     return points @ T[:3, :3].T + T[:3, 3]
-
-
-def _arrays(path: Path, data: bytes) -> dict[str, np.ndarray]:
-    with reading(path, "a shape", "expected arrays of numbers from numpy.savez"):
-        arrays = unpack_arrays(io.BytesIO(data), MAX_FILE)
-    if "points" not in arrays and not {"occupancy", "origin", "voxel_size"} <= set(arrays):
-        raise InputError(f"{path} has {', '.join(arrays)}; expected points, or occupancy, origin and voxel_size")
-    return arrays
 
 
 def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: VoxelGrid) -> np.ndarray:

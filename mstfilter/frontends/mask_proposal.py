@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -19,8 +18,8 @@ import numpy as np
 from mstfilter.completion import Completer, Extrude
 from mstfilter.frontends.mask_files import read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
-from mstfilter.scene import Clip, Recording, UsesFiles, component_key, content_key, memo
-from mstfilter.segmentation import CutSampler, ExactCuts, ObjectRule, Tree, complete_segments
+from mstfilter.scene import Clip, Recording, UsesFiles, content_key
+from mstfilter.segmentation import CutSampler, ExactCuts, ObjectRule, complete_segments
 from mstfilter.smc import Population, Proposal, child
 
 
@@ -66,12 +65,10 @@ class MaskProposal(Proposal, UsesFiles):
         drawn = child(rng, "region", whole).choice(len(masks.weights), n, p=masks.weights)
         for k in np.unique(drawn).tolist():
             tree, rows = masks.trees[k], np.flatnonzero(drawn == k)
-            found = memo(
-                "segments",
-                (frame.key, grid.key, tree.key, component_key(self.objects)),
-                partial(self.objects.segments, tree, frame, grid),
-            )
-            w = node_values(tree, _stops_at_objects(tree, masks.stops[k], found.is_object))
+            found = self.objects.cached_segments(tree, frame, grid)
+            # Background masks (such as the table) that contain other masks have the stop probability 0.
+            inner = np.arange(tree.n_nodes) >= tree.n_leaves
+            w = node_values(tree, np.where(inner & ~found.is_object, 0.0, masks.stops[k]))
             cuts = self.sampler.sample(child(rng, "cuts", whole, k), tree, w, len(rows)).cuts
             numbers: dict[int, int] = {}
             for row, cut in zip(rows.tolist(), cuts, strict=True):
@@ -90,12 +87,6 @@ class MaskProposal(Proposal, UsesFiles):
         alternatives = np.bincount(drawn, minlength=len(masks.weights)).tolist()
         notes = {"masks": masks.key.hex(), "alternatives": alternatives, **counts}
         return Population(particles, notes=notes)
-
-
-def _stops_at_objects(tree: Tree, stop: np.ndarray, is_object: np.ndarray) -> np.ndarray:
-    """Stop probabilities (N,), set to 0 at background masks (such as the table) that contain other masks."""
-    inner = np.arange(tree.n_nodes) >= tree.n_leaves
-    return np.where(inner & ~is_object, 0.0, stop)
 
 
 def _number(content: bytes) -> int:

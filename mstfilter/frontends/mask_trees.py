@@ -168,10 +168,10 @@ def nested_masks(
         for j in by_area[:i]:
             if (flat[k] & flat[j]).sum() >= share * areas[k]:
                 final[k] = final[k] & final[j]
-    chosen = [k for k in kept if final[k].any()]
     unique: dict[bytes, int] = {}
-    for k in chosen:
-        unique.setdefault(np.packbits(final[k]).tobytes(), k)
+    for k in kept:
+        if final[k].any():
+            unique.setdefault(np.packbits(final[k]).tobytes(), k)
     chosen = list(unique.values())
     out = np.array([final[k] for k in chosen], dtype=bool).reshape(len(chosen), *masks.shape[1:])
     return out, scores[chosen]

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.belief import Belief
-from mstfilter.errors import InputError, check_component, check_integer
+from mstfilter.errors import InputError, check_component, check_integer, warn_user
 from mstfilter.formats import Settled
 from mstfilter.presets import preset
 from mstfilter.processes import parallel
@@ -198,12 +198,14 @@ class Stream:
         self.counts["pushed"] += 1
         if not np.isfinite(time):
             raise InputError(f"time of frame {number} is {time}, expected seconds")
+        if np.ndim(rgb) != 3:
+            raise InputError(f"colour image of frame {number} has shape {np.shape(rgb)}, expected (H, W, 3)")
         if depth is None or not np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
-            return self._dropped("no depth")
+            return self._dropped("no depth", number, pause)
         if time <= self._last_time:
-            return self._dropped("late")
+            return self._dropped("late", number, pause)
         if self._queue.full():
-            return self._dropped("overflow")
+            return self._dropped("overflow", number, pause)
         camera = self._camera
         if not isinstance(camera, Camera):
             camera = self._camera = Camera(camera, np.shape(rgb)[1], np.shape(rgb)[0])
@@ -219,7 +221,10 @@ class Stream:
         self._queue.put(_Item(number, frame, time, pause, arrived))
         return True
 
-    def _dropped(self, why: str) -> bool:
+    def _dropped(self, why: str, number: int, pause: bool | None = None) -> bool:
+        if pause or (why == "late" and not self.counts[why]):
+            hint = "the counts of dropped frames are in `counts`; times have to ascend, also after the clock is set"
+            warn_user(f"frame {number} is dropped: {why}{', a given pause is lost' * bool(pause)}", hint)
         self.counts[why] += 1
         return False
 

@@ -18,7 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.completion import Completer, Completion, Extrude, ObservedBox, observed_box
+from mstfilter.completion import Completer, Completion, Extrude, SurfaceOnly, observed_box
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.scene import (
     Clip,
@@ -103,7 +103,7 @@ _WHOLE = 0.75  # share of the pixels of an object in a mask that shows all of it
 
 
 @dataclass(frozen=True)
-class TrueCompletion(UsesTruth, Completer):
+class TrueCompletion(UsesTruth, SurfaceOnly):
     """The true voxels of the objects that a mask shows. A mask without true objects gives its visible surface.
 
     `objects` determines which pixels can belong to an object. True voxels are assigned to pixels of their object. A
@@ -114,10 +114,6 @@ class TrueCompletion(UsesTruth, Completer):
     objects: ObjectRule = ObjectRule()  # noqa: RUF009 (frozen)
 
     needs: ClassVar[tuple[Need, ...]] = ("voxels", "instance")
-
-    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
-        """Probability 1 on the visible surface, for masks without true objects."""
-        return seen.surface.astype(np.float32)
 
     def complete_each(
         self,

@@ -138,6 +138,8 @@ def largest_products(log_factors: Sequence[np.ndarray], n: int) -> tuple[np.ndar
 def tempered(p: np.ndarray, temperature: float) -> np.ndarray:
     """Probabilities (k,) in proportion to p^(1/T)."""
     powers = p ** (1 / temperature)
+    if not powers.any():  # all underflow
+        powers = (p / p.max()) ** (1 / temperature)
     return powers / powers.sum()
 
 

@@ -112,6 +112,11 @@ class Alternatives(NamedTuple):
     partitions: np.ndarray  #: (p, k) object of each cell in each partition, 1, 2, ...
 
 
+def _share(marks: Sequence[np.ndarray] | np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Share (m,) of the samples that have a mark, from the marks (s, m) bool and the weights (s,), None if equal."""
+    return np.mean(marks, axis=0) if weights is None else weights @ np.asarray(marks, dtype=float)
+
+
 @dataclass(frozen=True, eq=False)
 class Cells:
     """The common refinement of samples and predictions."""
@@ -120,14 +125,21 @@ class Cells:
     of_reading: np.ndarray  #: (m,) cell of each reading, -1 for readings of no object
     samples: np.ndarray  #: (s, K) label of each cell in each sample
     predictions: np.ndarray  #: (n, K) label of each cell in each prediction, 0 is none
+    weights: np.ndarray | None = None  #: (s,) weights of the samples; None if they are equal
 
     @classmethod
-    def of(cls, readings: Readings, samples: Sequence[np.ndarray], predictions: Sequence[np.ndarray]) -> Cells:
+    def of(
+        cls,
+        readings: Readings,
+        samples: Sequence[np.ndarray],
+        predictions: Sequence[np.ndarray],
+        weights: np.ndarray | None = None,
+    ) -> Cells:
         """Cells from the labels (m,) of the readings in each sample and each prediction; 0 means no object.
 
-        Readings that most samples assign to no object belong to no cell.
+        Readings that most samples, by weight, assign to no object belong to no cell.
         """
-        kept = np.mean([labels > 0 for labels in samples], axis=0) >= 0.5
+        kept = _share([labels > 0 for labels in samples], weights) >= 0.5
         segments = [labels[kept] for labels in samples]
         in_segments = common_refinement(segments).cells
         objects = [_extended(in_segments, labels[kept]) for labels in predictions]
@@ -137,7 +149,7 @@ class Cells:
         of_reading[kept] = np.unique(cell, return_inverse=True)[1]
         example = _examples(cell, exact)
         labels = np.stack([*segments, *objects])[:, example]
-        return cls(readings, of_reading, labels[: len(segments)], labels[len(segments) :])
+        return cls(readings, of_reading, labels[: len(segments)], labels[len(segments) :], weights)
 
     @cached_property
     def sizes(self) -> np.ndarray:
@@ -329,7 +341,7 @@ class PairEvidence(PairOdds):
     def terms(self, cells: Cells, weights: np.ndarray) -> PairTerms:
         """The terms of the log odds, not yet multiplied by the coefficients."""
         in_samples = _labels_of_pairs(cells.samples, cells.pairs)
-        image = softened_logit(np.mean(in_samples.same, axis=0))
+        image = softened_logit(_share(in_samples.same, cells.weights))
         in_predictions = _labels_of_pairs(cells.predictions, cells.pairs)
         explained, same = weights @ in_predictions.both, weights @ in_predictions.same
         share = np.divide(same, explained, out=np.full(len(image), 0.5), where=explained > 0)

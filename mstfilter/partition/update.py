@@ -183,7 +183,9 @@ class PartitionUpdate(Update):
             if proposed is None:
                 return projected
             predictions = self._predictions(predicted, projected, readings, observation.after)
-            cells = Cells.of(readings, _segments(proposed, readings, raised), [one.objects for one in predictions])
+            segments = _segments(proposed, readings, raised)
+            weights = proposed.weights if np.ptp(proposed.log_weights) else None
+            cells = Cells.of(readings, segments, [one.objects for one in predictions], weights)
             choices = self._choices(cells, predictions, projected.log_weights, mended)
             described = choices.described(projected)
             objects_of = partial(self._associate, cells, predictions, choices)

@@ -107,13 +107,6 @@ def _keep_font_size(match: re.Match[str]) -> str:
     return "" if size is None else f"font-size: {size[1]}px;"
 
 
-def _pause_axis(axes: Axes, times: Sequence[int]) -> None:
-    axes.set_xlim(min(times) - 0.5, max(times) + 0.5)
-    step = max(1, len(times) // 12)
-    axes.set_xticks(list(times)[::step])
-    axes.set_xlabel("pause")
-
-
 def quality_figure(
     times: Sequence[int],
     qualities: Sequence[Sequence[float]],
@@ -139,7 +132,9 @@ def quality_figure(
         axes.plot(times, mean, color=_ACCENT, lw=2, marker="o", ms=4.5, label="mean over hypotheses")
         axes.scatter([], [], s=30, color=_ACCENT, alpha=0.4, lw=0, label="hypothesis")
         axes.set_ylim(0, 1.02)
-        _pause_axis(axes, times)
+        axes.set_xlim(min(times) - 0.5, max(times) + 0.5)
+        axes.set_xticks(list(times)[:: max(1, len(times) // 12)])
+        axes.set_xlabel("pause")
         axes.set_title("Quality against the ground truth")
         figure.legend(loc="outside lower center", ncols=3, handlelength=2.2, columnspacing=1.4)
         return _svg_text(figure, "Quality of the hypotheses over time")

@@ -232,11 +232,7 @@ def _normals(points: np.ndarray, rays: np.ndarray, grid: VoxelGrid) -> np.ndarra
 def _lines(labels: np.ndarray, side: np.ndarray, hit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels on the borders of faces within an object, and pixels on the borders of objects."""
     crease, border = np.zeros(hit.shape, bool), np.zeros(hit.shape, bool)
-    for axis in (0, 1):
-        a = [slice(None)] * 2
-        b = [slice(None)] * 2
-        a[axis], b[axis] = slice(None, -1), slice(1, None)
-        first, second = tuple(a), tuple(b)
+    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         other = labels[first] != labels[second]
         border[first] |= other & hit[first]
         border[second] |= other & hit[second]

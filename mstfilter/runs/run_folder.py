@@ -139,10 +139,6 @@ class _PosedCamera(CameraFile):
     T_world_camera: list[list[float]]
 
 
-class _SecondsFile(RootModel[dict[str, float]]):
-    pass
-
-
 @dataclass(frozen=True)
 class HypothesisCodec(Codec):
     """Converts hypotheses on one grid to arrays and back without loss."""
@@ -311,7 +307,7 @@ class RunFolder:
 
     def seconds(self, t: int) -> dict[str, float]:
         """Wall time of the step by component, in seconds."""
-        return self._read(self.pause(t) / "seconds.json", _SecondsFile)
+        return self._read(self.pause(t) / "seconds.json", RootModel[dict[str, float]])
 
     def instance(self, t: int) -> np.ndarray | None:
         """True label image (H, W) at a pause, with 255 for the robot; None if unknown."""

@@ -10,7 +10,7 @@ import pickle
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import PurePath
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,30 @@ def _code(cls: type) -> str:
     values = [value for base in own for value in vars(base).values()]
     inner = [getattr(v, "fget", None) or getattr(v, "func", None) or getattr(v, "__func__", v) for v in values]
     inner = [inspect.unwrap(v) if callable(v) else v for v in inner]  # methods whose results are checked
-    return "".join(_text(value.__code__) for value in inner if hasattr(value, "__code__"))
+    seen: set[CodeType] = set()
+    return "".join(_with_globals(value, seen) for value in inner if isinstance(value, FunctionType))
+
+
+def _with_globals(function: FunctionType, seen: set[CodeType]) -> str:
+    """The code of a function, and the constants and functions that the function names."""
+    seen.add(function.__code__)
+    text = _text(function.__code__)
+    for name in _names(function.__code__):
+        value = function.__globals__.get(name)
+        if isinstance(value, FunctionType) and value.__code__ not in seen:
+            same_module = value.__globals__ is function.__globals__
+            text += _with_globals(value, seen) if same_module else _text(value.__code__)
+        elif all(isinstance(v, (str, bytes, int, float)) for v in (value if isinstance(value, tuple) else [value])):
+            text += repr(value)
+        elif isinstance(value, np.ndarray):
+            text += content_key(value).hex()
+    return text
+
+
+def _names(code: CodeType) -> list[str]:
+    """The names in compiled code, and in the code of inner functions."""
+    inner = [part for part in code.co_consts if isinstance(part, CodeType)]
+    return [*code.co_names, *(name for part in inner for name in _names(part))]
 
 
 def _text(constant: Any) -> str:

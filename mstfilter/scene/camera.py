@@ -199,11 +199,18 @@ def scaled_area(pixels: float, n_pixels: int) -> float:
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1)) -> RigidTransform:
-    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), with `up` at the image top."""
+    """Pose `T_world_camera` of a camera at `position` (m) that looks at `target` (m), with `up` at the image top.
+
+    If the camera looks along `up`, the y axis of the world is at the image top.
+    """
     position = np.asarray(position, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - position
+    if not np.linalg.norm(forward) > 0:
+        raise InputError(f"camera and target are both at {position.tolist()}", "give two different points")
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9 * np.linalg.norm(up):
+        right = np.cross(forward, (0, 1, 0))
     right /= np.linalg.norm(right)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
@@ -229,8 +236,9 @@ def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform
         )
     R = matrix[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        left_handed = bool(np.linalg.det(R) < 0)
         raise InputError(
-            f"{where} is not a rigid transform: {matrix.tolist()}",
+            f"{where} is not a rigid transform{', its axes are left-handed' * left_handed}: {matrix.tolist()}",
             "expected a 4x4 matrix with a rotation in its upper left and last row 0 0 0 1",
         )
     return RigidTransform.from_matrix(matrix)

@@ -256,6 +256,8 @@ class Frame:
         depth = depth.astype(np.float32, copy=True)
         with np.errstate(invalid="ignore"):
             depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+        if np.isfinite(some := depth[::4, ::4]).any():
+            check_depth(some, "depth image of the frame")
         object.__setattr__(self, "rgb", frozen(rgb))
         object.__setattr__(self, "depth", read_only(depth))
         if self.robot_mask is not None:
@@ -339,7 +341,8 @@ class Clip:
     grid : VoxelGrid
         The workspace.
     index : int
-        Number of the pause at the end of the clip, starting from 0.
+        Number of the pause at the end of the clip, starting from 0. The identities of new objects depend on this
+        number, so the numbers of successive clips have to ascend.
     times : tuple of float, optional
         Time of each frame in seconds.
     """

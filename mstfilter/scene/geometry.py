@@ -12,6 +12,7 @@ function to disparity. Its unit is 1/8 pixel of a Kinect (f = 525 pixels, b = 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,11 +41,6 @@ class FrameGeometry:
         """(X, Y, Z) bool: voxel centres more than `margin` metres in front of the measured surface."""
         with np.errstate(invalid="ignore"):
             return self.signed < -np.asarray(margin, dtype=np.float32)
-
-    @property
-    def unknown(self) -> np.ndarray:
-        """(X, Y, Z) bool: voxel centres at pixels without a measured depth."""
-        return np.isnan(self.signed)
 
 
 def frame_geometry(frame: Frame, grid: VoxelGrid) -> FrameGeometry:
@@ -81,7 +77,6 @@ class SupportPlane:
     #: Camera pose in world axes of the plane: the plane is at z = 0, z is its normal; the origin is at the
     #: median of its pixels, y points away from the camera.
     T_world_camera: RigidTransform
-    on_or_behind: np.ndarray  #: (H, W) bool, readings on the plane or behind it
     #: (H, W) float32, measured minus plane disparity, in 1/8 pixels; positive is in front of the plane (above it),
     #: NaN is unknown.
     residual: np.ndarray
@@ -94,7 +89,9 @@ def disparity(depth: np.ndarray) -> np.ndarray:
 
 _N_TRIALS = 400  # minimal sets of RANSAC
 _INLIER = 1.5  # largest residual of an inlier, in 1/8 pixels
-_TOLERANCE = 2.0  # readings up to this much in front of the plane count as on it, in 1/8 pixels
+_SHIFTS = 16  # pixels of an image of 320 columns
+_MIN_EDGES = 120  # pixels of depth edges; fewer are taken for noise
+_BOX = np.ones((3, 3), np.uint8)
 _MIN_SHARE = 0.1  # smallest share of inliers among the readings
 
 
@@ -140,10 +137,8 @@ def _fit(frame: Frame) -> SupportPlane:
         )
     rows, columns = np.mgrid[: D.shape[0], : D.shape[1]]
     residual = (D - (plane[0] * columns + plane[1] * rows + plane[2])).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        on_or_behind = residual < _TOLERANCE
     pose = _pose(frame.camera, plane, np.stack([u, v], axis=1)[close])
-    return SupportPlane(pose, read_only(on_or_behind), read_only(residual))
+    return SupportPlane(pose, read_only(residual))
 
 
 def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransform:
@@ -241,3 +236,59 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     centre = np.clip(np.percentile(chosen, (2, 98), axis=0).mean(axis=0), *reach)
     origin = np.append(np.round((centre - side / 2) / voxel_size) * voxel_size, 0.0)
     return VoxelGrid(origin, voxel_size, (*map(round, side / voxel_size), round(_HEIGHT / voxel_size)))
+
+
+class Edges:
+    """Image of depth edges (H, W) float32, 0 or 1, and ranks (H, W) of the colour gradients of all pixels, 0 to 1."""
+
+    def __init__(self, frame: Frame) -> None:
+        import cv2
+
+        depth = np.where(frame.valid, frame.depth, np.nan)
+        near, far = cv2.erode(np.nan_to_num(depth, nan=9.0), _BOX), cv2.dilate(np.nan_to_num(depth, nan=0.0), _BOX)
+        known = cv2.erode(frame.valid.astype(np.uint8), _BOX) > 0
+        self.depth = (known & (far - near > 0.03 + 0.02 * near)).astype(np.float32)
+        margin = np.zeros_like(self.depth)
+        inner = slice(_SHIFTS, -_SHIFTS)
+        margin[inner, inner] = self.depth[inner, inner]
+        self.depth = margin
+        rgb = cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.float32)
+        across, down = np.abs(np.diff(rgb, axis=1, append=rgb[:, -1:])), np.abs(np.diff(rgb, axis=0, append=rgb[-1:]))
+        gradient = np.maximum(across, down).max(axis=2)
+        levels = np.sort(gradient, axis=None)
+        self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
+
+    def under(self, other: Edges) -> np.ndarray:
+        """(33, 33): sum of the colour ranks of `other` at the depth edges, for each shift of -16 to 16 pixels."""
+        import cv2
+
+        inner = slice(_SHIFTS, -_SHIFTS)
+        return np.asarray(cv2.matchTemplate(other.rank, self.depth[inner, inner], cv2.TM_CCORR))
+
+
+def edge_agreement(edges: Sequence[Edges]) -> tuple[float, float, tuple[int, int], float]:
+    """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
+
+    The first two values are the best agreement minus the median over all shifts, and its relative loss without a
+    shift. The third is the best shift (rows, columns) in pixels of an image with 320 columns. The fourth is the
+    increase of the agreement if the depth images of different pauses are exchanged.
+    """
+    edges = [edge for edge in edges if min(edge.depth.shape) >= 4 * _SHIFTS]
+    count = sum(float(edge.depth.sum()) for edge in edges)
+    if count < _MIN_EDGES:
+        return 0.0, 0.0, (0, 0), 0.0
+
+    def agreement(order: Sequence[int]) -> np.ndarray:
+        return np.sum([edges[i].under(edges[j]) for i, j in enumerate(order)], axis=0) / count
+
+    def unshifted(scores: np.ndarray) -> float:
+        return float(scores[_SHIFTS - 1 : _SHIFTS + 2, _SHIFTS - 1 : _SHIFTS + 2].max())
+
+    n, scores = len(edges), agreement(range(len(edges)))
+    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    base, top = float(np.median(scores)), float(scores.max())
+    lost = (top - unshifted(scores)) / max(top - base, 1e-9)
+    orders = [range(n - 1, -1, -1), [*range(1, n), 0], [n - 1, *range(n - 1)]] if n > 1 else []
+    best = max((unshifted(agreement(order)) for order in orders), default=0.0)
+    top = max(top, best)
+    return top - base, lost, (int(row) - _SHIFTS, int(column) - _SHIFTS), best - unshifted(scores)

@@ -90,6 +90,7 @@ def common_refinement(segmentations: Sequence[np.ndarray]) -> CommonRefinement:
 
 def _renumbered(codes: np.ndarray) -> tuple[int, np.ndarray]:
     """The number of distinct nonzero codes, and the codes renumbered 1, 2, ... in ascending order. Code 0 stays 0."""
+    codes = codes.astype(np.int64, copy=False)
     if codes.max(initial=0) > 8 * len(codes) + 1000:  # too large for a table
         codes = np.unique(np.append(codes, 0), return_inverse=True)[1][:-1]
     number = np.zeros(codes.max(initial=0) + 1, np.int64)

@@ -21,7 +21,14 @@ from mstfilter.errors import InputError, warn_user
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
-from mstfilter.scene.geometry import SupportPlane, fit_support_plane, in_columns, shares_with_depth
+from mstfilter.scene.geometry import (
+    Edges,
+    SupportPlane,
+    edge_agreement,
+    fit_support_plane,
+    in_columns,
+    shares_with_depth,
+)
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _Limits = tuple[float, float]
@@ -43,9 +50,9 @@ _MIN_READINGS = 30  # of an image of 160 columns; fewer are taken for noise
 _TALL, _UPRIGHT = 0.35, 0.5  # metres, cosine: see `_other_support`
 # Tilt in degrees, height and shift in metres of the camera between pauses: warning; twice: stop.
 _DRIFT = (2.0, 0.02, 0.015)
+_TABLE_LEFT = 0.3  # of the readings on the table at the first pause, below which a pause shows no table
 _MIN_MOVED = 15  # matched corners that agree with a moved camera
 _PEAK, _EXCESS, _ORDER = 0.15, 0.2, 0.015  # of the rank of colour edges below depth edges: see `_registration`
-_SHIFTS = 16  # pixels of an image of 320 columns
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,8 @@ def examine(
         looks = [Look(frames[p], grid, p) for p in pauses]
         found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
     if not any(finding.stop for finding in found):
-        found += [*_support(looks[0]), *_scale(looks[0]), *_missing(looks), *_workspace(looks), *_moved(looks)]
+        found += [*_support(looks[0]), *_scale(looks[0]), *_missing(looks), *_constant(looks[0])]
+        found += [*_workspace(looks), *_moved(looks)]
         found += [*_registration(looks), *_repeated(looks), *_one_pause(frames, pauses)]
         for view in frames[pauses[0]].views:
             doubts = [*_intrinsics(view.camera), *unreadable(view, "the image")]
@@ -127,7 +135,7 @@ class Look:
 
     def __init__(self, frame: Frame, grid: VoxelGrid, index: int = 0) -> None:
         self.index, self.grid = index, grid
-        self.frame, self.edges = _sampled(frame, 160), _Edges(_sampled(frame, 320))
+        self.frame, self.edges = _sampled(frame, 160), Edges(_sampled(frame, 320))
         self.corners = _Corners(_sampled(frame, 640), grid)
         self.points = self.frame.points[self.frame.valid]
         self.known = shares_with_depth(self.frame, grid)
@@ -244,7 +252,12 @@ def _support(first: Look) -> Iterator[Finding]:
         f"check K: its focal length is {camera.K[0, 0] / camera.width:.3g} of the width of the images",
         _CHECK_SCALE,
     )
-    if table is not None and (table[0] > _MAX_TILT or abs(table[1]) > _MAX_HEIGHT):
+    middle = np.median(first.frame.depth[first.frame.valid])
+    inverse = _share_on_plane(first.frame, middle**2 / first.frame.depth)
+    if inverse > 0.3 and inverse > 0.1 + _share_on_plane(first.frame):
+        text = "inverse depth has a larger plane than depth: the depth images seem to contain disparity or 1 / depth"
+        yield _stop(text, "convert them to metres: focal length in pixels * baseline in metres / disparity in pixels")
+    elif table is not None and (table[0] > _MAX_TILT or abs(table[1]) > _MAX_HEIGHT):
         text = f"the table in the depth image is tilted by {table[0]:.1f} degrees and at z = {table[1]:.3f} m"
         impossible = table[0] > 2 * _MAX_TILT or abs(table[1]) > 2 * _MAX_HEIGHT
         yield Finding(impossible, f"{text}, expected z = 0", hints)
@@ -253,6 +266,15 @@ def _support(first: Look) -> Iterator[Finding]:
         yield _stop(f"no table is at z = 0: {text}", *hints)
     else:
         yield from _other_support(first)
+
+
+def _share_on_plane(frame: Frame, depth: np.ndarray | None = None) -> float:
+    """Share of the readings on the largest plane, of a frame or of its colour image with other depth (H, W)."""
+    try:
+        plane = fit_support_plane(frame if depth is None else Frame(frame.rgb, depth, frame.camera))
+    except InputError:
+        return 0.0
+    return float((np.abs(plane.residual[frame.valid]) < 2).mean())
 
 
 def _other_support(first: Look) -> Iterator[Finding]:
@@ -285,9 +307,11 @@ def _scale(first: Look) -> Iterator[Finding]:
     z = float(np.median(depth[first.on_table] if first.on_table.mean() > _MIN_ON_TABLE else depth))
     possible = (_VOXELS_IN_DISTANCE * size, float(np.sqrt(_NOISE_IN_VOXELS * size / depth_sigma(1.0))))
     text = f"the table is {z:.3g} m from the camera, expected {_DISTANCES[0]:g} to {_DISTANCES[1]:g} m"
-    voxels = "larger" if z > possible[1] else "smaller"
-    right = f"if the distance is right, give a workspace with {voxels} voxels"
-    yield from _limited(z, _DISTANCES, possible, text, _CHECK_SCALE, right)
+    hints = [_CHECK_SCALE]
+    if not possible[0] <= z <= possible[1]:
+        size_of = "larger" if z > possible[1] else "smaller"
+        hints.append(f"if the distance is right, give a workspace with {size_of} voxels")
+    yield from _limited(z, _DISTANCES, possible, text, *hints)
     raised = first.in_columns & (first.points[:, 2] > _MIN_HEIGHT)
     above = first.points[raised, 2] > first.grid.upper[2]
     if raised.sum() >= _MIN_READINGS and above.mean() > 0.5:
@@ -305,9 +329,23 @@ def _missing(looks: Sequence[Look]) -> Iterator[Finding]:
         yield _warning(text.format(least.index, *least.known), hint)
 
 
+def _constant(look: Look) -> Iterator[Finding]:
+    """A finding if many readings beside the table have one value, and few have a similar value."""
+    depth = look.frame.depth[look.frame.valid]
+    values, counts = np.unique(depth, return_counts=True)
+    value, count = values[counts.argmax()], counts.max()
+    similar = np.abs(depth - value) < 0.03 * value
+    if count > 0.01 * look.frame.depth.size and similar.sum() < 1.2 * count and look.on_table[similar].mean() < 0.5:
+        text = f"{count / look.frame.depth.size:.0%} of the pixels of frame {look.index} have the depth {value:.4g} m"
+        yield _warning(text, "is this value the mark for missing depth? set these pixels to 0 or NaN")
+
+
 def _workspace(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A finding if the workspace is beside the table, or below or above the objects."""
+    """Findings if the workspace is beside the table, starts above it, or is below or above the objects."""
     grid, texts = looks[0].grid, []
+    if grid.origin[2] > _ON_TABLE:
+        text = f"the workspace starts at z = {grid.origin[2]:.3g} m, so the lower parts of objects are cut off"
+        yield _warning(text, "start it at z = 0, the height of the table")
     inside = (look.points[grid.contains(grid.index_of(look.points)), 2] for look in looks)
     if any((heights > _MIN_HEIGHT).sum() >= _MIN_READINGS for heights in inside):
         return
@@ -379,83 +417,28 @@ def drift(first: Look, look: Look) -> tuple[float, float, float]:
 
 def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
     """A finding for the first pause at which the camera is not at its given pose."""
+    hints = (
+        "fix the camera, or give its pose in every frame: T_world_camera of shape (T, 4, 4)",
+        "poses of the camera map its points to the world, in metres; check that they belong to these frames",
+    )
     for look in looks[1:]:
+        if looks[0].table and not look.table and look.on_table.mean() < _TABLE_LEFT * looks[0].on_table.mean():
+            text = f"frame {look.index} shows no table at z = 0, but frame {looks[0].index} does"
+            yield _stop(f"{text}: the camera or its pose is wrong", *hints)
+            return
         found = drift(looks[0], look)
         size = max(value / limit for value, limit in zip(found, _DRIFT, strict=True))
         if size > 1:
             text = f"the camera moves from frame {looks[0].index} to {look.index}, but not its pose: the table is "
             text += f"tilted by {found[0]:.1f} degrees and {found[1]:.3f} m higher, still corners are shifted by "
             text += f"{found[2]:.3f} m"
-            hints = (
-                "fix the camera, or give its pose in every frame: T_world_camera of shape (T, 4, 4)",
-                "poses of the camera map its points to the world, in metres; check that they belong to these frames",
-            )
             yield Finding(size > 2, text, hints)
             return
 
 
-class _Edges:
-    """Image of depth edges (H, W) float32, 0 or 1, and ranks (H, W) of the colour gradients of all pixels, 0 to 1."""
-
-    def __init__(self, frame: Frame) -> None:
-        import cv2
-
-        depth = np.where(frame.valid, frame.depth, np.nan)
-        near, far = cv2.erode(np.nan_to_num(depth, nan=9.0), _BOX), cv2.dilate(np.nan_to_num(depth, nan=0.0), _BOX)
-        known = cv2.erode(frame.valid.astype(np.uint8), _BOX) > 0
-        self.depth = (known & (far - near > 0.03 + 0.02 * near)).astype(np.float32)
-        margin = np.zeros_like(self.depth)
-        inner = slice(_SHIFTS, -_SHIFTS)
-        margin[inner, inner] = self.depth[inner, inner]
-        self.depth = margin
-        rgb = cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.float32)
-        across, down = np.abs(np.diff(rgb, axis=1, append=rgb[:, -1:])), np.abs(np.diff(rgb, axis=0, append=rgb[-1:]))
-        gradient = np.maximum(across, down).max(axis=2)
-        levels = np.sort(gradient, axis=None)
-        self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
-
-    def under(self, other: _Edges) -> np.ndarray:
-        """(33, 33): sum of the colour ranks of `other` at the depth edges, for each shift of -16 to 16 pixels."""
-        import cv2
-
-        inner = slice(_SHIFTS, -_SHIFTS)
-        return np.asarray(cv2.matchTemplate(other.rank, self.depth[inner, inner], cv2.TM_CCORR))
-
-
-_BOX = np.ones((3, 3), np.uint8)
-
-
-def edge_agreement(looks: Sequence[Look]) -> tuple[float, float, tuple[int, int], float]:
-    """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
-
-    The first two values are the best agreement minus the median over all shifts, and its relative loss without a
-    shift. The third is the best shift (rows, columns) in pixels of an image with 320 columns. The fourth is the
-    increase of the agreement if the depth images of different pauses are exchanged.
-    """
-    edges = [look.edges for look in looks if min(look.frame.depth.shape) > _SHIFTS]
-    count = sum(float(edge.depth.sum()) for edge in edges)
-    if count < 4 * _MIN_READINGS or min(edges[0].depth.shape) < 4 * _SHIFTS:
-        return 0.0, 0.0, (0, 0), 0.0
-
-    def agreement(order: Sequence[int]) -> np.ndarray:
-        return np.sum([edges[i].under(edges[j]) for i, j in enumerate(order)], axis=0) / count
-
-    def unshifted(scores: np.ndarray) -> float:
-        return float(scores[_SHIFTS - 1 : _SHIFTS + 2, _SHIFTS - 1 : _SHIFTS + 2].max())
-
-    n, scores = len(edges), agreement(range(len(edges)))
-    row, column = np.unravel_index(scores.argmax(), scores.shape)
-    base, top = float(np.median(scores)), float(scores.max())
-    lost = (top - unshifted(scores)) / max(top - base, 1e-9)
-    orders = [range(n - 1, -1, -1), [*range(1, n), 0], [n - 1, *range(n - 1)]] if n > 1 else []
-    best = max((unshifted(agreement(order)) for order in orders), default=0.0)
-    top = max(top, best)
-    return top - base, lost, (int(row) - _SHIFTS, int(column) - _SHIFTS), best - unshifted(scores)
-
-
 def _registration(looks: Sequence[Look]) -> Iterator[Finding]:
     """A finding if the edges of the depth image and of the colour image of a pause are not at the same pixels."""
-    peak, lost, shift, rise = edge_agreement(looks)
+    peak, lost, shift, rise = edge_agreement([look.edges for look in looks])
     if peak < _PEAK:
         return
     if rise > _ORDER:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, overload
@@ -120,12 +121,11 @@ class Recording:
             raise InputError(f"recording {self.name} has {n} frames and {len(pauses)} pauses, expected at least 1")
         if list(pauses) != sorted(set(pauses)) or pauses[0] < 0 or pauses[-1] >= n:
             raise InputError(f"pauses of recording {self.name} are {pauses}, expected ascending indices below {n}")
-        if (
-            len(self.times) != n
-            or not np.isfinite(self.times).all()
-            or any(b <= a for a, b in zip(self.times, self.times[1:], strict=False))
-        ):
+        if len(self.times) != n or not np.isfinite(self.times).all():
             raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
+        for k, (a, b) in enumerate(pairwise(self.times)):
+            if b <= a:
+                raise InputError(f"times of recording {self.name} do not ascend: frames {k}, {k + 1} at {a}, {b} s")
         object.__setattr__(self, "pauses", pauses)
 
     def __repr__(self) -> str:

@@ -58,6 +58,13 @@ class BeliefScore(NamedTuple):
         return table.with_forecasts(np.full(len(table.p), table.yes.sum() / table.n)).log_loss()
 
 
+def check_normalised(weights: np.ndarray, n: int, where: str) -> None:
+    """Raise InputError unless there are `n` > 0 weights that are not negative and have the sum 1."""
+    w = np.asarray(weights, dtype=np.float64)
+    if n == 0 or w.shape != (n,) or not (w >= 0).all() or not np.isclose(w.sum(), 1):
+        raise InputError(f"{where}: {n} with the weights {w.tolist()}", "give one weight for each, with the sum 1")
+
+
 def score_belief(
     questions: Questions, hypotheses: Sequence[np.ndarray | Hypothesis], weights: np.ndarray, truth: np.ndarray
 ) -> BeliefScore:
@@ -72,8 +79,7 @@ def score_belief(
     truth : (X, Y, Z) int
     """
     weights = np.asarray(weights, dtype=np.float64)
-    if len(hypotheses) != len(weights) or not len(hypotheses):
-        raise InputError(f"there are {len(hypotheses)} hypotheses and {len(weights)} weights")
+    check_normalised(weights, len(hypotheses), "hypotheses")
     if not len(questions):
         unknown = dict.fromkeys(("brier", "log_loss", "calibration_error"), float("nan"))
         return BeliefScore(unknown, np.zeros((len(NOISE_RATES), *NO_COUNTS.shape), np.int32))

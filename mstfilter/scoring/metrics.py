@@ -22,10 +22,11 @@ which is 0 if all hypotheses are identical.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
-from mstfilter.scene import occupied_box
+from mstfilter.scene import common_refinement, occupied_box
 from mstfilter.scoring.quality import (
     FORMS,
     STATUSES,
@@ -36,6 +37,7 @@ from mstfilter.scoring.quality import (
     quality_of,
     weighted_coverage,
 )
+from mstfilter.smc import first_seen
 
 _MOST = 0.5
 _FRAGMENT = 0.1
@@ -57,7 +59,8 @@ def pause_metrics(
         True label -> visible, hidden or unseen; empty if unknown.
     """
     (truth, *labels), n_free = _cropped([truth, *labels])
-    distinct, which = _distinct(labels)
+    which = first_seen(one.tobytes() for one in labels)
+    distinct = [labels[k] for k in np.unique(which, return_index=True)[1]]
     tables = [overlap(one, truth) for one in distinct]
     if n_free:  # the cropped grids have free voxels, too
         for table in tables:
@@ -105,23 +108,9 @@ def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
     return cut, occupied.size - cut[0].size
 
 
-def _distinct(labels: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """The distinct arrays, and the index (n,) of each array among them."""
-    found: dict[bytes, int] = {}
-    which = np.array([found.setdefault(one.tobytes(), len(found)) for one in labels])
-    return [labels[int(np.flatnonzero(which == k)[0])] for k in range(len(found))], which
-
-
-def _objects(table: Overlap) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Intersections (na, nb), sizes (na,) and (nb,), and intersections over union of objects, without label 0."""
-    rows, columns = table.labels_a > 0, table.labels_b > 0
-    box = np.ix_(rows, columns)
-    return table.counts[box], table.sizes_a[rows], table.sizes_b[columns], table.jaccard()[box]
-
-
 def coverage_of(table: Overlap, labels: Sequence[int]) -> float:
     """Largest IoU of each true object in `labels` with an object, averaged by size; NaN without such objects."""
-    _, _, sizes, jaccard = _objects(table)
+    _, _, sizes, jaccard = table.objects()
     chosen = np.isin(table.labels_b[table.labels_b > 0], np.asarray(labels, dtype=np.int64))
     if not chosen.any():
         return float("nan")
@@ -142,7 +131,7 @@ def object_metrics(table: Overlap) -> dict[str, float]:
     For ``object_f``, objects are matched by an intersection over union above 0.5, so that no object matches twice
     (Kirillov et al. 2019). ``occupancy`` and ``object_f`` are 1 if neither the truth nor the hypothesis has objects.
     """
-    counts, sizes_a, sizes_b, jaccard = _objects(table)
+    counts, sizes_a, sizes_b, jaccard = table.objects()
     found, true, both = float(sizes_a.sum()), float(sizes_b.sum()), float(counts.sum())
     n = len(sizes_a) + len(sizes_b)
     lies = counts > _MOST * sizes_a[:, None]
@@ -162,21 +151,19 @@ def object_metrics(table: Overlap) -> dict[str, float]:
 
 
 def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
-    """Quality (n, n) of all pairs of hypotheses, in the form ``objects``; 1 on the diagonal."""
-    n = len(labels)
-    stacked = np.stack([np.asarray(one).ravel() for one in labels])
-    # Voxels with equal labels in all hypotheses form a pattern; the voxels of each pattern are counted once.
-    patterns, sizes = _patterns(stacked[:, (stacked > 0).any(axis=0)])
-    compact = [np.unique(np.append(row, 0), return_inverse=True) for row in patterns]
-    found = np.eye(n)
-    for a in range(n):
-        for b in range(a):
-            (labels_a, in_a), (labels_b, in_b) = compact[a], compact[b]
-            shape = len(labels_a), len(labels_b)
-            counts = np.bincount(in_a[:-1] * shape[1] + in_b[:-1], sizes, shape[0] * shape[1]).reshape(shape)
-            counts[0, 0] = 1.0  # free in both: of no effect, but no region may be empty
-            found[a, b] = found[b, a] = quality_of(Overlap(labels_a, labels_b, counts))
-    return found
+    """Quality (n, n) of all pairs of label grids of one shape, in the form ``objects``; 1 on the diagonal."""
+    refined = common_refinement(labels)
+    common = refined.overlaps()[1:, 1:]
+    sizes = common.diagonal().copy()
+    jaccard = common / (sizes[:, None] + sizes - common)
+    objects = [slice(a, b) for a, b in pairwise(refined.first)]  # of each hypothesis
+    best = np.stack([jaccard[:, k].max(axis=1, initial=0.0) for k in objects], axis=1)
+    volumes = np.array([sizes[k].sum() for k in objects])
+    covered = np.stack([sizes[k] @ best[k] for k in objects]) / np.maximum(volumes, 1)[:, None]
+    quality = (covered + covered.T) / 2
+    empty = volumes == 0
+    quality[np.ix_(empty, empty)] = 1.0  # an empty and another hypothesis have quality 0
+    return np.asarray(quality)
 
 
 def least_loss(labels: Sequence[np.ndarray], weights: np.ndarray) -> int:
@@ -192,13 +179,3 @@ def diversity(quality: np.ndarray) -> float:
     """1 - mean quality over all pairs of hypotheses, from `pairwise_quality` (n, n); NaN for a single hypothesis."""
     n = len(quality)
     return float((1 - quality).sum() / (n * (n - 1))) if n > 1 else float("nan")
-
-
-def _patterns(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct columns of an array (k, m) of small integers, and the number of times that each column occurs."""
-    code = np.zeros(columns.shape[1], np.int64)
-    for row in columns:  # renumbered after each row to keep the code small
-        code = code * (int(row.max(initial=0)) + 1) + row
-        _, code = np.unique(code, return_inverse=True)
-    _, first, sizes = np.unique(code, return_index=True, return_counts=True)
-    return columns[:, first], sizes.astype(np.float64)

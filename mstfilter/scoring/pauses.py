@@ -24,7 +24,7 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, render
-from mstfilter.scoring.log_loss import score_belief
+from mstfilter.scoring.log_loss import check_normalised, score_belief
 from mstfilter.scoring.metrics import diversity, least_loss, pairwise_quality, pause_metrics
 from mstfilter.scoring.quality import FORMS, connected_components, object_status, one_blob, weighted_coverage
 from mstfilter.scoring.questions import Questions, ask
@@ -45,13 +45,18 @@ class PauseEstimate:
     frame : int
         Frame of the recording at this pause.
     grid : VoxelGrid, optional
-        Grid of the arrays.
+        Grid of the arrays. The default is the grid of the first `Hypothesis`.
     """
 
     hypotheses: Sequence[Hypothesis | np.ndarray]
     weights: np.ndarray
     frame: int
     grid: VoxelGrid | None = None
+
+    def __post_init__(self) -> None:
+        check_normalised(self.weights, len(self.hypotheses), f"hypotheses at frame {self.frame}")
+        grids = [one.grid for one in self.hypotheses if isinstance(one, Hypothesis)]
+        object.__setattr__(self, "grid", self.grid or next(iter(grids), None))
 
     @property
     def labels(self) -> list[np.ndarray]:

@@ -79,6 +79,12 @@ class Overlap:
         union = self.sizes_a[:, None] + self.sizes_b[None, :] - self.counts
         return self.counts / union
 
+    def objects(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Intersections (na, nb), sizes (na,), (nb,), and intersections over union of objects, without label 0."""
+        rows, columns = self.labels_a > 0, self.labels_b > 0
+        box = np.ix_(rows, columns)
+        return self.counts[box], self.sizes_a[rows], self.sizes_b[columns], self.jaccard()[box]
+
 
 def overlap(a: np.ndarray, b: np.ndarray) -> Overlap:
     """The contingency table of two label arrays of the same shape, in one pass."""
@@ -117,25 +123,17 @@ def quality_of(table: Overlap, form: Form = "objects") -> float:
     if form not in FORMS:
         raise InputError(f"quality has no form {form!r}", f"there are: {', '.join(FORMS)}")
     if form == "paper":
-        best = table.jaccard()
-        total = table.counts.sum()
-        if total == 0:
-            return 1.0
-        side_a = (table.sizes_a * best.max(axis=1)).sum()
-        side_b = (table.sizes_b * best.max(axis=0)).sum()
-        return float((side_a + side_b) / (2 * total))
-
-    jaccard, sizes_a, sizes_b = table.jaccard(), table.sizes_a, table.sizes_b
-    rows, columns = table.labels_a > 0, table.labels_b > 0
-    volume_a, volume_b = sizes_a[rows].sum(), sizes_b[columns].sum()
+        sizes_a, sizes_b, jaccard = table.sizes_a, table.sizes_b, table.jaccard()
+    else:
+        _, sizes_a, sizes_b, jaccard = table.objects()
+    volume_a, volume_b = sizes_a.sum(), sizes_b.sum()
     if volume_a == 0 or volume_b == 0:
         return 1.0 if volume_a == volume_b else 0.0
-    inner = jaccard[rows][:, columns]
-    side_a = (sizes_a[rows] * inner.max(axis=1)).sum()
-    side_b = (sizes_b[columns] * inner.max(axis=0)).sum()
-    if form == "authors":
-        return float((side_a + side_b) / (2 * volume_a))
-    return float((side_a / volume_a + side_b / volume_b) / 2)
+    side_a = (sizes_a * jaccard.max(axis=1)).sum()
+    side_b = (sizes_b * jaccard.max(axis=0)).sum()
+    if form == "objects":
+        return float((side_a / volume_a + side_b / volume_b) / 2)
+    return float((side_a + side_b) / (2 * volume_a))
 
 
 def one_blob(labels: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ A model may also have a `PairNetwork`, which corrects the linear log odds of the
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
@@ -26,10 +25,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, fill_from_nearest, posed_camera
-from mstfilter.segmentation.boundary import SENSOR_FOCAL
+from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, posed_camera
+from mstfilter.segmentation.boundary import SENSOR_FOCAL, filled_disparity
 from mstfilter.segmentation.regions import SeenBorders
-from mstfilter.trained import TrainedModel, calibrated_network, open_model
+from mstfilter.trained import TrainedModel, calibrated_network, load_once, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
 PAIR_TENSORS = "pairs."  #: prefix of the names of the tensors of a pair network in a border model
@@ -47,8 +46,7 @@ _MULTIPLE = 8  # image sizes that the network works on
 def encode_image(frame: Frame) -> np.ndarray:
     """The input (9, H, W) float32 of the network for a frame with a camera pose."""
     h, w = frame.depth.shape
-    disparity = 8 * SENSOR_FOCAL * BASELINE / fill_from_nearest(frame.depth, ~frame.valid)
-    disparity = disparity.astype(np.float32) if frame.valid.any() else np.zeros((h, w), np.float32)
+    disparity = filled_disparity(frame) if frame.valid.any() else np.zeros((h, w), np.float32)
     camera = frame.camera
     matrix = camera.pose.as_matrix()
     up = matrix[2, :3]  # of the table, in the camera's axes
@@ -221,7 +219,7 @@ def reduced(frame: Frame) -> Frame:
     return frame.resized(camera if camera.width == RASTER else camera.scaled(RASTER / camera.width))
 
 
-@functools.lru_cache(maxsize=4)
+@load_once
 def load_border_network(name: str) -> BorderNetwork:
     """Load the network of a trained model, given by name or folder. See `mstfilter.trained.open_model`."""
     return BorderNetwork(open_model(name, BORDER_ARCHITECTURE))

@@ -15,7 +15,6 @@ px at f = 525 px), and lengths are in metres. The "front" region of a pair is ne
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import heapq
 import math
@@ -41,6 +40,7 @@ from mstfilter.segmentation.regions import (
     object_leaves,
 )
 from mstfilter.segmentation.tree import Tree, TreeBuilder, UcmTree
+from mstfilter.trained import load_once
 
 if TYPE_CHECKING:
     from mstfilter.segmentation.border_network import BorderNetwork, PairNetwork
@@ -349,9 +349,9 @@ class LearnedTree(MergedTree):
         return read_tree_weights(self.weights)
 
 
-@functools.lru_cache(maxsize=4)
+@load_once
 def read_tree_weights(name: str) -> tuple[Mapping[str, float], str]:
-    """Weights of `PAIR_FEATURES` by name, and the hash of the file. A file is read once per process."""
+    """Weights of `PAIR_FEATURES` by name, and the hash of the file. A file is read again if it has changed."""
     path = Path(name) if name.endswith(".json") else models_folder() / name / "weights.json"
     weights = read_json(path, "weights of a tree", f"fit them with: {_FIT}")
     check_weights(weights, PAIR_FEATURES, path, _FIT)

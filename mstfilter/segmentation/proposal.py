@@ -100,6 +100,11 @@ class ObjectRule:
         )
         return Segments(pixels, is_object)
 
+    def cached_segments(self, tree: Tree, frame: Frame, grid: VoxelGrid) -> Segments:
+        """The result of `segments`, which is computed once for a tree, a frame and a workspace."""
+        key = (frame.key, grid.key, tree.key, component_key(self))
+        return memo("segments", key, lambda: self.segments(tree, frame, grid))
+
     def label_image(self, tree: Tree, cut: np.ndarray, frame: Frame, grid: VoxelGrid | None = None) -> np.ndarray:
         """(H, W) int32 label image of a cut: 0 is background, and k + 1 is the k-th node of the cut."""
         segments = self.segments(tree, frame, grid)
@@ -180,11 +185,7 @@ class TreeCutProposal(Proposal):
         frame, grid = observation.after, observation.grid
         tree, w = self.of_clip(observation).tree_of(frame, grid)
         drawn = self.sampler.sample(rng, tree, w, n)
-        segments = memo(
-            "segments",
-            (frame.key, grid.key, tree.key, component_key(self.objects)),
-            lambda: self.objects.segments(tree, frame, grid),
-        )
+        segments = self.objects.cached_segments(tree, frame, grid)
         particles, counts = complete_segments(
             rng,
             Clip((self.objects.foreground(frame, grid).frame,), grid, observation.index),

@@ -73,8 +73,7 @@ class Stage:
 def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow."""
     ray = points - light
-    length = np.sqrt(ray[:, 0] ** 2 + ray[:, 1] ** 2 + ray[:, 2] ** 2)
-    cosine = -(ray[:, 0] * normal[:, 0] + ray[:, 1] * normal[:, 1] + ray[:, 2] * normal[:, 2]) / length
+    cosine = -_dot(ray, normal) / np.sqrt(_dot(ray, ray))
     lit = np.flatnonzero(cosine > 0.0)
     _, distance, _ = stage.cast(light, ray[lit], SHADOW_GROUPS)
     visible = (distance < 0) | (distance > 1.0 - 1e-6)

@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError, InputWarning, check_integer
 from mstfilter.files import atomic_folder, damaged_files, sweep, write_text
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.reading import check_private
@@ -70,16 +70,11 @@ def stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
     return np.random.default_rng([seed, word, index])
 
 
-def _check_seed(seed: int) -> None:
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"seed is {seed!r}, expected an integer of at least 0")
-
-
 class SimulatedScene:
     """A simulated scene with physics, textures and sensors, for simulation step by step."""
 
     def __init__(self, family: SceneFamily, seed: int) -> None:
-        _check_seed(seed)
+        check_integer("seed", seed, at_least=0)
         self.family, self.seed = family, int(seed)
         self.camera, self.grid = family.camera(), family.grid()
         self.objects: SceneObjects = draw_objects(stream(self.seed, "things"), family, family.pool(self.seed))
@@ -247,7 +242,7 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
             f"scene family {chosen.name!r} has no field {unknown[0]!r}", f"fields: {', '.join(sorted(known))}"
         )
     chosen = replace(chosen, **overrides)
-    _check_seed(seed)
+    check_integer("seed", seed, at_least=0)
     target = cached_path(chosen, seed, folder or cache_folder() / "recordings")
     check_private(target.parent)
     if (target / "manifest.json").is_file() and (damage := damaged_files(target)):

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +65,7 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
     if not path.exists():
         raise InputError(f"checkpoint is missing: {path}")
     arrays = read_arrays(path, "a checkpoint", _DAMAGED, limit=limit)
-    with _stored_state(path):
+    try:
         head = json.loads(str(arrays["head"]))
         if head.get("format") != _FORMAT:
             raise InputError(f"checkpoint {path} has format {head.get('format')}, expected {_FORMAT}")
@@ -74,16 +73,6 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
         population = Population(particles, arrays["log_weights"], _below(arrays, "parents/"))
         key = Key(int(head["seed"]), tuple(head["path"]))
         return State(int(head["t"]), population, key, bool(head["properly_weighted"]))
-
-
-_DAMAGED = "remove it to start again, or choose another file"
-
-
-@contextmanager
-def _stored_state(path: Path) -> Iterator[None]:
-    """Convert errors about missing or wrong content of the file to InputError."""
-    try:
-        yield
     except InputError as error:
         message = error.message if str(path) in error.message else f"checkpoint {path}: {error.message}"
         raise InputError(message, *error.hints) from error
@@ -91,6 +80,9 @@ def _stored_state(path: Path) -> Iterator[None]:
         raise InputError(
             f"{path} is not a checkpoint of a filter ({type(error).__name__}: {reason(error)})", _DAMAGED
         ) from error
+
+
+_DAMAGED = "remove it to start again, or choose another file"
 
 
 def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -128,7 +128,11 @@ def kalman_filter(
             S, root = joint[:k, :k], joint[k:, k:]
             if (abs(np.diag(S)) <= 1e-14 * np.linalg.norm(S, axis=1)).any():
                 raise InputError(f"the covariance H P H' + R of observation {t} is singular", "is R too small?")
-            z = np.linalg.solve(S, _observed(t, y, k) - m["H"][t] @ x)
+            observed = vector_of(f"observation {t}", y, k)
+            if not np.isfinite(observed).all():
+                hint = "one that is missing is None"
+                raise InputError(f"observation {t} is {observed.tolist()}, expected finite numbers", hint)
+            z = np.linalg.solve(S, observed - m["H"][t] @ x)
             x = x + joint[k:, :k] @ z
             total[t] -= 0.5 * (z @ z + k * np.log(2 * np.pi)) + np.log(abs(np.diag(S))).sum()
         means[t], roots[t] = x, root
@@ -159,15 +163,6 @@ def _triangular(blocks: list[list[np.ndarray]]) -> np.ndarray:
     """The lower triangular L with L L' = M M', for a matrix M of blocks."""
     upper: Any = np.linalg.qr(np.block(blocks).T, mode="r")
     return upper.T
-
-
-def _observed(t: int, y: Any, k: int) -> np.ndarray:
-    vector = vector_of(f"observation {t}", y, k)
-    if not np.isfinite(vector).all():
-        raise InputError(
-            f"observation {t} is {vector.tolist()}, expected finite numbers", "one that is missing is None"
-        )
-    return vector
 
 
 def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., Any]) -> StateSpaceModel:

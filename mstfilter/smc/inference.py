@@ -110,21 +110,18 @@ class _Posterior:
             except NotTogether as why:
                 self.batched = False
                 warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=5)
-        return self._one_by_one(thetas, seeds)
-
-    def _filter(self, theta: np.ndarray) -> ParticleFilter:
-        filter = self.filter_of(theta)
-        if not filter.properly_weighted:
-            raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
-        return filter
-
-    def _one_by_one(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
             with suppress(LostRunError):
                 state, _ = self._filter(theta).run(self.observations, seed)
                 found[r] = state.log_evidence
         return found
+
+    def _filter(self, theta: np.ndarray) -> ParticleFilter:
+        filter = self.filter_of(theta)
+        if not filter.properly_weighted:
+            raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
+        return filter
 
     def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of a batch of filters. The components hold one parameter vector per particle.

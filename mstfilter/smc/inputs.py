@@ -47,17 +47,17 @@ def split_input(observation: Any) -> tuple[Any, Any]:
     return observation, None
 
 
-def check_observations(observations: Iterable[Any], where: str = "") -> Any:
+def check_observations(observations: Iterable[Any]) -> Any:
     """Check the type and the values of observations, and return the observations unchanged.
 
     Raises InputError for a table, a mapping or a string, and for an observation whose entries are all NaN. Masked
     entries also raise InputError, because the functions of models ignore masks.
 
-    Iteration over a data frame or a mapping would yield names, not rows. `where` is the start of the error message.
+    Iteration over a data frame or a mapping would yield names, not rows.
     """
     if isinstance(observations, (str, bytes, Mapping)) or hasattr(observations, "columns"):
         raise InputError(
-            f"{where}observations are a {type(observations).__name__}, expected one observation for each step",
+            f"observations are a {type(observations).__name__}, expected one observation for each step",
             "rows of a data frame: table.to_numpy(); one column: table['y'].to_numpy()",
         )
     if isinstance(observations, (list, tuple, np.ndarray)):
@@ -67,7 +67,7 @@ def check_observations(observations: Iterable[Any], where: str = "") -> Any:
             if nan or np.ma.is_masked(y):
                 what = "is NaN" if nan else "has masked entries"
                 raise InputError(
-                    f"{where}observation {t} {what}", "one that is missing is None: then the step only predicts"
+                    f"observation {t} {what}", "one that is missing is None: then the step only predicts"
                 )
     return observations
 

@@ -33,17 +33,15 @@ def _seeds(value: Any) -> Any:
         first, dash, last = part.strip().partition("-")
         if not first.isdigit() or (dash and not last.strip().isdigit()):
             raise ValueError(f"{value!r} is not of the form 0-4, 7")
+        if dash and int(last) < int(first):
+            raise ValueError(f"{part.strip()!r} ends before it starts")
         found.extend(range(int(first), int(last if dash else first) + 1))
     return tuple(found)
 
 
-def _texts(value: Any) -> Any:
-    """A text as a tuple with this text; other values are unchanged."""
-    return (value,) if isinstance(value, str) else value
-
-
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seeds)]
-Texts = Annotated[tuple[str, ...], BeforeValidator(_texts)]
+#: A text stands for a tuple of this text.
+Texts = Annotated[tuple[str, ...], BeforeValidator(lambda given: (given,) if isinstance(given, str) else given)]
 
 
 class _Entry(BaseModel):
@@ -170,7 +168,8 @@ def expand_arms(study: StudyConfig, overrides: Sequence[str] = ()) -> Iterator[A
 
 
 def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator[ArmRequest]:
-    presets = [_preset_path(folder, name.strip()) for text in entry.preset for name in text.split(",")]
+    names = [name.strip() for text in entry.preset for name in text.split(",")]  # or files in the study's folder
+    presets = [str(folder / n) if n.endswith(".toml") and (folder / n).is_file() else n for n in names]
     grids = [split_grid(text) for text in (*entry.set, *overrides)]
     if not presets or not all(presets):
         raise InputError(f"an arm names no preset: {list(entry.preset)}")
@@ -183,11 +182,6 @@ def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator
                 shown = [k for k in range(len(grids)) if k < len(entry.set) or k in varied]
                 words = [_stem(preset), *(chosen[k] for k in shown)]
             yield ArmRequest(" ".join(words), preset, chosen, entry.reported_only)
-
-
-def _preset_path(folder: Path, name: str) -> str:
-    """The path of a preset file in the study's folder if the file exists, or else the name."""
-    return str(folder / name) if name.endswith(".toml") and (folder / name).is_file() else name
 
 
 def _stem(preset: str) -> str:

@@ -128,7 +128,7 @@ def _arm(request: ArmRequest, versions: dict[str, str], code: str) -> Arm:
         filter = build_filter(request.config(), allow_files=True)
         files = component_files(filter)
     config = as_json(describe_filter(filter))
-    known_code = all(type(part).__module__.startswith("mstfilter") for part in nested_components(filter))
+    known_code = all(type(part).__module__.split(".")[0] == "mstfilter" for part in nested_components(filter))
     key = _hash([config, files, versions, code])
     return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -178,22 +178,22 @@ class StudyFolder:
         """Path of the folder of a run, from the name of the folder."""
         return self.path / "runs" / folder
 
-    def failures(self) -> list[dict[str, Any]]:
-        """Runs of this study that failed: name, error, hints, tries, folder, trace."""
-        found = []
+    def _results(self, status: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+        """The runs of this study with a status, and their results."""
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
-            if result.get("status") == "failed" and result.get("identity") == run["identity"]:
-                found.append({**run, **{k: result.get(k) for k in ("error", "hints", "tries", "trace")}})
-        return found
+            if result.get("status") == status and result.get("identity") == run["identity"]:
+                yield run, result
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Runs of this study that failed: name, error, hints, tries, folder, trace."""
+        names = ("error", "hints", "tries", "trace")
+        return [{**run, **{k: result.get(k) for k in names}} for run, result in self._results("failed")]
 
     def records(self) -> list[dict[str, Any]]:
         """The rows of `rows`, with additional lists such as ``qualities``, which has one value per hypothesis."""
         rows = []
-        for run in self.description["runs"]:
-            result = read_result(self.run(run["folder"]))
-            if result.get("status") != "done" or result.get("identity") != run["identity"]:
-                continue
+        for run, result in self._results("done"):
             named = {"family": run["group"], "scene": run["scene"], "arm": run["arm"], "seed": run["seed"]}
             for row, cost in zip(result["rows"], result["costs"], strict=True):
                 rows.append({**named, **row, **cost})

@@ -176,7 +176,7 @@ def summarise(
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
     measured = [name for name in named if name not in cost]
-    values = _by_scene([row for row in rows if row["pause"] >= 1], measured)
+    values = _by_seed([row for row in rows if row["pause"] >= 1], measured)
     spent = [k for k in named if k in cost]
     zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
     seeds: dict[Any, set[Any]] = defaultdict(set)
@@ -184,30 +184,33 @@ def summarise(
         seeds[row["family"], row["arm"]].add(row["seed"])
     filling = {of_arm: min(found) for of_arm, found in seeds.items() if len(found) > 1}
     warm = [{**zero, **row} for row in rows if filling.get((row["family"], row["arm"])) != row["seed"]]
-    values.update(_by_scene(warm, spent))
+    values.update(_by_seed(warm, spent))
     for endpoint, slope_name in SLOPES.items():
         if endpoint in measured:
-            slopes = _by_scene(rows, [endpoint], slope)
+            slopes = _by_seed(rows, [endpoint], slope)
             values.update({(family, arm, slope_name): found for (family, arm, _), found in slopes.items()})
             measured.insert(1 + measured.index(endpoint), slope_name)
     names = tuple([*measured, *(k for k in named if k in cost)])
     metrics = tuple(
-        ArmMetric(family, arm, name, values[family, arm, name])
+        ArmMetric(family, arm, name, _means(found, found))
         for family in families
         for arm in arms
         for name in names
-        if values.get((family, arm, name))
+        if (found := values.get((family, arm, name)))
     )
     # The primary endpoints first, then their slopes; all other comparisons are exploratory.
     first = [*ENDPOINTS, *SLOPES.values()]
     order = [name for name in first if name in measured] + [name for name in measured if name not in first]
     differences = [
-        Compared(family, arm, reference, name, compare(of_arm, of_reference, name in ENDPOINTS), arm in reported_only)
+        Compared(family, arm, reference, name, difference, arm in reported_only)
         for name in order
         for family in families
         for of_reference in [values.get((family, reference, name), {})]
         for arm in arms
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
+        # A failed run has no values. Its seed is left out of the scene in both arms.
+        for pair in [(_means(of_arm, of_reference), _means(of_reference, of_arm))]
+        for difference in [compare(*pair, name in ENDPOINTS)]
     ]
     return Summary(families, arms, names, reference, set(seeds) == set(filling), metrics, _adjust(differences))
 
@@ -221,15 +224,21 @@ def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
     )
 
 
-_Values = dict[tuple[str, str, str], dict[str, float]]
+_Values = dict[tuple[str, str, str], dict[str, dict[Any, float]]]
 
 
-def _by_scene(
+def _means(scenes: Mapping[str, Mapping[Any, float]], of: Mapping[str, Mapping[Any, float]]) -> dict[str, float]:
+    """Mapping scene -> mean over the seeds that the same scene has in `of`."""
+    common = {scene: [found[k] for k in found if k in of.get(scene, {})] for scene, found in scenes.items()}
+    return {scene: float(np.mean(values)) for scene, values in common.items() if values}
+
+
+def _by_seed(
     rows: Sequence[Mapping[str, Any]],
     names: Sequence[str],
     of_run: Callable[[np.ndarray, np.ndarray], float] = lambda pauses, values: float(np.mean(values)),
 ) -> _Values:
-    """Mapping (family, arm, metric) -> scene -> mean over seeds of ``of_run(pauses, values)``, without NaN."""
+    """Mapping (family, arm, metric) -> scene -> seed -> ``of_run(pauses, values)``, without NaN."""
     runs: dict[tuple[str, str, str, str, Any], list[tuple[int, float]]] = defaultdict(list)
     for row in rows:
         for name in names:
@@ -237,12 +246,9 @@ def _by_scene(
             if value is not None and np.isfinite(value):
                 run = row["family"], row["arm"], name, row["scene"], row["seed"]
                 runs[run].append((row["pause"], value))
-    seeds: dict[tuple[str, str, str, str], list[float]] = defaultdict(list)
-    for (family, arm, name, scene, _), points in runs.items():
+    values: _Values = defaultdict(lambda: defaultdict(dict))
+    for (family, arm, name, scene, seed), points in runs.items():
         found = of_run(*np.array(points, dtype=np.float64).T)
         if np.isfinite(found):
-            seeds[family, arm, name, scene].append(found)
-    values: _Values = defaultdict(dict)
-    for (family, arm, name, scene), of_seeds in seeds.items():
-        values[family, arm, name][scene] = float(np.mean(of_seeds))
+            values[family, arm, name][scene][seed] = found
     return dict(values)

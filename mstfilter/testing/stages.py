@@ -279,7 +279,8 @@ def run_contract(
     """
     cls = type(component)
     contract = contract_of(cls)
-    example = example or _function_beside(cls, "example") or (scene_example if _uses_images(cls) else None)
+    of_scenes = cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")
+    example = example or _function_beside(cls, "example") or (scene_example if of_scenes else None)
     return check_properties(component, contract, example, exact or _function_beside(cls, "exact"))
 
 
@@ -287,8 +288,3 @@ def _function_beside(cls: type, name: str) -> Callable[..., Any] | None:
     """The function with a given name in the module of a class."""
     found = getattr(sys.modules.get(cls.__module__), name, None)
     return found if callable(found) else None
-
-
-def _uses_images(cls: type) -> bool:
-    """Whether a class of components belongs to a package of mstfilter other than smc."""
-    return cls.__module__.startswith("mstfilter.") and not cls.__module__.startswith("mstfilter.smc.")

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.spatial.transform import RigidTransform
 
+from mstfilter.errors import InputError
 from mstfilter.fields import Bounded, Share
 from mstfilter.processes import each
 from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid, content_key, memo
@@ -85,6 +86,8 @@ class Warp(Bounded):
         `motions` maps labels to motions in world metres. Objects without an entry do not move. `residuals` maps
         labels to residuals (see `collisions`).
         """
+        if unknown := motions.keys() - {record.label for record in hypothesis.objects}:
+            raise InputError(f"motions have the labels {sorted(unknown)}, which the hypothesis does not contain")
         matrices = {k: T.as_matrix() for k, T in motions.items()}
         moving = {k: T for k, T in matrices.items() if not np.array_equal(T, np.eye(4))}
         if not moving:

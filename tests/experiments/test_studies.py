@@ -11,7 +11,7 @@ from mstfilter.files import read_csv
 from mstfilter.scoring import LOG_LOSS
 from mstfilter.simulation import FIRST_REPORTED_SEED
 from mstfilter.study import load_study, make_plan
-from tests.experiments.scripts import EXPERIMENTS, run_script
+from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
 from tests.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
@@ -114,6 +114,13 @@ def test_a_study_by_families_has_the_tables_of_the_whole_study(tmp_path, capsys)
             for key, text in expected.items():
                 same = row[key] == text or float(row[key]) == pytest.approx(float(text), abs=2e-4)
                 assert same, (name, key)
+    # Rows that do not belong to the plan.
+    capsys.readouterr()
+    config.write_text(config.read_text().replace('seeds = "1-2"', 'seeds = "1-3"'))
+    import_script("tables.py").Source.of(config)
+    assert "rows of 4 of 12 runs are missing" in capsys.readouterr().err
+    config.write_text(config.read_text().replace('seeds = "1-3"', "seeds = 1"))
+    assert "has no run" in run_script("tables.py", config, joined, expected_exit=1)
 
 
 @pytest.mark.parametrize("config, first", [(MAIN, 1000), (EXPERIMENTS / "fusion/study.toml", 1100)])

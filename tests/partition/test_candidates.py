@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from mstfilter.partition import Cells, Choices, Readings
-from mstfilter.partition.candidates import largest_products, stays
+from mstfilter.partition.candidates import largest_products, stays, tempered
 
 READINGS = Readings(np.arange(40), np.zeros((40, 3), int), (4, 10))
 
@@ -79,3 +79,7 @@ def test_candidates_by_enumeration(seed, n):
     assert np.exp(kept.log_weights).sum() == pytest.approx(np.exp(found.log_weights).sum())
     share = sum(w for w, labels in zip(np.exp(kept.log_weights), kept.staying, strict=True) if 1 in labels)
     assert share == pytest.approx(0.25 * np.exp(found.log_weights).sum())
+
+
+def test_low_temperatures_do_not_underflow():
+    np.testing.assert_allclose(tempered(np.array([0.4, 0.6]), 5e-4), [0, 1])

@@ -186,3 +186,17 @@ def test_small_objects_far_from_others_are_not_slivers(monkeypatch):
 def test_no_objects():
     found = Cells.of(READINGS, [np.zeros(30, int)], [np.ones(30, int)])
     assert (found.of_reading == -1).all() and found.alternatives() == []
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(images, min_size=2, max_size=3), st.integers(1, 4))
+def test_a_sample_of_a_larger_weight_counts_as_several(samples, more):
+    """One sample with the weight of `more` copies, or these copies."""
+    rows = [one.ravel() for one in samples]
+    weights = np.array([more, *(1 for _ in rows[1:])]) / (more + len(rows) - 1)
+    weighted = Cells.of(READINGS, rows, [], weights)
+    copied = Cells.of(READINGS, [rows[0]] * more + rows[1:], [])
+    np.testing.assert_array_equal(weighted.of_reading, copied.of_reading)
+    given = np.zeros(0)
+    for one, other in zip(PairEvidence().terms(weighted, given), PairEvidence().terms(copied, given), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)

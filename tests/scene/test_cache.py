@@ -279,6 +279,9 @@ def test_a_class_of_the_user_is_known_by_its_code():
     first = key(CLASS.replace("FACTOR", "1.0"))
     assert first == key("\n\n" + CLASS.replace("FACTOR", "1.0"))
     assert len({first, key(CLASS.replace("FACTOR", "0.7")), key(CLASS.replace("2 * k", "3 * k"))}) == 3
+    named = CLASS.replace("FACTOR * v", "FACTOR * scaled(v)")
+    texts = [f"FACTOR = {a}\ndef scaled(v):\n    return {b} * v\n{named}" for a, b in ((1, 1), (1, 2), (2, 1))]
+    assert len({key(text) for text in texts}) == 3
     values = [content_key(value) for value in astuple(Extrude())]
     assert component_key(Extrude()) == content_key("mstfilter.completion.extrude", "Extrude", "", b"", *values)
 

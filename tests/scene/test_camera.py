@@ -139,3 +139,16 @@ def test_pixels_of_points_inside_and_outside_the_image():
     assert inside.tolist() == [True, False, False]
     assert (u.tolist(), v.tolist()) == ([12, 0, 0], [3, 0, 0])
     assert z.tolist() == [2.0, 1.0, -1.0]
+
+
+def test_a_camera_that_looks_straight_down():
+    pose = look_at((0.1, 0.2, 1.0), (0.1, 0.2, 0.0))
+    np.testing.assert_allclose(pose.apply([[0, 0, 1], [0, -1, 0]]), [[0.1, 0.2, 0], [0.1, 1.2, 1]], atol=1e-12)
+    with pytest.raises(InputError, match="are both at"):
+        look_at((0, 0, 1), (0, 0, 1))
+
+
+def test_depth_in_millimetres_is_refused():
+    depth = np.full((CAMERA.height, CAMERA.width), 800.0)
+    with pytest.raises(InputError, match="median of 800 m"):
+        Frame(np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)

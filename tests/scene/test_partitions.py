@@ -34,3 +34,9 @@ def test_refinement():
     np.testing.assert_array_equal(found.overlaps()[1:, 1:], want)
     sparse = common_refinement([np.array([0, 65535, 9]), np.array([0, 65535, 65534])])
     np.testing.assert_array_equal(sparse.cells, [0, 2, 1])
+
+
+def test_the_largest_label():
+    labels = np.zeros((20, 20, 25), np.uint16)
+    labels[:] = 65535
+    assert common_refinement([labels]).n_objects == 1

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.scene import Frame, Hypothesis, check_grid, render, write_image
+from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, render, write_image
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording
@@ -243,8 +243,8 @@ def test_support_plane_of_known_pose():
     up = plane.T_world_camera.as_matrix()[2, :3] @ CAMERA.pose.as_matrix()[2, :3]
     assert np.degrees(np.arccos(np.clip(up, -1, 1))) < 0.3
     assert abs(plane.T_world_camera.translation[2] - CAMERA.position[2]) < 3e-3
-    truth = (labels_of(depth) == 0) & frame.valid
-    assert (plane.on_or_behind & truth).sum() / (plane.on_or_behind | truth).sum() > 0.97
+    truth, table = (labels_of(depth) == 0) & frame.valid, plane.residual < TABLE_TOLERANCE
+    assert (table & truth).sum() / (table | truth).sum() > 0.97
     # Thresholds are in units of the sensor, not of pixels.
     half = Recording.from_arrays(rgb[::2, ::2], depth[::2, ::2], CAMERA.scaled(0.5).K)
     assert abs(half.frames[0].camera.position[2] - CAMERA.position[2]) < 6e-3
@@ -302,7 +302,7 @@ def test_real_frames_find_their_table(shared_data):
     for name in ("learn0", "learn9", "learn17", "learn25", "learn33", "learn41"):
         recording = PairedImages(frames=(name,)).open(path)
         label = cv2.imread(str(path / f"{name}_label.png"), cv2.IMREAD_UNCHANGED)
-        table = fit_support_plane(recording.frames[0]).on_or_behind & (label > 0)
+        table = (fit_support_plane(recording.frames[0]).residual < TABLE_TOLERANCE) & (label > 0)
         scores.append((table & (label == 1)).sum() / (table | (label == 1)).sum())
     assert np.mean(scores) > 0.9
 

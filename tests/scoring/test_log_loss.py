@@ -70,7 +70,7 @@ def test_without_questions_scores_are_unknown():
     score = score_belief(empty, [truth], np.ones(1), truth)
     assert np.isnan(score.row["brier"]) and not score.counts.any()
     assert leave_one_out({"one": score.counts, "two": score.counts}) == {}
-    with pytest.raises(InputError, match="1 hypotheses and 2 weights"):
+    with pytest.raises(InputError, match="1 with the weights"):
         score_belief(empty, [truth], np.ones(2) / 2, truth)
 
 

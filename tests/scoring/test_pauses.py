@@ -9,7 +9,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
-from mstfilter.scene import VoxelGrid, render
+from mstfilter.scene import Hypothesis, VoxelGrid, render
 from mstfilter.scoring import PauseEstimate, PauseTruth, read_truth, score_pauses
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -116,3 +116,11 @@ def test_input_that_does_not_match_is_an_error(tmp_path):
             score_pauses(estimate, truth)
     with pytest.raises(InputError, match="has no ground truth"):
         read_truth(open_recording(write_recording(tmp_path / "bare", volumes=False, instance=False)))
+
+
+def test_weights_and_grids_are_checked():
+    with pytest.raises(InputError, match="2 with the weights"):
+        PauseEstimate([line("110000"), line("110220")], np.ones(2), 0)
+    shifted = Hypothesis.from_labels(line("110220"), VoxelGrid((0.1, 0, 0), 0.01, (6, 1, 1)))
+    with pytest.raises(InputError, match="truth on"):
+        score_pauses([PauseEstimate([shifted], np.ones(1), 0)], [PauseTruth(line("110220"), 0, SMALL)])

@@ -189,7 +189,7 @@ WRONG = {
     "arms = []": "has no arm",
     "scenes = []": "has no scene",
     "seeds = []": "has no seed",
-    'seeds = "3-1"': "has no seed",
+    'seeds = "3-1"': "ends before it starts",
     'seeds = "x"': "not of the form 0-4, 7",
     "seeds = [1, 1]": "names a seed twice",
     'arms = [{set = "n=5"}, {name = "same"}]': "two arms are the same: 'mst n=5' and 'same'",

@@ -141,15 +141,17 @@ def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
     """Against means and t intervals that scipy computes from the files of the runs."""
     study = make_study(tmp_path, n_scenes=5, arms=("ours", STRANGE), groups=("s1",), fail=True)
     StudyFolder.open(study).write_tables()
-    of_scene = {}
-    for arm in ("ours", STRANGE):
-        for scene in (f"s1-{k}" for k in range(5)):
-            seeds = {}
-            for a, s, seed, t, q in results(study):
-                if (a, s) == (arm, scene) and t > 0:
-                    seeds.setdefault(seed, []).append(q)
-            of_scene[arm, scene] = np.mean([np.mean(q) for q in seeds.values()])
-    ours, theirs = ([of_scene[arm, f"s1-{k}"] for k in range(5)] for arm in ("ours", STRANGE))
+    runs = {}
+    for arm, scene, seed, pause, q in results(study):
+        if pause > 0:
+            runs.setdefault((arm, scene), {}).setdefault(seed, []).append(q)
+
+    def scene_means(arm, seeds_of=None):
+        found = [(runs[arm, f"s1-{k}"], runs[seeds_of or arm, f"s1-{k}"]) for k in range(5)]
+        return [np.mean([np.mean(qs) for seed, qs in mine.items() if seed in both]) for mine, both in found]
+
+    ours, theirs = scene_means("ours"), scene_means(STRANGE)
+    paired = np.subtract(scene_means(STRANGE, "ours"), scene_means("ours", STRANGE))
 
     def estimate(values, sign=""):
         low, high = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
@@ -159,10 +161,24 @@ def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
     means = [["s1", arm, "5", estimate(q), "–", "2.00"] for arm, q in (("ours", ours), (STRANGE, theirs))]
     with (study / "differences.csv").open(newline="", encoding="utf-8") as file:
         p = next(row["p_holm"] for row in csv.DictReader(file) if row["metric"] == "quality")
-    difference = ["s1", STRANGE, "5", estimate(np.subtract(theirs, ours), "+"), f"{float(p):.3f}", "–", "–"]
+    difference = ["s1", STRANGE, "5", estimate(paired, "+"), f"{float(p):.3f}", "–", "–"]
     for read, kind in ((latex_rows, "tex"), (markdown_rows, "md")):
         assert read(study / f"summary.{kind}") == [head, *means]
         assert read(study / f"differences.{kind}")[1:] == [difference]
     caption = (study / "summary.md").read_text().split("\n")[0]
     assert "95 % t intervals" in caption and "n scenes" in caption and "warm cache" in caption
     assert r"95~\% t intervals" in (study / "summary.tex").read_text()
+
+
+def test_seeds_that_failed_in_one_arm_are_left_out_of_the_difference():
+    """Equal arms, whose second seed is better. The reference has no second seed on every other scene."""
+    table = [
+        {"family": "f", "scene": str(k), "arm": arm, "seed": seed, "pause": 1, "quality": 0.5 + 0.1 * seed + 0.01 * k}
+        for k in range(20)
+        for arm in ("ours", "theirs")
+        for seed in (0, 1)
+        if not (arm == "ours" and seed and k % 2)
+    ]
+    [one] = summarise(table, "ours").compared()
+    assert (one.difference.n, one.difference.mean) == (20, pytest.approx(0, abs=1e-12))
+    assert summarise(table, "ours").metric("f", "theirs").by_scene["1"] == pytest.approx(0.56)

@@ -134,7 +134,10 @@ def run_program(
         Change of the log weights.
     """
     run = _run_once(model, handler, previous, observation, n)
-    return _values_of(run), run.gain
+    particles = {**run.values, **run.returned}
+    if not particles:
+        raise InputError("the program sampled nothing and returned nothing: a particle would be empty")
+    return particles, run.gain
 
 
 def _run_once(
@@ -145,24 +148,18 @@ def _run_once(
     run.function = function
     if isinstance(previous, dict):
         previous = MappingProxyType(previous)
+    token = active_run.set(run)
     try:
-        _call(function, run, previous, observation)
+        run.returned = _returned(function(previous, observation), run)
     except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
         explained = _explained(error, run, previous)
         if explained is error:
             raise
         raise explained from error
-    handler.finish(run.values)
-    return run
-
-
-def _call(function: Model, run: ProgramRun, previous: Any, observation: Any) -> None:
-    token = active_run.set(run)
-    try:
-        returned = function(previous, observation)
     finally:
         active_run.reset(token)
-    run.returned = _returned(returned, run)
+    handler.finish(run.values)
+    return run
 
 
 #: Parts of messages of numpy and Python, what the program did, and what to write instead.
@@ -243,11 +240,3 @@ def _returned(returned: Any, run: ProgramRun) -> dict[str, Any]:
 def _equal(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two arrays are equal, where NaN equals NaN."""
     return a is b or np.array_equal(a, b, equal_nan=a.dtype.kind in "fc" and b.dtype.kind in "fc")
-
-
-def _values_of(run: ProgramRun) -> dict[str, Any]:
-    """The particles after a run: values of the `sample` calls, and returned values."""
-    particles = {**run.values, **run.returned}
-    if not particles:
-        raise InputError("the program sampled nothing and returned nothing: a particle would be empty")
-    return particles

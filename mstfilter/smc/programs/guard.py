@@ -21,13 +21,13 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from copy import deepcopy
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.fields import copied
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.population import Population, log_mean_exp, normalise, take
 from mstfilter.smc.programs.handlers import GivenHandler, SampleHandler
@@ -61,7 +61,7 @@ class Guard:
         self.previous, self.count = None if past is None else past.particles, count
         self.state = rng.bit_generator.state
         #: Copies of the model and the guide, made before the step: objects may keep values between calls.
-        self.fresh = {id(f): _copy(f) for f in (model, guide) if f is not None} if count <= 2 else {}
+        self.fresh = {id(f): copied(f) for f in (model, guide) if f is not None} if count <= 2 else {}
 
     def checked(self, run: Run, step: Callable[[], Any]) -> Any:
         """The particles and log weight changes that ``step()`` returns. Raises InputError if a check fails."""
@@ -109,7 +109,7 @@ class Guard:
         previous = None if self.previous is None else take(self.previous, rows)
         handler = GivenHandler(whole.values, rows, weigh=False)
         fresh = self.fresh.get(id(whole.function))
-        function = whole.function if fresh is None else _copy(fresh)
+        function = whole.function if fresh is None else copied(fresh)
         try:
             with recorded():
                 return run(function, handler, previous, self.observation, len(rows))
@@ -194,14 +194,6 @@ def _parts(function: Any) -> list[Any]:
     return [getattr(function, "__code__", function), *(v for v in values if not isinstance(v, float | np.ndarray))]
 
 
-def _copy(function: Any) -> Any:
-    """A deep copy of a program. Functions, and objects that cannot be copied, are returned unchanged."""
-    try:
-        return deepcopy(function)
-    except Exception:
-        return function
-
-
 def _groups(run: ProgramRun) -> list[np.ndarray]:
     """Two groups of particles to run alone: particles with small and with large values, from every branch."""
     numbers = next((v for v in run.values.values() if v.dtype.kind == "f" and v.size), None)
@@ -246,11 +238,8 @@ def _first_difference(particles: Mapping[str, np.ndarray], again: Mapping[str, n
     if list(particles) != list(again):
         return f"the names {sorted(set(particles) ^ set(again))}"
     pairs = ((name, np.asarray(a), np.asarray(again[name])) for name, a in particles.items())
-    return next((f"values of {name!r}" for name, a, b in pairs if not _same(a, b)), None)
-
-
-def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    return a.shape == b.shape and bool(_close(a, b, 1e-9).all())
+    different = (name for name, a, b in pairs if a.shape != b.shape or not _close(a, b, 1e-9).all())
+    return next((f"values of {name!r}" for name in different), None)
 
 
 def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:

@@ -255,8 +255,9 @@ class ProgramRun:
             self.values[name] = value
             return
         values = self.values.get(name)
-        if values is None:
-            values = _blank(value, self.n)
+        if values is None:  # particles that reach no such site keep the value NaN, or 0 if it is no float
+            fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
+            values = np.full((self.n, *value.shape[1:]), fill, dtype=value.dtype)
         if values.shape[1:] != value.shape[1:]:
             raise InputError(
                 f"values have event shape {value.shape[1:]} here, {values.shape[1:]} in another branch",
@@ -307,12 +308,6 @@ def _check_rows(argument: Any, size: int, k: int) -> None:
                 "particles",
                 "a branch can use values that all particles share, such as the observation, without an argument",
             )
-
-
-def _blank(value: np.ndarray, n: int) -> np.ndarray:
-    """(n, ...) values of particles that do not reach a site, which are NaN for floats and otherwise 0."""
-    fill = np.nan if np.issubdtype(value.dtype, np.floating) else 0
-    return np.full((n, *value.shape[1:]), fill, dtype=value.dtype)
 
 
 def _merge(results: list[Any], groups: list[np.ndarray], n: int) -> Any:

@@ -25,6 +25,7 @@ from unittest import SkipTest
 import numpy as np
 
 from mstfilter.errors import InputError, describe_error
+from mstfilter.fields import copied
 from mstfilter.smc import Population, as_matrix
 
 #: Largest probability that a statistical test fails for a correct component.
@@ -167,14 +168,6 @@ def _selected(population: Population) -> list[np.ndarray]:
     return [*population.parents.values(), *([as_matrix(population.particles)] if numbers else [])]
 
 
-def copied(component: Any) -> Any:
-    """A deep copy of a component, or the component if copying fails."""
-    try:
-        return copy.deepcopy(component)
-    except Exception:  # for example a lock or a module in a field
-        return component
-
-
 def skip_unless_properly_weighted(component: Any) -> Any:
     """Return the component, or skip the test if the component declares ``properly_weighted = False``."""
     if not component.properly_weighted:
@@ -213,7 +206,8 @@ def check_properties(
     failure: str | None
     skipped: str | None
     stopped = False
-    for name in _test_names(tests):
+    names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
+    for name in dict.fromkeys(names):  # those of base classes first
         test = getattr(tests, name)
         if stopped:
             failure, skipped = None, "not tested: first fix what is broken above"
@@ -226,12 +220,6 @@ def check_properties(
         statistical = getattr(test, "statistical", False)
         results.append(CheckResult(name.removeprefix("test_"), statement, statistical, failure, skipped))
     return results
-
-
-def _test_names(tests: type) -> list[str]:
-    """The names of the test methods, those of base classes first."""
-    names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
-    return list(dict.fromkeys(names))
 
 
 def _outcome(test: Callable[[], None]) -> tuple[str | None, str | None]:
