@@ -3,11 +3,11 @@
     python experiments/fingerprints/run.py before.json               # before the change
     python experiments/fingerprints/run.py after.json --against before.json
 
-There are hashes of the hypotheses (labels, weights, parents) for each preset, scene and pause, and of their metrics
-to nine digits. There are also hashes of the simulated images and true volumes, and of particles and log evidence of
-filters of `mstfilter.smc`. If the data of `experiments/real` are there, there are hashes of the hypotheses of `mst` at
-the first two pauses of each real sequence. Hashes can be compared only on one machine with one set of library versions,
-so the repository stores no hashes.
+There are hashes of the hypotheses (labels, weights, parents) for each preset, scene and pause, and of their
+metrics to nine digits. There are also hashes of the simulated images and true volumes, and of particles and log
+evidence of filters of `mstfilter.smc`. If the data of `experiments/real` are there, there are hashes of the
+hypotheses of `mst` at the first two pauses of each real sequence. Hashes can be compared only on one machine
+with one set of library versions, so the repository stores no hashes.
 """
 
 from __future__ import annotations
