@@ -1,9 +1,10 @@
-"""Geometry of a depth image: voxels in the image, the support plane, the workspace.
+"""Geometry of a depth image: voxels in the image, the support plane, the workspace, edges of depth and colour.
 
 >>> frame_geometry(frame, grid).known_free(0.005)         # voxels observed as free
 >>> plane = fit_support_plane(frame)                      # if the camera pose is not known
 >>> camera = frame.camera.at(plane.T_world_camera)        # z up, table at z = 0
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
+>>> edge_agreement([Edges(frame)])                        # whether depth is registered to colour
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
 The noise of disparity does not depend on depth, so the support plane is found by a least-squares fit of an affine
@@ -89,9 +90,6 @@ def disparity(depth: np.ndarray) -> np.ndarray:
 
 _N_TRIALS = 400  # minimal sets of RANSAC
 _INLIER = 1.5  # largest residual of an inlier, in 1/8 pixels
-_SHIFTS = 16  # pixels of an image of 320 columns
-_MIN_EDGES = 120  # pixels of depth edges; fewer are taken for noise
-_BOX = np.ones((3, 3), np.uint8)
 _MIN_SHARE = 0.1  # smallest share of inliers among the readings
 
 
@@ -236,6 +234,11 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     centre = np.clip(np.percentile(chosen, (2, 98), axis=0).mean(axis=0), *reach)
     origin = np.append(np.round((centre - side / 2) / voxel_size) * voxel_size, 0.0)
     return VoxelGrid(origin, voxel_size, (*map(round, side / voxel_size), round(_HEIGHT / voxel_size)))
+
+
+_SHIFTS = 16  # pixels of an image of 320 columns
+_MIN_EDGES = 120  # pixels of depth edges; fewer are taken for noise
+_BOX = np.ones((3, 3), np.uint8)
 
 
 class Edges:

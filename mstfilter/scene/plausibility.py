@@ -29,6 +29,7 @@ from mstfilter.scene.geometry import (
     in_columns,
     shares_with_depth,
 )
+from mstfilter.scene.support import TABLE_TOLERANCE
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _Limits = tuple[float, float]
@@ -150,14 +151,16 @@ class Look:
         """(n,) bool: whether each depth reading is inside, above or below the workspace."""
         return in_columns(self.grid, self.points)
 
-    def plane(self, chosen: np.ndarray) -> tuple[float, float, np.ndarray] | None:
+    def plane(self, chosen: np.ndarray | None = None) -> tuple[float, float, np.ndarray] | None:
         """Tilt (degrees), height (m) and normal (3,) in camera axes of a plane fitted to `chosen` readings (n,)."""
-        valid = np.zeros_like(self.frame.valid)
-        valid[self.frame.valid] = chosen
-        depth = np.where(valid, self.frame.depth, np.nan)
+        frame = self.frame
         try:
-            plane: SupportPlane = fit_support_plane(Frame(self.frame.rgb, depth, self.frame.camera))
-        except InputError:
+            if chosen is not None:
+                valid = np.zeros_like(frame.valid)
+                valid[frame.valid] = chosen
+                frame = Frame(frame.rgb, np.where(valid, frame.depth, np.nan), frame.camera)
+            plane: SupportPlane = fit_support_plane(frame)
+        except InputError:  # too few readings, or most are beyond 30 m
             return None
         fitted, given = plane.T_world_camera.inv(), self.frame.camera.pose
         normal = fitted.rotation.apply([0.0, 0.0, 1.0])
@@ -245,7 +248,7 @@ def unreadable(frame: Frame, which: str) -> Iterator[Finding]:
 
 def _support(first: Look) -> Iterator[Finding]:
     """Findings if the depth readings at the first pause contradict the pose, intrinsics or support plane."""
-    free, camera, table = first.plane(np.ones(len(first.points), bool)), first.frame.camera, first.table
+    free, camera, table = first.plane(), first.frame.camera, first.table
     hints = (
         f"{_CHECK_POSE}; without a pose it is found from the table",
         "T_world_camera maps points of the camera to the world; is this the inverse?",
@@ -274,7 +277,7 @@ def _share_on_plane(frame: Frame, depth: np.ndarray | None = None) -> float:
         plane = fit_support_plane(frame if depth is None else Frame(frame.rgb, depth, frame.camera))
     except InputError:
         return 0.0
-    return float((np.abs(plane.residual[frame.valid]) < 2).mean())
+    return float((np.abs(plane.residual[frame.valid]) < TABLE_TOLERANCE).mean())
 
 
 def _other_support(first: Look) -> Iterator[Finding]:
