@@ -105,15 +105,15 @@ def compare(first: Values, second: Values, adjusted: bool = False) -> Difference
         If two arrays have different shapes, or are not one-dimensional.
     """
     if isinstance(first, Mapping) and isinstance(second, Mapping):
-        d = np.array([first[unit] - second[unit] for unit in first if unit in second], dtype=np.float64)
+        units = [unit for unit in first if unit in second]
+        first, second = ([arm[unit] for unit in units] for arm in (first, second))
     elif isinstance(first, Mapping) or isinstance(second, Mapping):
         raise InputError("one arm is a mapping of units to values and the other is not, so they cannot be paired")
-    else:
-        a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-        if a.ndim != 1 or a.shape != b.shape:
-            raise InputError(f"values have shapes {a.shape} and {b.shape}, expected one number per unit: (n,) twice")
-        with np.errstate(invalid="ignore"):
-            d = a - b
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    if a.ndim != 1 or a.shape != b.shape:
+        raise InputError(f"values have shapes {a.shape} and {b.shape}, expected one number per unit: (n,) twice")
+    with np.errstate(invalid="ignore"):
+        d = a - b
     d = d[np.isfinite(d)]
     if len(d) == 0:
         nan = float("nan")
@@ -162,14 +162,14 @@ def studentised_bootstrap(values: np.ndarray, n_resamples: int = N_RESAMPLES) ->
 def _resampled_ratios(values: np.ndarray, n_resamples: int) -> np.ndarray:
     """Ratios (mean of a resample - mean) / (standard deviation of the resample) of all resamples.
 
-    If all values of a resample are equal, its ratio is infinite. Such ratios are set to +-1e200, because quantiles
-    interpolate.
+    If all values of a resample are equal, its ratio is infinite, or 0 if its mean is the mean of the values. Infinite
+    ratios are set to +-1e200, because quantiles interpolate.
     """
     rng = np.random.default_rng(20210)
     drawn = values[rng.integers(0, len(values), (n_resamples, len(values)))]
     scale = drawn.std(axis=1, ddof=1)
     away = drawn.mean(axis=1) - values.mean()
-    return np.divide(away, scale, out=np.copysign(1e200, away), where=scale > 1e-9 * values.std(ddof=1))
+    return np.divide(away, scale, out=1e200 * np.sign(away), where=scale > 1e-9 * values.std(ddof=1))
 
 
 def _all_equal(values: np.ndarray) -> bool:

@@ -74,6 +74,18 @@ def test_the_bootstrap_interval_leans_with_the_skew():
     assert high - values.mean() > values.mean() - low
 
 
+def test_the_bootstrap_of_tied_values_is_symmetric():
+    values = np.array([0.0] * 10 + [1, -1])
+    low, high, _ = studentised_bootstrap(values)
+    assert np.isclose(-low, high, rtol=0.05)
+
+
+def test_values_by_unit_of_any_type():
+    found = compare({"a": np.uint8(1), "b": np.uint8(3), "c": None}, {"a": np.uint8(2), "b": np.uint8(1), "c": 2.0})
+    assert (found.mean, found.n) == (0.5, 2)
+    assert compare({"a": True}, {"a": False}).mean == 1
+
+
 def test_the_p_value_of_the_bootstrap():
     """As the docstring says, drawn anew; and above .05 where the interval of the same resamples holds the mean."""
     values = np.random.default_rng(7).exponential(1.0, 20) - 0.6

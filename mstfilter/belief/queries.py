@@ -112,7 +112,7 @@ class Belief:
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The n distinct hypotheses."""
+        """The n hypotheses of the population."""
         return tuple(self.population.particles)
 
     @property
@@ -253,8 +253,10 @@ class Belief:
         """Borders in the image that separate two objects in some hypotheses only, the most uncertain first.
 
         A border is open if the probability that both sides are one object, given that both sides are objects, is
-        between `at_least` and 1 - `at_least`. Borders separate the parts of the common refinement of all label
-        images. Parts of fewer than 200 pixels (in an image of 640 x 480) join the nearest larger part.
+        between `at_least` and 1 - `at_least`. Both sides must be objects with a probability above `at_least`.
+        Borders separate the parts of the common refinement of all label images. In an image of 640 x 480, parts of
+        fewer than 200 pixels join the nearest larger part, and borders of fewer than 14 pixels are left out. Borders
+        of one object with the same answer in all hypotheses are one border.
         """
         check_number("at_least", at_least, at_least=0, at_most=0.5)
         refined = self._refined_image(camera)
@@ -348,6 +350,8 @@ class Belief:
             which = first_seen(o for o, _ in outcomes)
         except TypeError as error:
             raise InputError(f"outcomes cannot be compared ({error})", "for arrays: array.tobytes()") from error
+        if any(isinstance(o, float) and o != o for o, _ in outcomes):
+            raise InputError("an outcome is NaN, which is not equal to itself", "return None, or another constant")
         return entropy(np.bincount(which, [w for _, w in outcomes]))
 
     def estimate(self) -> Hypothesis:

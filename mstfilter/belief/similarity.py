@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.errors import InputError
 from mstfilter.fields import PositiveInt
 from mstfilter.scene import Hypothesis
+from mstfilter.scene.evidence import check_grid
 from mstfilter.scene.partitions import canonical
 from mstfilter.scoring import pairwise_quality
 from mstfilter.smc import Equivalence, Similarity, first_seen
@@ -43,7 +43,6 @@ class WeightedCoverage(Similarity):
 
     def matrix(self, particles: Sequence[Hypothesis]) -> np.ndarray:
         step = slice(None, None, self.stride)
-        grids = [h.labels[step, step, step] for h in particles]
-        if len({g.shape for g in grids}) != 1:
-            raise InputError("hypotheses have label grids of different shapes, expected the same for all")
-        return pairwise_quality(grids)
+        for h in particles:
+            check_grid("a hypothesis", h, particles[0].grid)
+        return pairwise_quality([h.labels[step, step, step] for h in particles])

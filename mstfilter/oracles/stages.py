@@ -25,6 +25,7 @@ import numpy as np
 from mstfilter.oracles.truth import Need, UsesTruth
 from mstfilter.partition import Cells, PairOdds
 from mstfilter.scene import Clip, Evidence, Frame, Hypothesis, Projection, frame_geometry, render
+from mstfilter.scene.evidence import cleared
 from mstfilter.scoring import overlap, weighted_coverage
 from mstfilter.smc import Population, Transition
 from mstfilter.tracking import Warp, move_points, rigid_transform
@@ -85,16 +86,10 @@ class TrueFreeSpace(UsesTruth, Projection):
     def project(self, hypothesis: Hypothesis, frame: Frame) -> tuple[Hypothesis, float]:
         """The hypothesis without truly free visible voxels, and the fraction of occupied voxels that remain."""
         labels = self.truth.labels(self.truth.pause_of(frame))
-        free = labels == 0
         geometry = frame_geometry(frame, hypothesis.grid)
         depth = render(labels, hypothesis.grid, frame.camera).depth
         surface = np.where(np.isnan(depth), np.inf, depth).ravel()[np.maximum(geometry.pixel, 0)]
-        occupied = hypothesis.labels != 0
-        hit = occupied & free & (geometry.pixel >= 0) & (geometry.z < surface)
-        if not hit.any():
-            return hypothesis, 1.0
-        kept = hypothesis.with_labels(np.where(hit, 0, hypothesis.labels).astype(np.uint16))
-        return kept, 1.0 - int(hit.sum()) / int(occupied.sum())
+        return cleared(hypothesis, (labels == 0) & (geometry.pixel >= 0) & (geometry.z < surface))
 
 
 @dataclass(frozen=True)

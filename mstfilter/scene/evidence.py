@@ -123,13 +123,17 @@ class FreeSpace(Projection):
 
     def project(self, hypothesis: Hypothesis, frame: Frame) -> Projected:
         """Clear the voxels that the frame observes as free. Without occupied voxels, the returned share is 1."""
-        free = self.known_free(frame, hypothesis.grid)
-        occupied = hypothesis.labels != 0
-        possible = occupied if hypothesis.occupancy is None else hypothesis.occupancy.probability > 0
-        if not (possible & free).any():
-            return hypothesis, 1.0
-        quality = 1.0 - int((occupied & free).sum()) / max(int(occupied.sum()), 1)
-        return hypothesis.without(possible & free), quality
+        return cleared(hypothesis, self.known_free(frame, hypothesis.grid))
+
+
+def cleared(hypothesis: Hypothesis, free: np.ndarray) -> Projected:
+    """A hypothesis without the voxels `free` (X, Y, Z) bool, and the share of its occupied voxels that remain."""
+    occupied = hypothesis.labels != 0
+    possible = occupied if hypothesis.occupancy is None else hypothesis.occupancy.probability > 0
+    if not (possible & free).any():
+        return hypothesis, 1.0
+    quality = 1.0 - int((occupied & free).sum()) / max(int(occupied.sum()), 1)
+    return hypothesis.without(possible & free), quality
 
 
 def log_quality(quality: np.ndarray) -> np.ndarray:

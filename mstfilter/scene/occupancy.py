@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 
+from mstfilter.errors import InputError
 from mstfilter.scene.arrays import content_key, read_only
 
 
@@ -35,6 +36,8 @@ class Occupancy:
 
     def __init__(self, owner: np.ndarray, probability: np.ndarray) -> None:
         owner, p = np.asarray(owner), np.asarray(probability)
+        if p.size and not 0 <= p.min() <= p.max() <= 1.001:  # rounded to half precision
+            raise InputError(f"probabilities of voxels are from {p.min():g} to {p.max():g}, expected 0 to 1")
         voxels = np.flatnonzero((owner > 0) | (p > 0))
         self._store(owner.shape, voxels, owner.ravel()[voxels], p.ravel()[voxels])
 

@@ -14,9 +14,9 @@ objects that are visible at this pause, that were visible only at earlier pauses
 (`mstfilter.scoring.object_status`). ``quality_one_blob``, ``quality_components``: trivial baselines, with the
 occupied voxels as one object or as their connected components. ``occupancy``: intersection over union of the occupied
 voxels. ``volume_missed``, ``volume_invented``: volume that is occupied only in the truth, and only in the hypothesis,
-divided by the true volume. ``object_f``: F score of objects at IoU 0.5. ``split``, ``merged``, ``missed``,
-``invented``: numbers of objects (see `object_metrics`). ``diversity``: 1 - mean quality over pairs of hypotheses,
-which is 0 if all hypotheses are identical.
+divided by the true volume; NaN if it is 0. ``object_f``: F score of objects at IoU 0.5. ``split``, ``merged``,
+``missed``, ``invented``: numbers of objects (see `object_metrics`). ``diversity``: 1 - mean quality over pairs of
+hypotheses, which is 0 if all hypotheses are identical.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from mstfilter.scene import common_refinement, occupied_box
+from mstfilter.errors import InputError
+from mstfilter.scene import as_labels, common_refinement, occupied_box
 from mstfilter.scoring.quality import (
     FORMS,
     STATUSES,
@@ -58,7 +59,7 @@ def pause_metrics(
     status : mapping
         True label -> visible, hidden or unseen; empty if unknown.
     """
-    (truth, *labels), n_free = _cropped([truth, *labels])
+    (truth, *labels), n_free = _cropped(_checked([truth, *labels]))
     which = first_seen(one.tobytes() for one in labels)
     distinct = [labels[k] for k in np.unique(which, return_index=True)[1]]
     tables = [overlap(one, truth) for one in distinct]
@@ -94,6 +95,16 @@ def pause_metrics(
     row["quality_estimate"] = float(q[int(np.argmax(between @ weights))])
     row["diversity"] = diversity(between)
     return row, q
+
+
+def _checked(labels: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The labels as uint16. Raises InputError for invalid labels, or for shapes that differ."""
+    found = [as_labels(one, "segmentation") for one in labels]
+    if len({one.shape for one in found}) != 1:
+        raise InputError(
+            f"segmentations have shapes {[one.shape for one in found]}, expected at least one, all equal"
+        )
+    return found
 
 
 def _cropped(grids: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
@@ -140,8 +151,8 @@ def object_metrics(table: Overlap) -> dict[str, float]:
     related = lies | holds
     return {
         "occupancy": both / (found + true - both) if found + true else 1.0,
-        "volume_missed": (true - both) / max(true, 1.0),
-        "volume_invented": (found - both) / max(true, 1.0),
+        "volume_missed": (true - both) / true if true else float("nan"),
+        "volume_invented": (found - both) / true if true else float("nan"),
         "object_f": float(2 * np.count_nonzero(jaccard > 0.5) / n) if n else 1.0,
         "split": float(((lies & fragment).sum(axis=0) >= 2).sum()),
         "merged": float((holds.sum(axis=1) >= 2).sum()),
@@ -152,7 +163,7 @@ def object_metrics(table: Overlap) -> dict[str, float]:
 
 def pairwise_quality(labels: Sequence[np.ndarray]) -> np.ndarray:
     """Quality (n, n) of all pairs of label grids of one shape, in the form ``objects``; 1 on the diagonal."""
-    refined = common_refinement(labels)
+    refined = common_refinement(_checked(labels))
     common = refined.overlaps()[1:, 1:]
     sizes = common.diagonal().copy()
     jaccard = common / (sizes[:, None] + sizes - common)

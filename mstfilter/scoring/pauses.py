@@ -57,6 +57,8 @@ class PauseEstimate:
         check_normalised(self.weights, len(self.hypotheses), f"hypotheses at frame {self.frame}")
         grids = [one.grid for one in self.hypotheses if isinstance(one, Hypothesis)]
         object.__setattr__(self, "grid", self.grid or next(iter(grids), None))
+        for one in grids:
+            _check_grid(one, self.grid, f"a hypothesis at frame {self.frame}", "its estimate")
 
     @property
     def labels(self) -> list[np.ndarray]:
@@ -151,6 +153,8 @@ def measure_pause(
     counts : (r, 1001, 2) int32, or None without ground truth
         The field `counts` of `BeliefScore`.
     """
+    for h in hypotheses:
+        _check_grid(h.grid, recording.grid, f"a hypothesis at pause {t}", f"recording {recording.name}")
     labels = [h.labels for h in hypotheses]
     row: dict[str, Any] = {"pause": t, "time_s": recording.times[recording.pauses[t]], "n": len(labels)}
     row["n_objects"] = float(np.mean([h.n_objects for h in hypotheses]))
@@ -204,11 +208,8 @@ def _comparable(
     """A function that converts a label volume for comparison with the truth, and the truth in the same form."""
     grid, camera = estimate.grid, truth.camera
     if camera is None:
-        if grid is not None and truth.grid is not None and not _same_grid(grid, truth.grid):
-            raise InputError(
-                f"pause {pause}: hypotheses are on {grid}, truth on {truth.grid}",
-                "run the filter on the recording that has the ground truth, or give it the same workspace",
-            )
+        if grid is not None:
+            _check_grid(grid, truth.grid, f"pause {pause}: the hypotheses", "the truth")
         return lambda labels: labels, truth.labels
     if grid is None:
         raise InputError("label volumes without a grid cannot be projected", "give the field `grid`")
@@ -216,6 +217,8 @@ def _comparable(
     return lambda labels: render(labels, grid, camera).labels[known], truth.labels[known]
 
 
-def _same_grid(a: VoxelGrid, b: VoxelGrid) -> bool:
-    ends = np.allclose([a.origin, a.upper], [b.origin, b.upper], atol=1e-6)  # up to single precision
-    return a.shape == b.shape and bool(ends)
+def _check_grid(a: VoxelGrid, b: VoxelGrid | None, name: str, other: str) -> None:
+    """Raise InputError if two workspaces differ by more than single precision."""
+    if b and not (a.shape == b.shape and np.allclose([a.origin, a.upper], [b.origin, b.upper], atol=1e-6)):
+        hint = "run the filter on the recording that has the ground truth, or give it the same workspace"
+        raise InputError(f"{name}: the workspace is {a}, but {other} has {b}", hint)

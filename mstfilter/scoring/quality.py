@@ -113,7 +113,8 @@ def weighted_coverage(a: np.ndarray, b: np.ndarray, form: Form = "objects") -> f
     a, b : integer arrays of the same shape
         Labels, 0 is background or free.
     form : {"objects", "paper", "authors"}
-        The module describes the forms. The quality is 1 without any objects, and 0 if only one argument has objects.
+        The module describes the forms. The quality is 1 without any objects. Except in the form ``paper``, it is 0 if
+        only one argument has objects.
     """
     return quality_of(overlap(a, b), form)
 

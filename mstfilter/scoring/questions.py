@@ -12,7 +12,7 @@ answer has a better expected score than the true probabilities.
 **Questions.** A voxel is *in question* at pause t if three conditions hold. The voxel is above the table. The depth
 images of pause t do not observe the voxel as free. The voxel contains a depth reading above the table at pause t or
 earlier, or is up to 10 cm behind one along the camera's z axis. The first voxel u of a question is uniform among the
-voxels in question. The second voxel v is uniform among the other voxels in question within 8 voxels of u.
+voxels in question that have another one within 8 voxels. The second voxel v is uniform among these others of u.
 
 **Noise.** Labels do not state the uncertainty of a border. So `Questions.forecasts` also returns forecasts for labels
 with noise. With probability e, each voxel independently takes the label of one of its six neighbours. Only
@@ -225,7 +225,7 @@ def _behind_readings(frame: Frame, grid: VoxelGrid) -> np.ndarray:
 
 def draw_questions(where: np.ndarray, n: int, rng: np.random.Generator) -> Questions:
     """Draw n pairs of near voxels of `where` (X, Y, Z) bool; none if no two voxels are near each other."""
-    where = np.asarray(where, dtype=bool)
+    where = np.array(where, dtype=bool)
     voxels = np.argwhere(where)
     axis = np.arange(-REACH, REACH + 1)
     offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -248,15 +248,13 @@ def draw_questions(where: np.ndarray, n: int, rng: np.random.Generator) -> Quest
                 v[k] = options[rng.integers(len(options))] - REACH
         return v
 
-    first = voxels[rng.integers(max(len(voxels), 1), size=n if len(voxels) > 1 else 0)]
-    second = partners(first)
-    alone = second[:, 0] < 0
-    if alone.all():
-        first = second = np.zeros((0, 3), np.int64)
-    elif alone.any():  # u is uniform among the voxels that have a partner
-        first, second = first[~alone], second[~alone]
-        more = draw_questions(where, n - len(first), rng)
-        pairs = np.unravel_index(np.stack([more.first, more.second]), where.shape)
-        first, second = (np.concatenate([own, np.stack(pairs, axis=-1)[k]]) for k, own in enumerate((first, second)))
-    flat = [np.ravel_multi_index(tuple(pair.T), where.shape) for pair in (first, second)]
-    return Questions(where.shape, flat[0], flat[1])
+    first = second = np.zeros((0, 3), np.int64)
+    while len(first) < n and len(voxels) > 1:
+        u = voxels[rng.integers(len(voxels), size=n - len(first))]
+        v = partners(u)
+        alone = v[:, 0] < 0
+        first, second = np.concatenate([first, u[~alone]]), np.concatenate([second, v[~alone]])
+        where[tuple(u[alone].T)] = False  # u is uniform among the voxels that have a partner
+        voxels = voxels[where[tuple(voxels.T)]]
+    flat = [np.asarray(np.ravel_multi_index(tuple(pair.T), where.shape)) for pair in (first, second)]
+    return Questions(where.shape, *flat)

@@ -106,7 +106,8 @@ class Summary:
     arms: tuple[str, ...]
     names: tuple[str, ...]
     reference: str
-    warm: bool  #: all times are of runs that found shared work in the cache (the first seed of each arm is omitted)
+    #: All times are of runs that found shared work in the cache (the first seed of an arm and scene is omitted).
+    warm: bool
     metrics: tuple[ArmMetric, ...]
     differences: tuple[Compared, ...]  #: primary endpoints first, then their slopes, then all other metrics
 
@@ -179,11 +180,12 @@ def summarise(
     values = _by_seed([row for row in rows if row["pause"] >= 1], measured)
     spent = [k for k in named if k in cost]
     zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
-    seeds: dict[Any, set[Any]] = defaultdict(set)
+    seeds: dict[Any, dict[Any, set[Any]]] = defaultdict(lambda: defaultdict(set))
     for row in rows:
-        seeds[row["family"], row["arm"]].add(row["seed"])
-    filling = {of_arm: min(found) for of_arm, found in seeds.items() if len(found) > 1}
-    warm = [{**zero, **row} for row in rows if filling.get((row["family"], row["arm"])) != row["seed"]]
+        seeds[row["family"], row["arm"]][row["scene"]].add(row["seed"])
+    several = {of_arm for of_arm, scenes in seeds.items() if any(len(found) > 1 for found in scenes.values())}
+    filling = {(*of_arm, scene): min(found) for of_arm in several for scene, found in seeds[of_arm].items()}
+    warm = [{**zero, **row} for row in rows if filling.get((row["family"], row["arm"], row["scene"])) != row["seed"]]
     values.update(_by_seed(warm, spent))
     for endpoint, slope_name in SLOPES.items():
         if endpoint in measured:
@@ -212,7 +214,7 @@ def summarise(
         for pair in [(_means(of_arm, of_reference), _means(of_reference, of_arm))]
         for difference in [compare(*pair, name in ENDPOINTS)]
     ]
-    return Summary(families, arms, names, reference, set(seeds) == set(filling), metrics, _adjust(differences))
+    return Summary(families, arms, names, reference, set(seeds) == several, metrics, _adjust(differences))
 
 
 def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:

@@ -341,3 +341,16 @@ def test_probabilities_of_unsure_hypotheses():
     np.testing.assert_allclose(belief.occupancy(), occupied, atol=1e-12)
     every = np.array(VOXELS)
     np.testing.assert_allclose(belief.same_object(every[:, None], every[None]), same, atol=1e-12)
+
+
+def test_an_outcome_that_is_not_a_number_is_an_error():
+    empty = Hypothesis.from_labels(np.zeros((2, 2, 2), int), VoxelGrid((0, 0, 0), 0.01, (2, 2, 2)))
+    belief = Belief(Population((empty,) * 3))
+    assert belief.information(lambda h: None) == 0
+    with pytest.raises(InputError, match="NaN"):
+        belief.information(lambda h: float("nan"))
+
+
+def test_probabilities_above_one_are_an_error():
+    with pytest.raises(InputError, match="expected 0 to 1"):
+        Occupancy(np.ones((2, 2, 2), int), np.full((2, 2, 2), 3.0))

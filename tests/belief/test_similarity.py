@@ -43,7 +43,7 @@ def test_hypotheses_without_any_object():
     with pytest.raises(InputError, match="stride"):
         WeightedCoverage(stride=0)
     other = VoxelGrid(np.zeros(3), 0.01, (2, 2, 2))
-    with pytest.raises(InputError, match="shapes"):
+    with pytest.raises(InputError, match="grid of a hypothesis"):
         WeightedCoverage().matrix([empty, Hypothesis.from_labels(np.zeros((2, 2, 2), int), other)])
 
 

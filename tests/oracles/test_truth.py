@@ -25,7 +25,7 @@ from mstfilter.oracles.truth import RecordingTruth
 from mstfilter.partition import Cells, Choices, Readings
 from mstfilter.presets import build_filter, describe_filter, load_config
 from mstfilter.runs import filter_recording
-from mstfilter.scene import Hypothesis, component_key
+from mstfilter.scene import Hypothesis, Occupancy, component_key
 from mstfilter.scoring import weighted_coverage
 from mstfilter.segmentation import ColourDepthBoundary
 from mstfilter.smc import Key, LargestWeights, Population
@@ -254,7 +254,12 @@ def test_true_free_space_clears_what_is_free_and_seen(recording):
         Hypothesis.from_labels(shadow, recording.grid), frame
     )
     assert (kept.labels == shadow).all() and share == 1
+    # Probabilities of voxels that are no label are cleared too.
     exact = Hypothesis.from_labels(true, recording.grid)
+    air = (labels == 3) & (seen.labels == 0)
+    unsure = replace(exact, occupancy=Occupancy(np.where(air, 3, true), np.where(air, 0.4, true > 0)))
+    kept, share = bind_truth(TrueFreeSpace(), recording).project(unsure, frame)
+    assert not kept.shares.probability[air].any() and share == 1
     assert bind_truth(TrueFreeSpace(), recording).project(exact, frame) == (exact, 1.0)
 
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
+from mstfilter.errors import InputError
 from mstfilter.scoring import diversity, least_loss, overlap, pairwise_quality, pause_metrics, weighted_coverage
 from mstfilter.scoring.metrics import coverage_of, object_metrics
 
@@ -118,3 +119,17 @@ def test_empty_worlds():
     assert pause_metrics([nothing], np.ones(1), nothing, {})[0]["quality"] == 1.0
     assert pause_metrics([nothing], np.ones(1), some, {1: "visible"})[0]["missed"] == 1
     assert pause_metrics([some], np.ones(1), nothing, {})[0]["invented"] == 1
+
+
+def test_invalid_segmentations_are_named():
+    one = np.array([0, 1, 1, 2])
+    for bad, message in ((np.array([0, -1, 1, 2]), "from -1 to 2"), (one / 2, "float64"), (one[:2], "shapes")):
+        with pytest.raises(InputError, match=message):
+            pairwise_quality([one, bad])
+        with pytest.raises(InputError, match=message):
+            pause_metrics([bad], np.ones(1), one, {})
+
+
+def test_the_volume_has_no_share_of_nothing():
+    row, _ = pause_metrics([np.ones((2, 2, 2), int)], np.ones(1), np.zeros((2, 2, 2), int), {})
+    assert math.isnan(row["volume_missed"]) and math.isnan(row["volume_invented"])

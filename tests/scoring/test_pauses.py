@@ -109,7 +109,7 @@ def test_input_that_does_not_match_is_an_error(tmp_path):
     other = VoxelGrid((1, 1, 0), 0.01, GRID.shape)
     labels = table_scene(0)[2]
     for estimate, message in (
-        ([PauseEstimate([labels], np.ones(1), 0, other)], r"on VoxelGrid\(.*shape=\(60, 60, 30\)\), truth on"),
+        ([PauseEstimate([labels], np.ones(1), 0, other)], r"is VoxelGrid\(.*shape=\(60, 60, 30\)\), but the truth"),
         ([PauseEstimate([labels], np.ones(1), 7, GRID)], "no pause has both"),
     ):
         with pytest.raises(InputError, match=message):
@@ -122,5 +122,7 @@ def test_weights_and_grids_are_checked():
     with pytest.raises(InputError, match="2 with the weights"):
         PauseEstimate([line("110000"), line("110220")], np.ones(2), 0)
     shifted = Hypothesis.from_labels(line("110220"), VoxelGrid((0.1, 0, 0), 0.01, (6, 1, 1)))
-    with pytest.raises(InputError, match="truth on"):
+    with pytest.raises(InputError, match="but the truth has"):
         score_pauses([PauseEstimate([shifted], np.ones(1), 0)], [PauseTruth(line("110220"), 0, SMALL)])
+    with pytest.raises(InputError, match="a hypothesis at frame 0"):
+        PauseEstimate([Hypothesis.from_labels(line("110220"), SMALL), shifted], np.full(2, 0.5), 0)

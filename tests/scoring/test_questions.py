@@ -52,6 +52,16 @@ def test_the_law_of_the_pairs():
         assert abs(pairs.count(pair) / n - p) < 4 * np.sqrt(p * (1 - p) / n)
 
 
+@pytest.mark.parametrize("n", [1, 20])
+def test_voxels_without_a_partner_are_left_out(n):
+    where = np.zeros((60,) * 3, bool)
+    where[::20, ::20, ::20] = where[0, 0, 1] = True
+    for seed in range(5):
+        questions = draw_questions(where, n, np.random.default_rng(seed))
+        assert len(questions) == n and set(questions.first) | set(questions.second) == {0, 1}
+    assert where.sum() == 28
+
+
 def test_no_two_near_voxels_give_no_questions():
     where = np.zeros((30, 1, 1), bool)
     assert len(draw_questions(where, 10, np.random.default_rng(0))) == 0
