@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mstfilter.errors import InputError, check_choice, naming
+from mstfilter.errors import InputError, check_choice, check_number, naming
 from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.formats.video import RecordingFormat, check_images, read_optional, warn_of_unread
 from mstfilter.reading import read_arrays, read_json, read_model
@@ -90,7 +90,7 @@ class RecordingWriter:
         self.path = Path(path)
         check_output(self.path, folder=True)
         self._camera, self._grid, self._scale = camera, grid, depth_scale
-        self._manifest = {"version": VERSION, **manifest}
+        self._manifest = _stored({"version": VERSION, **manifest}, "an entry of the manifest")
         self._frames: list[dict[str, Any]] = []
         self._poses: list[dict[str, Any]] = []
         self._voxels: list[np.ndarray] = []
@@ -121,6 +121,9 @@ class RecordingWriter:
         """
         index = len(self._frames)
         check_choice(f"role of frame {index}", role, ("static", "action"))
+        entry = _stored(entry, f"an entry of frame {index}")
+        before = self._frames[-1]["time_s"] if index else -np.inf
+        check_number(f"time of frame {index}", time_s, "times are in seconds and ascend", above=before)
         units = np.rint(np.nan_to_num(np.ma.filled(depth, 0).astype(np.float64) / self._scale, nan=0.0, posinf=0.0))
         units[(units < 0) | (units > 65535)] = 0  # out of range: no reading
         if not units.any() and np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
@@ -132,7 +135,7 @@ class RecordingWriter:
             "rgb": rgb,
             "depth": units.astype(np.uint16),
             "instance": instance,
-            "robot": None if robot_mask is None else robot_mask.astype(np.uint8) * 255,
+            "robot": None if robot_mask is None else np.asarray(robot_mask, dtype=bool).astype(np.uint8) * 255,
         }
         for part, image in images.items():
             if image is None:
@@ -169,6 +172,8 @@ class RecordingWriter:
         described = _CameraFile.of(camera, depth_scale=self._scale, workspace=workspace).model_dump()
         manifest = {**self._manifest, "frames": self._frames}
         with self._writing(), self._open:
+            if not self._frames:
+                raise InputError(f"recording {self.path} has no frame", "call add_frame before close")
             (self._folder / "camera.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
             (self._folder / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
             if self._poses:
@@ -195,6 +200,16 @@ class RecordingWriter:
             self.close()
         else:
             self._open.__exit__(kind, *error)  # removes all files written so far
+
+
+def _stored(entries: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Entries as JSON stores them. Raises InputError for values that JSON cannot store."""
+    number = np.ndarray, np.generic
+    try:
+        plain = json.dumps(entries, default=lambda value: value.tolist() if isinstance(value, number) else str(value))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} cannot be stored as JSON: {error}") from error
+    return dict(json.loads(plain))
 
 
 def save_recording(

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, check_number, warn_user
+from mstfilter.fields import NonNegativeFloat
 from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import Video, VideoFormat, object_numbers, pair_stamps, read_optional, warn_of_unread
@@ -49,7 +50,7 @@ class PairedImages(VideoFormat):
     """
 
     frames: tuple[str | int, ...] = ()
-    depth_scale: float = 0.0
+    depth_scale: NonNegativeFloat = 0.0
     pauses: PauseRule = field(default_factory=EveryNth)
 
     @classmethod
@@ -129,8 +130,8 @@ class Redwood(VideoFormat):
         Frames per second, used if names are not time stamps. The default is the rate in the intrinsics file, else 30.
     """
 
-    depth_scale: float = 0.0
-    fps: float = 0.0
+    depth_scale: NonNegativeFloat = 0.0
+    fps: NonNegativeFloat = 0.0
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -260,7 +261,10 @@ def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Pat
     of_number = {_number(file): file for file in depth}
     pairs = [(file, of_number[n]) for file in colour if (n := _number(file)) in of_number and n > last]
     if not pairs and not after:
-        raise InputError("no colour image has a depth image of the same number")
+        raise InputError(
+            "no colour image has a depth image of the same number",
+            "a live run pairs images by number: give both images of a pair the same name",
+        )
     if not pairs or time.time() - max(file.stat().st_mtime for file in pairs[-1]) > _WRITTEN_S:
         return pairs
     return pairs[:-1]
@@ -379,7 +383,7 @@ class Tum(VideoFormat):
     Parameters: `VideoFormat`.
     """
 
-    depth_scale: float = 0.0002
+    depth_scale: NonNegativeFloat = 0.0002
 
     @classmethod
     def detects(cls, path: Path) -> bool:

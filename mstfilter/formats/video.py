@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, warn_user
-from mstfilter.fields import Bounded, NonNegativeInt
+from mstfilter.fields import Bounded, NonNegativeFloat, NonNegativeInt
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
     WORKING_PIXELS,
@@ -296,9 +296,9 @@ class VideoFormat(RecordingFormat, Bounded):
     """
 
     K: tuple[float, ...] = ()
-    depth_scale: float = 0.001
+    depth_scale: NonNegativeFloat = 0.001
     distortion: tuple[float, ...] = ()
-    tolerance_s: float = 0.02
+    tolerance_s: NonNegativeFloat = 0.02
     start_s: float = 0.0
     stop_s: float = math.inf
     max_pixels: NonNegativeInt = WORKING_PIXELS

@@ -79,8 +79,13 @@ def _entries(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
 
 
-def _find(folder: Path, pause: int) -> Path:
-    """The file or folder of a pause."""
+def has_masks(folder: str | Path, first: int) -> bool:
+    """Whether a folder has masks with the number `first` or a larger one."""
+    return max(_by_pause(Path(folder)), default=-1) >= first
+
+
+def _by_pause(folder: Path) -> dict[int, list[Path]]:
+    """The files and folders of each pause."""
     if not folder.is_dir():
         raise InputError(f"folder of masks does not exist: {folder}")
     found: dict[int, list[Path]] = {}
@@ -88,6 +93,12 @@ def _find(folder: Path, pause: int) -> Path:
         name = path.name if path.is_dir() else path.stem
         if name.isdecimal() and (path.is_dir() or path.suffix in _SUFFIXES):
             found.setdefault(int(name), []).append(path)
+    return found
+
+
+def _find(folder: Path, pause: int) -> Path:
+    """The file or folder of a pause."""
+    found = _by_pause(folder)
     if not found:
         raise InputError(
             f"folder {folder} has no masks",

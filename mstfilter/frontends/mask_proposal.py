@@ -16,7 +16,8 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from mstfilter.completion import Completer, Extrude
-from mstfilter.frontends.mask_files import read_masks, write_masks
+from mstfilter.errors import warn_user
+from mstfilter.frontends.mask_files import has_masks, read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
 from mstfilter.scene import Clip, Recording, UsesFiles, content_key
 from mstfilter.segmentation import CutSampler, ExactCuts, ObjectRule, complete_segments
@@ -54,6 +55,10 @@ class MaskProposal(Proposal, UsesFiles):
         """Read the masks of all pauses."""
         for clip in recording.clips():
             read_masks(self.folder, clip.index, clip.after.depth.shape)
+        n = len(recording.pauses)
+        if has_masks(self.folder, n):
+            text = f"folder {self.folder} has masks with numbers above {n - 1}, but {recording.name} has {n} pauses"
+            warn_user(text, "masks are numbered by pause, from 0, and not by frame")
 
     def sample(self, rng: np.random.Generator, observation: Clip, n: int) -> Population:
         """Sample `n` hypotheses for the scene at the end of the clip, with equal weights."""

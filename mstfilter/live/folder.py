@@ -99,7 +99,7 @@ def filter_folder(
             with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
                 stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask)
                 for time, frame in frames:
-                    stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask)
+                    stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask, wait=True)
         except BaseException as error:
             finish("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
             raise

@@ -145,6 +145,7 @@ class Stream:
         self._n_pauses = 0
         self._last_time = -np.inf
         self._step: Future[None] | None = None
+        self._step_thread = 0
         self._error: BaseException | None = None
         self.last: Pause | None = None  #: the result at the last pause
         self.counts: Counter[str] = Counter()  #: see `Pause.counts`
@@ -161,6 +162,7 @@ class Stream:
         pose: np.ndarray | RigidTransform | None = None,
         robot_mask: np.ndarray | None = None,
         pause: bool | None = None,
+        wait: bool = False,
     ) -> bool:
         """Add a frame. The images are copied.
 
@@ -178,6 +180,8 @@ class Stream:
             Pixels that show the robot.
         pause : bool, optional
             Whether the frame is a pause, which ends a clip. By default, the rule `pauses` decides.
+        wait : bool
+            If the queue is full, wait for a place instead of dropping the frame.
 
         Returns
         -------
@@ -204,11 +208,12 @@ class Stream:
             return self._dropped("no depth", number, pause)
         if time <= self._last_time:
             return self._dropped("late", number, pause)
-        if self._queue.full():
+        if self._queue.full() and not wait:
             return self._dropped("overflow", number, pause)
         camera = self._camera
         if not isinstance(camera, Camera):
-            camera = self._camera = Camera(camera, np.shape(rgb)[1], np.shape(rgb)[0])
+            camera = Camera(camera, np.shape(rgb)[1], np.shape(rgb)[0])
+        known = camera
         if pose is not None:
             rigid = pose if isinstance(pose, RigidTransform) else rigid_from_matrix(pose, f"pose of frame {number}")
             camera = camera.at(rigid)
@@ -217,14 +222,18 @@ class Stream:
         frame = Frame(np.array(rgb), depth, camera, None if robot_mask is None else np.array(robot_mask))
         check_depth(frame.depth, f"depth image of frame {number}")
         frame = frame.resized(camera.limited(self._max_pixels))
-        self._last_time = time
+        self._last_time, self._camera = time, known
         self._queue.put(_Item(number, frame, time, pause, arrived))
         return True
 
     def _dropped(self, why: str, number: int, pause: bool | None = None) -> bool:
-        if pause or (why == "late" and not self.counts[why]):
-            hint = "the counts of dropped frames are in `counts`; times have to ascend, also after the clock is set"
-            warn_user(f"frame {number} is dropped: {why}{', a given pause is lost' * bool(pause)}", hint)
+        if pause or (why != "no depth" and not self.counts[why]):
+            hint = {
+                "late": "times have to ascend, also after the clock is set",
+                "overflow": "the frames arrive faster than they are processed: push fewer, or push(..., wait=True)",
+            }.get(why, "every frame needs a depth image")
+            text = f"frame {number} is dropped: {why}{', a given pause is lost' * bool(pause)}"
+            warn_user(text, f"{hint}; the counts of dropped frames are in `counts`")
         self.counts[why] += 1
         return False
 
@@ -246,7 +255,8 @@ class Stream:
         return Belief(self.last.state.population)
 
     def wait(self) -> None:
-        """Wait until all pushed frames are processed."""
+        """Wait until all pushed frames are processed. Raises InputError in `on_pause`."""
+        self._check_caller("wait")
         self._queue.join()
         if self._step is not None:
             with contextlib.suppress(Exception):  # raised by `_check`
@@ -254,7 +264,8 @@ class Stream:
         self._check()
 
     def close(self) -> None:
-        """Process the queued frames, and end the threads."""
+        """Process the queued frames, and end the threads. Raises InputError in `on_pause`."""
+        self._check_caller("close")
         if self._watcher.is_alive():
             self._queue.put(None)
             self._watcher.join()
@@ -270,6 +281,10 @@ class Stream:
         else:
             with contextlib.suppress(Exception):  # the first error is raised
                 self.close()
+
+    def _check_caller(self, name: str) -> None:
+        if threading.get_ident() == self._step_thread:
+            raise InputError(f"{name}() of a stream is called in on_pause", "call it in the thread that pushes")
 
     def _check(self) -> None:
         if self._error is not None:
@@ -362,6 +377,7 @@ class Stream:
 
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
         """Filter a clip. The argument `trackers` keeps the tracked flow in memory until the filter uses the flow."""
+        self._step_thread = threading.get_ident()
         try:
             with parallel(self._threads):
                 self._state, info = self._filter.step(self._state, clip)

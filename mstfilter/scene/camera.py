@@ -235,10 +235,12 @@ def rigid_from_matrix(matrix: np.ndarray, where: str = "pose") -> RigidTransform
             "leave the pose out to find it from the support plane",
         )
     R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+    away = np.abs(R @ R.T - np.eye(3)).max()
+    if away > 1e-3 or np.linalg.det(R) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
         left_handed = bool(np.linalg.det(R) < 0)
         raise InputError(
             f"{where} is not a rigid transform{', its axes are left-handed' * left_handed}: {matrix.tolist()}",
-            "expected a 4x4 matrix with a rotation in its upper left and last row 0 0 0 1",
+            "expected a 4x4 matrix with a rotation R in its upper left and last row 0 0 0 1",
+            f"R R^T differs from 1 by {away:.1g}, at most 0.001 is allowed: are its numbers rounded?",
         )
     return RigidTransform.from_matrix(matrix)

@@ -158,6 +158,7 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
     import cv2
 
     image = _load_array(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim != 2 or not (image.dtype in (np.uint16, np.int16) or np.issubdtype(image.dtype, np.floating)):
         raise InputError(
             f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits or "
@@ -167,6 +168,7 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
     if np.issubdtype(image.dtype, np.floating):
         unit = 1
         check_depth(image, f"depth image {path}")
+        image = image.astype(np.float32)
     read = (image > 0) & (image != 65535)
     return np.where(read, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
 

@@ -171,7 +171,7 @@ class Recording:
             pose is computed from the support plane at the first pause.
         grid : VoxelGrid or float
             Workspace, or the voxel size in metres of one that covers the table (sides of 1 to 2 m, height 0.5 m).
-        robot_masks : (T, H, W) bool, optional
+        robot_masks : (T, H, W) bool, or T of (H, W) bool or None, optional
             Pixels that show the robot.
         times : sequence of float, optional
             Times in seconds. The default times are 0, 1, 2, ...
@@ -204,6 +204,8 @@ class Recording:
                 "multiply raw readings by the depth scale: depth * 0.001 for millimetres",
             )
         n, height, width = depth.shape
+        if n == 0:
+            raise InputError(f"{name} has no frame")
         for index, image in enumerate(depth):
             check_depth(image, f"depth image of frame {index} of {name}")
         cameras = _cameras(Camera(K, width, height), T_world_camera, n)
@@ -228,11 +230,11 @@ class Recording:
         chosen = tuple(int(p) for p in listed)
         if not chosen or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
-        masks = [None] * n if robot_masks is None else list(np.asarray(robot_masks, dtype=bool))
-        if len(masks) != n:
-            raise InputError(
-                f"robot_masks has shape {np.asarray(robot_masks).shape}, expected {depth.shape} of {name}"
-            )
+        some: Any = [None] * n if robot_masks is None else robot_masks
+        if len(some) != n:
+            shape = getattr(robot_masks, "shape", (len(some),))
+            raise InputError(f"robot_masks has shape {shape}, expected {depth.shape} of {name}")
+        masks = [None if mask is None else np.asarray(mask, dtype=bool) for mask in some]
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
         posed, grid = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:

@@ -57,7 +57,10 @@ class VoxelGrid:
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise InputError(f"grid origin is {self.origin!r}, expected three finite numbers in metres")
         if size.shape != () or not (np.isfinite(size) and size > 0):
-            raise InputError(f"voxel size is {self.voxel_size!r}, expected metres > 0")
+            raise InputError(
+                f"voxel size is {self.voxel_size!r}, expected metres > 0",
+                "for a workspace with two corners: VoxelGrid.from_bounds(lower, upper, voxel_size)",
+            )
         if counts.shape != (3,) or not (
             np.isfinite(counts).all() and (counts >= 1).all() and (counts % 1 == 0).all()
         ):
@@ -78,16 +81,15 @@ class VoxelGrid:
     @classmethod
     def from_bounds(cls, lower: np.ndarray, upper: np.ndarray, voxel_size: float) -> VoxelGrid:
         """The grid that covers a box given by two corners in metres."""
-        lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-        if not (
-            np.isfinite(voxel_size) and voxel_size > 0 and (upper > lower).all() and np.isfinite(upper - lower).all()
-        ):
+        lower, upper, size = _numbers(lower), _numbers(upper), _numbers(voxel_size)
+        shapes = lower.shape == upper.shape == (3,) and size.ndim == 0
+        if not (shapes and (lower < upper).all() and np.isfinite(upper - lower).all() and 0 < size < np.inf):
             raise InputError(
                 f"workspace from {lower.tolist()} to {upper.tolist()} in voxels of {voxel_size} m has no voxel",
                 "min must be below max in all three axes, in metres",
             )
-        shape = np.maximum(1, np.ceil((upper - lower) / voxel_size - 1e-6)).astype(int)
-        return cls(lower, voxel_size, tuple(shape))
+        shape = np.maximum(1, np.ceil((upper - lower) / size - 1e-6)).astype(int)
+        return cls(lower, float(size), tuple(shape))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, VoxelGrid) and self.key == other.key

@@ -14,7 +14,7 @@ import pytest
 from scipy.stats import chisquare
 
 from mstfilter.completion import Extrude
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, InputWarning
 from mstfilter.frontends import (
     MaskProposal,
     mask_tree,
@@ -25,7 +25,7 @@ from mstfilter.frontends import (
     write_masks,
 )
 from mstfilter.presets import preset
-from mstfilter.scene import project, render, scene_cache, write_image
+from mstfilter.scene import Recording, project, render, scene_cache, write_image
 from mstfilter.segmentation import ExactCuts, ObjectRule
 from mstfilter.smc.testing import ProposalContract
 from mstfilter.testing import scene_example
@@ -360,3 +360,12 @@ def test_a_surface_without_readings_is_estimated_as_by_the_other_proposals(tmp_p
         (hypothesis,) = proposal.sample(np.random.default_rng(0), dark, 1).particles
         covered.append((project(hypothesis, frame.camera)[hole] > 0).mean())
     assert covered[0] < 0.8 and covered[1] > 0.95, covered
+
+
+def test_masks_of_frames_instead_of_pauses_give_a_warning(tmp_path):
+    recording = Recording((CLIP.after,) * 2, CLIP.grid, (0,), (0.0, 1.0))
+    write_masks(tmp_path, 0, [BOX[0].astype(int)])
+    MaskProposal(str(tmp_path)).check_files(recording)
+    write_masks(tmp_path, 1, [BOX[0].astype(int)])
+    with pytest.warns(InputWarning, match="numbers above 0, but arrays has 1 pauses"):
+        MaskProposal(str(tmp_path)).check_files(recording)

@@ -158,10 +158,34 @@ def test_a_live_folder_has_the_robot_masks(tmp_path):
 def test_a_full_queue_drops_frames_and_says_so():
     gate = threading.Event()
     with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4, on_pause=lambda pause: gate.wait()) as stream:
-        n = sum(stream.push(RGB[k % 17], DEPTH[k % 17], k, pause=True) for k in range(30))
+        with pytest.warns(InputWarning, match="overflow"):
+            n = sum(stream.push(RGB[k % 17], DEPTH[k % 17], k, pause=True) for k in range(30))
         gate.set()
     assert n < 30 and stream.counts["overflow"] == 30 - n
     assert stream.last.index == n - 1  # every accepted frame was a pause
+
+
+def test_frames_may_wait_for_a_place_in_the_queue():
+    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4) as stream:
+        assert all(stream.push(RGB[0], DEPTH[0], k, pause=k in (0, 19), wait=True) for k in range(20))
+        stream.wait()
+        assert stream.last.index == 1 and stream.counts["overflow"] == 0
+
+
+@pytest.mark.parametrize("name", ["wait", "close"])
+def test_a_callback_cannot_wait_for_itself(name):
+    stream = mstfilter.Stream(CAMERA.K, FAST, pauses=None, on_pause=lambda pause: getattr(stream, name)())
+    stream.push(RGB[0], DEPTH[0], 0, pause=True)
+    for _ in range(2):
+        with pytest.raises(InputError, match="in on_pause"):
+            stream.close()
+
+
+def test_a_first_frame_that_is_refused_does_not_set_the_camera():
+    with mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+        with pytest.raises(InputError, match="expected"):
+            stream.push(np.repeat(RGB[0], 2, axis=1), DEPTH[0], 0)
+        assert stream.push(RGB[0], DEPTH[0], 1, pause=True)
 
 
 def test_errors_of_frames_and_threads_reach_the_caller():

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, render, write_image
+from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, read_depth, render, write_image
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording
@@ -363,3 +363,52 @@ def test_parts_of_a_session_share_a_world(tmp_path):
     with pytest.raises(InputError, match="grid of prediction") as caught:
         check_grid("prediction", hypothesis, first.grid)
     assert "in_world_of(first)" in caught.value.hints[1]
+
+
+def test_entries_that_json_cannot_store_are_converted_or_refused(tmp_path):
+    rgb, depth, _ = table_scene(0)
+    with RecordingWriter(tmp_path / "r", CAMERA, GRID, seed=np.int64(3), note=tmp_path) as writer:
+        mask = np.zeros(depth.shape, np.float32)
+        mask[:4] = 0.9
+        writer.add_frame(rgb, depth, 0.0, "static", T_world_camera=CAMERA.pose.as_matrix(), robot_mask=mask)
+        for time, message in ((0.0, "above 0"), (np.nan, "finite"), ("a", "time of frame 1")):
+            with pytest.raises(InputError, match=message):
+                writer.add_frame(rgb, depth, time, "static")
+        with pytest.raises(InputError, match="cannot be stored as JSON"):
+            writer.add_frame(rgb, depth, 1.0, "static", note={(1, 2): 3})
+    assert open_recording(tmp_path / "r").frames[0].robot_mask.mean() == 4 / depth.shape[0]
+    with pytest.raises(InputError, match="has no frame"), RecordingWriter(tmp_path / "empty", CAMERA, GRID):
+        pass
+    assert not (tmp_path / "empty").exists()
+
+
+def test_some_frames_may_have_no_robot_mask():
+    images = [table_scene(0)[:2] for _ in range(2)]
+    rgb, depth = (np.stack(part) for part in zip(*images, strict=True))
+    mask = np.zeros(depth.shape[1:], bool)
+    mask[:4] = True
+    with pytest.warns(InputWarning):  # equal images
+        made = Recording.from_arrays(rgb, depth, CAMERA.K, robot_masks=[None, mask])
+    assert made.frames[0].robot_mask is None and (made.frames[1].robot_mask == mask).all()
+    for changed, message in (({"robot_masks": [mask]}, "robot_masks has shape"), ({}, "no frame")):
+        images = (rgb, depth) if changed else (rgb[:0], depth[:0])
+        with pytest.raises(InputError, match=message):
+            Recording.from_arrays(*images, CAMERA.K, **changed)
+
+
+@pytest.mark.parametrize("kind", [">u2", "<u2", "float16", ">f8"])
+def test_depth_files_of_any_byte_order(tmp_path, kind):
+    values = np.array([[0, 1, 2], [1, 2, 1]]).astype(kind)
+    np.save(tmp_path / "d.npy", values)
+    found = read_depth(tmp_path / "d.npy", 0.001)
+    expected = values.astype(float) * (0.001 if "u" in kind else 1)
+    np.testing.assert_allclose(found, np.where(expected > 0, expected, np.nan), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "size"),
+    [((0, 0, 0), (1, 1), 0.01), ("abc", (1, 1, 1), 0.01), ((0, 0, 0), (1, 1, 1), "x"), ((0,) * 3, (1,) * 3, np.nan)],
+)
+def test_invalid_bounds_are_one_error(lower, upper, size):
+    with pytest.raises(InputError, match="has no voxel"):
+        VoxelGrid.from_bounds(lower, upper, size)
