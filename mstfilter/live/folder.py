@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +98,8 @@ def filter_folder(
         settings["max_pixels"] = reader.max_pixels
         try:
             with Stream(camera, filter, pauses=reader.pauses, on_pause=write, **settings) as stream:
-                stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask)
-                for time, frame in frames:
-                    stream.push(frame.rgb, frame.depth, time, robot_mask=frame.robot_mask, wait=True)
+                for when, one in chain([(time, frame)], frames):
+                    stream.push(one.rgb, one.depth, when, robot_mask=one.robot_mask, wait=True)
         except BaseException as error:
             finish("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
             raise

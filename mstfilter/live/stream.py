@@ -145,12 +145,11 @@ class Stream:
         self._n_pauses = 0
         self._last_time = -np.inf
         self._step: Future[None] | None = None
-        self._step_thread = 0
         self._error: BaseException | None = None
         self.last: Pause | None = None  #: the result at the last pause
         self.counts: Counter[str] = Counter()  #: see `Pause.counts`
         self._queue: queue.Queue[_Item | None] = queue.Queue(max_frames)
-        self._pool = ThreadPoolExecutor(1, "mstfilter-step")
+        self._pool = ThreadPoolExecutor(1, f"mstfilter-step-{id(self)}")
         self._watcher = threading.Thread(target=self._watch, name="mstfilter-stream", daemon=True)
         self._watcher.start()
 
@@ -195,6 +194,8 @@ class Stream:
             If the images are invalid, the stream is closed, or a thread of the stream has failed.
         """
         arrived = clock.perf_counter()
+        if wait:
+            self._check_caller("push(wait=True)")
         self._check()
         if not self._watcher.is_alive():
             raise InputError("the stream is closed", "make a new Stream")
@@ -228,10 +229,9 @@ class Stream:
 
     def _dropped(self, why: str, number: int, pause: bool | None = None) -> bool:
         if pause or (why != "no depth" and not self.counts[why]):
-            hint = {
-                "late": "times have to ascend, also after the clock is set",
-                "overflow": "the frames arrive faster than they are processed: push fewer, or push(..., wait=True)",
-            }.get(why, "every frame needs a depth image")
+            hint = "every frame needs a depth image, and times have to ascend, also after the clock is set"
+            if why == "overflow":
+                hint = "the frames arrive faster than they are processed: push fewer, or push(..., wait=True)"
             text = f"frame {number} is dropped: {why}{', a given pause is lost' * bool(pause)}"
             warn_user(text, f"{hint}; the counts of dropped frames are in `counts`")
         self.counts[why] += 1
@@ -256,7 +256,7 @@ class Stream:
 
     def wait(self) -> None:
         """Wait until all pushed frames are processed. Raises InputError in `on_pause`."""
-        self._check_caller("wait")
+        self._check_caller("wait()")
         self._queue.join()
         if self._step is not None:
             with contextlib.suppress(Exception):  # raised by `_check`
@@ -265,7 +265,7 @@ class Stream:
 
     def close(self) -> None:
         """Process the queued frames, and end the threads. Raises InputError in `on_pause`."""
-        self._check_caller("close")
+        self._check_caller("close()")
         if self._watcher.is_alive():
             self._queue.put(None)
             self._watcher.join()
@@ -283,8 +283,8 @@ class Stream:
                 self.close()
 
     def _check_caller(self, name: str) -> None:
-        if threading.get_ident() == self._step_thread:
-            raise InputError(f"{name}() of a stream is called in on_pause", "call it in the thread that pushes")
+        if threading.current_thread().name.startswith(f"mstfilter-step-{id(self)}"):
+            raise InputError(f"{name} of a stream is called in on_pause", "call it in the thread that pushes")
 
     def _check(self) -> None:
         if self._error is not None:
@@ -377,7 +377,6 @@ class Stream:
 
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
         """Filter a clip. The argument `trackers` keeps the tracked flow in memory until the filter uses the flow."""
-        self._step_thread = threading.get_ident()
         try:
             with parallel(self._threads):
                 self._state, info = self._filter.step(self._state, clip)

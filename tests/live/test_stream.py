@@ -172,9 +172,10 @@ def test_frames_may_wait_for_a_place_in_the_queue():
         assert stream.last.index == 1 and stream.counts["overflow"] == 0
 
 
-@pytest.mark.parametrize("name", ["wait", "close"])
+@pytest.mark.parametrize("name", ["wait", "close", "push"])
 def test_a_callback_cannot_wait_for_itself(name):
-    stream = mstfilter.Stream(CAMERA.K, FAST, pauses=None, on_pause=lambda pause: getattr(stream, name)())
+    arguments = {"rgb": RGB[1], "depth": DEPTH[1], "time": 1, "wait": True} if name == "push" else {}
+    stream = mstfilter.Stream(CAMERA.K, FAST, pauses=None, on_pause=lambda pause: getattr(stream, name)(**arguments))
     stream.push(RGB[0], DEPTH[0], 0, pause=True)
     for _ in range(2):
         with pytest.raises(InputError, match="in on_pause"):
