@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.oracles import UsesTruth
 from mstfilter.presets import REGISTRY
 from mstfilter.reading import read_toml
 from mstfilter.registry import default_of
@@ -50,7 +51,7 @@ def _lines(kind: str) -> Iterator[str]:
             why = error.hints[0] if isinstance(error, MissingLibraryError) else error.message
             yield f"{name:<20}not available: {why}"
             continue
-        truth = " (uses the ground truth)" if hasattr(cls, "needs") else ""
+        truth = " (uses the ground truth)" if issubclass(cls, UsesTruth) else ""
         summary = (cls.__doc__ or "").strip().split("\n")[0].rstrip(".")
         yield f"{name:<20}{summary}{truth}  [{_fields(cls)}]"
 

@@ -39,6 +39,7 @@ from mstfilter.scene.frame import (
 )
 from mstfilter.scene.geometry import (
     BASELINE as BASELINE,
+    TABLE_TOLERANCE as TABLE_TOLERANCE,
     fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
     table_residual as table_residual,
@@ -72,7 +73,6 @@ from mstfilter.scene.rendering import (
     render_hypothesis as render_hypothesis,
 )
 from mstfilter.scene.support import (
-    TABLE_TOLERANCE as TABLE_TOLERANCE,
     Foreground as Foreground,
     above_table as above_table,
     fill_from_nearest as fill_from_nearest,

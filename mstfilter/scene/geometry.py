@@ -69,6 +69,8 @@ def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray,
 
 BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity
 _FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of disparity only
+#: Readings up to this much above the table are table, in sensor disparity units.
+TABLE_TOLERANCE = 2.0
 
 
 @dataclass(frozen=True, eq=False)

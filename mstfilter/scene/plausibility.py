@@ -22,6 +22,7 @@ from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks
 from mstfilter.scene.geometry import (
+    TABLE_TOLERANCE,
     Edges,
     SupportPlane,
     edge_agreement,
@@ -29,7 +30,6 @@ from mstfilter.scene.geometry import (
     in_columns,
     shares_with_depth,
 )
-from mstfilter.scene.support import TABLE_TOLERANCE
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid
 
 _Limits = tuple[float, float]

@@ -4,10 +4,12 @@
 >>> found.pixels                        # (H, W) bool, may belong to an object
 >>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading
 
-Pixels with a depth reading are classified by depth. A reading on the table never belongs to an object. Isolated
-readings above the table are noise; connected regions of readings are objects. Dark or shiny surfaces often have no
-readings. A pixel without a reading belongs to an object if its colour differs from the nearby table. The table is the
-plane z = 0 if the camera has a pose, else the plane with the most depth readings.
+Pixels with a depth reading are classified by depth. Isolated readings above the table are noise, and so are small
+and low regions with the colour of the table. Other connected regions of readings are objects. Dark or shiny surfaces
+often have no readings. A pixel without a reading belongs to an object if its colour differs from the nearby table.
+Near the outline of an object, depth images have errors of several pixels. There, the colours of the object and of the
+table decide. A region of another colour with readings on the table is a flat object if it is higher than the table
+around it. The table is the plane z = 0 if the camera has a pose, else the plane with the most depth readings.
 """
 
 from __future__ import annotations
@@ -25,11 +27,9 @@ from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera, scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
-from mstfilter.scene.geometry import BASELINE, fit_support_plane, table_residual
+from mstfilter.scene.geometry import BASELINE, TABLE_TOLERANCE, fit_support_plane, table_residual
 from mstfilter.scene.voxels import VoxelGrid
 
-#: Readings up to this much above the table are table, in sensor disparity units.
-TABLE_TOLERANCE = 2.0
 # Areas and lengths are those of an image of 640 x 480 pixels.
 _DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
 _SMALLEST = 25  # pixels of a region of readings
@@ -44,9 +44,22 @@ _ENCLOSED, _FEW_AROUND = 0.55, 0.1  # share of the readings around a region that
 _SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare, standard deviations above the table
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
+_FINE = 20.0  # pixels: means over less than this are computed at half of the resolution, others at a quarter
+_FEW_NEAR = 1e-3  # share of the core of objects around a pixel that shows their colours
 _NARROW = 6.0  # pixels between a reading and an estimate that is this reading
 _FEW = 10  # readings of an object that do not determine the depth of its other pixels
-_STANDS = 0.004  # metres: estimated readings are at least this much nearer than the table
+_STANDS = 0.004  # metres: least height of estimated readings above the table, without a grid
+_LAYER = 0.75  # the same in voxels of the grid: at least one layer of voxel centres lies inside a flat object
+_LOW, _SMALL = 6.0, 500  # mean rise in sensor units, and pixels, of noise with the colour of the table
+_SAME_COLOUR, _OTHER_COLOUR = 2.0, 0.25  # squared distance of the colour of the table; share of pixels above it
+_OUTLINE = 6.0  # pixels on both sides of an outline that are assigned by colour
+_CORE, _CORE_REACH = (
+    2.0,
+    10.0,
+)  # pixels between an outline and the core of an object; reach of the colours of the core
+_ADDED, _REMOVED = 4.0, 8.0  # log odds that a reading on the table is right, and that a reading above the table is
+_FLAT, _HIGHER = 80, 0.4  # pixels of a flat object; its rise above the table around it, in sensor units
+_BESIDE = 0.05  # share of other objects around a flat object; with more, it can be a shadow
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,18 +126,48 @@ def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
 
 
 def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
-    measured, table, missing = _regions_of_readings(frame, grid), _on_table(frame), _without_readings(frame)
-    pixels = _joined(measured, _silent(frame, measured, table, missing), table, missing)
-    depth = _with_estimates(frame, pixels)
-    if depth is None:
-        return Foreground(read_only(pixels), frame)
-    if grid is not None:
-        pixels &= frame.valid | grid.contains(grid.index_of(posed_camera(frame).unproject(depth)))
+    table, missing, seen = _on_table(frame), _without_readings(frame), _Colours.of(frame)
+    measured = _without_noise(frame, _regions_of_readings(frame, grid), seen)
+    pixels = _joined(measured, _silent(frame, measured, table, missing, seen), table, missing)
+    pixels = _outlined(frame, pixels, seen)
+    flat = _flat(frame, pixels, seen)
+    pixels |= flat
+    raised = pixels_above_table(frame)
+    height = _STANDS if grid is None else _LAYER * grid.voxel_size
+    depth = _with_estimates(frame, pixels, raised, flat, height)
     pixels &= np.isfinite(depth)
-    estimated = read_only(pixels & ~frame.valid)
+    if grid is not None:
+        pixels &= grid.contains(grid.index_of(posed_camera(frame).unproject(depth)))
+    estimated = pixels & ~raised & ~flat
+    if not (flat | pixels & ~raised).any():
+        return Foreground(read_only(pixels), frame)
     return Foreground(
-        read_only(pixels), replace(frame, depth=np.where(pixels, depth, frame.depth), estimated=estimated)
+        read_only(pixels),
+        replace(frame, depth=np.where(pixels, depth, frame.depth), estimated=read_only(estimated)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Colours:
+    """The colours of an image, compared with the colours of the nearby table."""
+
+    lab: np.ndarray  #: (H, W, 3) CIELAB
+    near: np.ndarray  #: (H, W) bool, whether the table is near
+    brightness: np.ndarray  #: (H, W) difference from the table in standard deviations
+    distance: np.ndarray  #: (H, W) squared Mahalanobis distance from the colours of the table
+    log_variance: np.ndarray  #: (H, W) log of the product of the variances of the colours of the table
+
+    @classmethod
+    def of(cls, frame: Frame) -> _Colours:
+        """The colours of a frame. Without table near a pixel, the pixel is compared with the whole table."""
+        lab, table = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab), _on_table(frame)
+        lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
+        share, mean, variance = _around(lab, table, _COLOUR_REACH)
+        near = share > _TABLE_NEAR
+        if table.any():
+            mean[~near], variance[~near] = lab[table].mean(axis=0), lab[table].var(axis=0) + _COLOUR_NOISE
+        deviation = (lab - mean) / np.sqrt(variance)
+        return cls(lab, near, deviation[..., 0], (deviation**2).sum(axis=-1), np.log(variance).sum(axis=-1))
 
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
@@ -139,6 +182,17 @@ def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
     kept = (area >= scaled_area(_SMALLEST, raised.size)) & (rise > _RISE * TABLE_TOLERANCE * area)
     kept[0] = False
     return (cv2.dilate(kept[regions].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & raised
+
+
+def _without_noise(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
+    """The `pixels` (H, W) bool without small and low connected regions that have the colour of the table."""
+    regions, n = ndimage.label(pixels)
+    index = np.arange(n + 1)
+    low = ndimage.mean(above_table(frame), regions, index) < _LOW
+    other = ndimage.mean(seen.distance > _SAME_COLOUR, regions, index) > _OTHER_COLOUR
+    kept = other | ~low | (np.bincount(regions.ravel()) >= scaled_area(_SMALL, pixels.size))
+    kept[0] = False
+    return np.asarray(kept[regions])
 
 
 def _on_table(frame: Frame) -> np.ndarray:
@@ -176,37 +230,74 @@ def _shadows(frame: Frame) -> np.ndarray:
     return shadow
 
 
-def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray) -> np.ndarray:
+def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray, seen: _Colours) -> np.ndarray:
     """The pixels (H, W) bool without a depth reading that are assigned to objects by colour or by outline.
 
     A pixel near the table must differ in colour from the nearby table. A pixel far from the table must differ from
     the colours of the whole table, and readings of objects (`measured`) must enclose its region. A large gap in the
     readings of the table, without glare, also belongs to an object, for example a glass.
     """
-    lab = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
-    lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
-    near, brightness, distance = _compared_with_table(lab, table)
     searched = missing & _measured_part(frame)
-    other = _opened(searched & (distance > _COLOUR_DISTANCE), 1)
-    enclosed = _enclosed(other & ~near, measured, frame.valid)
-    gaps = _opened(searched & (brightness < _GLARE), scaled_length(_SOLID, frame.camera.width))
-    return (other & near) | enclosed | _enclosed(gaps, table, frame.valid)
+    other = _opened(searched & (seen.distance > _COLOUR_DISTANCE), 1)
+    enclosed = _enclosed(other & ~seen.near, measured, frame.valid)
+    gaps = _opened(searched & (seen.brightness < _GLARE), scaled_length(_SOLID, frame.camera.width))
+    return (other & seen.near) | enclosed | _enclosed(gaps, table, frame.valid)
 
 
-def _compared_with_table(lab: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether the table is near a pixel, (H, W) bool, and two colour differences (H, W) between pixel and table.
+def _outlined(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
+    """The pixels (H, W) bool of objects, with outlines that follow the colours.
 
-    The differences are the brightness in standard deviations, and the squared Mahalanobis distance of the colours.
+    A pixel near an outline is assigned by the likelihood ratio of two normal distributions of colours: of the nearby
+    core of objects and of the nearby table. The prior odds say how reliable a depth reading is near an outline.
     """
-    share = _surroundings(table.astype(np.float32))
-    near = share > _TABLE_NEAR
+    width, image = frame.camera.width, pixels.astype(np.uint8)
+    beside = _ellipse(scaled_length(_OUTLINE, width))
+    asked = (cv2.dilate(image, beside) > cv2.erode(image, beside)) & seen.near
+    if frame.robot_mask is not None:
+        asked &= ~frame.robot_mask
+    core = cv2.erode(image, _ellipse(scaled_length(_CORE, width))) > 0
+    regions, _ = ndimage.label(pixels)
+    core |= pixels & ~np.isin(regions, regions[core])  # a thin object is its own core
+    share, mean, variance = _around(seen.lab, core, _CORE_REACH)
+    distance = ((seen.lab - mean) ** 2 / variance).sum(axis=-1)
+    log_ratio = 0.5 * (seen.distance + seen.log_variance - distance - np.log(variance).sum(axis=-1))
+    log_prior = np.where(frame.valid, np.where(pixels, _REMOVED, -_ADDED), 0)
+    return np.asarray(np.where(asked & (share > _FEW_NEAR), log_ratio + log_prior > 0, pixels))
+
+
+def _flat(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
+    """Pixels (H, W) bool of flat objects: regions of another colour that are a little higher than the table around.
+
+    `pixels` (H, W) bool are those of other objects. A region beside another object can be its shadow, which the depth
+    errors at the outline of the object raise, and is not used.
+    """
+    table, rise = _on_table(frame), above_table(frame)
+    other = _opened(frame.valid & ~pixels & seen.near & (seen.distance > _COLOUR_DISTANCE), 1)
+    regions, _ = ndimage.label(other)
+    kept = np.bincount(regions.ravel()) >= scaled_area(_FLAT, pixels.size)
+    kept[0] = False
+    for k, box in enumerate(ndimage.find_objects(regions), start=1):
+        if kept[k]:
+            ring, around = _ring(regions, k, box)
+            bare = ring & table[around] & ~pixels[around]
+            kept[k] = (
+                pixels[around][ring].mean() <= _BESIDE
+                and bare.sum() >= _ON_TABLE * ring.sum()
+                and rise[box][regions[box] == k].mean() - rise[around][bare].mean() > _HIGHER
+            )
+    return np.asarray(kept[regions])
+
+
+def _around(image: np.ndarray, pixels: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Share (H, W) of `pixels` (H, W) bool around each pixel, and mean and variance (H, W, 3) of their colours.
+
+    The surroundings have a standard deviation of `reach` pixels of an image of 640 x 480 pixels.
+    """
+    share = _surroundings(pixels.astype(np.float32), reach)
     n = np.maximum(share, 1e-6)[..., None]
-    mean = _surroundings(lab * table[..., None]) / n
-    variance = np.maximum(_surroundings(lab**2 * table[..., None]) / n - mean**2, 0) + _COLOUR_NOISE
-    if table.any():
-        mean[~near], variance[~near] = lab[table].mean(axis=0), lab[table].var(axis=0) + _COLOUR_NOISE
-    deviation = (lab - mean) / np.sqrt(variance)
-    return near, deviation[..., 0], (deviation**2).sum(axis=-1)
+    mean = _surroundings(image * pixels[..., None], reach) / n
+    variance = np.maximum(_surroundings(image**2 * pixels[..., None], reach) / n - mean**2, 0) + _COLOUR_NOISE
+    return share, mean, variance
 
 
 def _opened(pixels: np.ndarray, radius: float) -> np.ndarray:
@@ -234,13 +325,12 @@ def _measured_part(frame: Frame) -> np.ndarray:
     return part > 0
 
 
-def _surroundings(image: np.ndarray) -> np.ndarray:
-    """Mean of an image (H, W, ...) around each pixel, computed at a quarter of the resolution."""
-    size = image.shape[1], image.shape[0]
-    small = cv2.resize(image, (max(1, size[0] // 4), max(1, size[1] // 4)), interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(
-        small, (0, 0), max(1.0, scaled_length(_COLOUR_REACH, size[0]) / 4), borderType=cv2.BORDER_CONSTANT
-    )
+def _surroundings(image: np.ndarray, reach: float) -> np.ndarray:
+    """Mean of an image (H, W, ...) around each pixel, computed at a lower resolution."""
+    size, step = (image.shape[1], image.shape[0]), 4 if reach > _FINE else 2
+    small = cv2.resize(image, (max(1, size[0] // step), max(1, size[1] // step)), interpolation=cv2.INTER_AREA)
+    spread = max(1.0, scaled_length(reach, size[0]) / step)
+    small = cv2.GaussianBlur(small, (0, 0), spread, borderType=cv2.BORDER_CONSTANT)
     return cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
 
 
@@ -290,33 +380,31 @@ def _ellipse(radius: float) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
 
 
-def _with_estimates(frame: Frame, pixels: np.ndarray) -> np.ndarray | None:
-    """Depth (H, W) with estimates at object pixels without a reading; None if all object pixels have a reading.
+def _with_estimates(
+    frame: Frame, pixels: np.ndarray, known: np.ndarray, flat: np.ndarray, height: float
+) -> np.ndarray:
+    """Depth (H, W) with estimates at pixels of objects that are not `known` (H, W) bool.
 
     In a narrow gap, the estimate is the nearest reading, because two objects can meet in a gap. In a wide gap,
-    inverse depth is interpolated by a harmonic function, which is exact on planes. Estimates are never behind the
-    table. If an object has fewer than ten readings, the estimate is the smallest depth of the table at its pixels.
+    inverse depth is interpolated by a harmonic function, which is exact on planes. If an object has fewer than ten
+    readings, the estimate is the smallest depth of the table at its pixels. Estimates, and the readings of `flat`
+    objects (H, W) bool, are at least `height` metres above the table.
     """
-    if not (pixels & ~frame.valid).any():
-        return None
-    camera = posed_camera(frame)
+    camera, depth = posed_camera(frame), np.array(frame.depth)
     down = camera.rays() @ camera.pose.as_matrix()[2, :3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        to_table = -camera.position[2] / down
-    table = np.where((down < 0) & (to_table > 2 * _STANDS), to_table, np.inf)
-    depth = np.array(frame.depth)
-    regions, _ = ndimage.label(pixels)
+        lowest = np.where(down < 0, (height - camera.position[2]) / down, np.inf)
+    lowest[lowest <= 0] = np.inf  # the camera is below
+    regions, _ = ndimage.label(pixels & ~flat)
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
         inside = regions[box] == k
-        known, missing = inside & frame.valid[box], inside & ~frame.valid[box]
+        read, missing = inside & known[box], inside & ~known[box]
         if missing.any():
-            found = (
-                _estimated(depth[box], known, missing, frame.camera.width)
-                if known.sum() >= _FEW
-                else table[box][inside].min()
+            few = read.sum() < _FEW
+            depth[box][missing] = (
+                lowest[box][inside].min() if few else _estimated(depth[box], read, missing, frame.camera.width)
             )
-            depth[box][missing] = np.minimum(found, table[box][missing] - _STANDS)
-    return depth
+    return np.where(flat | (pixels & ~known), np.minimum(depth, lowest), depth)
 
 
 def _estimated(depth: np.ndarray, known: np.ndarray, missing: np.ndarray, width: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.ndimage import binary_erosion
 
 from mstfilter.scene import Frame, foreground, pixels_above_table, readings_above_table, render
 from tests.segmentation.scenes import GRID, TWO, camera, frame_of
@@ -24,11 +25,15 @@ def share(found: np.ndarray, true: np.ndarray) -> float:
     return float((found & true).sum() / true.sum())
 
 
-def test_without_noise_the_readings_above_the_table_are_the_foreground():
+def test_without_noise_the_foreground_is_the_readings_above_the_table_and_the_contact_with_the_table():
     frame = frame_of(TWO, width=640)
-    found = foreground(frame, GRID)
-    assert found.frame.key == frame.key  # no depth is estimated
-    assert (found.pixels != readings_above_table(frame, GRID)).sum() < 20  # single pixels at corners
+    found = foreground(frame, GRID).pixels
+    above, true = readings_above_table(frame, GRID), SEEN > 0
+    inside = binary_erosion(true)  # the colours of the other pixels are mixed
+    assert not (found & ~true).any() and (above & ~found).sum() < 0.01 * above.sum()
+    assert not (above & inside & ~found).any()
+    contact = inside & ~above
+    assert contact.sum() > 100 and (contact & ~found).sum() < 0.1 * contact.sum()
 
 
 def test_noise_on_the_table_is_no_object():
@@ -53,7 +58,8 @@ def test_an_object_without_readings_is_found_by_its_colour(part):
     error = np.abs(found.frame.depth - frame.depth)[holes & found.pixels]
     # The readings of the other pixels are near; an object without any stands at its lowest pixels.
     assert np.median(error) < (0.05 if part == "its middle" else 0.12)
-    assert np.array_equal(found.frame.depth[~holes], frame.depth[~holes])
+    above = ~holes & readings_above_table(frame, GRID)
+    assert np.array_equal(found.frame.depth[above], frame.depth[above])
 
 
 def test_a_hole_in_the_table_is_an_object_by_its_colour_or_its_size():
@@ -113,18 +119,79 @@ def test_empty_margins_of_registered_depth_are_no_objects():
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 1000), missing=st.floats(0, 0.9), noise=st.floats(0, 1))
-def test_measured_depth_stays_and_estimates_are_above_the_table(seed, missing, noise):
+def test_readings_of_objects_stay_and_estimates_are_above_the_table(seed, missing, noise):
     frame = frame_of(TWO, width=160, noise=noise)
     blocks = np.random.default_rng(seed).random((12, 16)) < missing
     holed = without(frame, np.kron(blocks, np.ones((10, 10))) > 0)
     found = foreground(holed, GRID)
-    measured = np.isfinite(holed.depth)
-    np.testing.assert_array_equal(found.frame.depth[measured], holed.depth[measured])
-    assert not (found.pixels & measured & ~readings_above_table(holed, GRID)).any()
+    raised = readings_above_table(holed, GRID)
+    kept = raised | ~found.pixels
+    np.testing.assert_array_equal(found.frame.depth[kept], holed.depth[kept])
     assert np.isfinite(found.frame.depth[found.pixels]).all()
-    estimated = found.frame.estimated
-    assert np.array_equal(found.pixels & ~measured, np.zeros_like(measured) if estimated is None else estimated)
-    assert (found.frame.points[..., 2][found.pixels & ~measured] > 0).all()
+    estimated = found.frame.estimated if found.frame.estimated is not None else np.zeros_like(raised)
+    assert not (estimated & (raised | ~found.pixels)).any()
+    assert (found.frame.points[..., 2][found.pixels & ~raised] > 0.7 * GRID.voxel_size).all()
+
+
+def lifted(frame: Frame, pixels: np.ndarray, units: float, colour: tuple[int, int, int] | None) -> Frame:
+    """The frame with readings in some pixels that are higher by some sensor units, perhaps of another colour."""
+    depth = np.where(pixels, 315.0 / (315.0 / frame.depth + units), frame.depth).astype(np.float32)
+    rgb = frame.rgb if colour is None else np.where(pixels[..., None], np.uint8(colour), frame.rgb)
+    return Frame(rgb, depth, frame.camera)
+
+
+def patch(rows: slice, columns: slice) -> np.ndarray:
+    found = np.zeros(SEEN.shape, bool)
+    found[rows, columns] = True
+    assert not SEEN[found].any()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("rise", "colour", "is_object"), [(1.2, (30, 30, 40), True), (0, (30, 30, 40), False), (1.2, None, False)]
+)
+def test_a_flat_object_has_another_colour_and_rises_a_little_from_the_table(rise, colour, is_object):
+    """A pen is an object, a print on the table is none, and a dent in the readings is none."""
+    pen = patch(slice(330, 344), slice(280, 360))
+    found = foreground(lifted(frame_of(TWO, width=640, noise=0.3), pen, rise, colour), GRID)
+    assert (found.pixels[pen].mean() > 0.8) if is_object else not found.pixels[pen].any()
+    if is_object:  # the voxels at its readings have their centres inside the object
+        assert (found.frame.points[..., 2][pen & found.pixels] >= 0.7 * GRID.voxel_size).all()
+        assert found.frame.estimated is None or not found.frame.estimated[pen].any()
+
+
+def test_a_raised_region_beside_an_object_can_be_its_shadow():
+    """The same dark patch is an object if it stands alone."""
+    rows, columns = np.nonzero(SEEN == 1)
+    row, left = int(np.percentile(rows, 60)), columns[rows == int(np.percentile(rows, 60))].min()
+    shadow = np.zeros(SEEN.shape, bool)
+    shadow[row : row + 12, left - 45 : left] = True
+    shadow &= SEEN == 0
+    beyond = shadow & (np.arange(640) < left - 10)
+    frame = frame_of(TWO, width=640, noise=0.3)
+    assert not foreground(lifted(frame, shadow, 1.2, (60, 60, 55)), GRID).pixels[beyond].any()
+    alone = patch(slice(330, 342), slice(280, 325))
+    assert foreground(lifted(frame, alone, 1.2, (60, 60, 55)), GRID).pixels[alone].mean() > 0.8
+
+
+@pytest.mark.parametrize("shift", [-3, 3])
+def test_outlines_follow_the_colours_if_depth_is_shifted(shift):
+    frame, bare, true = frame_of(TWO, width=640, noise=0.3), frame_of(0 * TWO, width=640, noise=0.3), SEEN > 0
+    shown = np.roll(true, shift, axis=0)
+    moved = Frame(frame.rgb, np.where(shown, np.roll(frame.depth, shift, axis=0), bare.depth), frame.camera)
+    found, readings = foreground(moved, GRID), readings_above_table(moved, GRID)
+    far = binary_erosion(true) | binary_erosion(~true)  # the colours of the other pixels are mixed
+    assert (found.pixels != true)[far].sum() < 0.1 * (readings != true)[far].sum()
+    added = found.pixels & true & ~shown  # their readings are of the table behind
+    assert added.sum() > 100 and np.median(np.abs(found.frame.depth - frame.depth)[added]) < 0.02
+
+
+def test_low_regions_with_the_colour_of_the_table_are_noise_if_they_are_small():
+    frame = frame_of(TWO, width=640, noise=0.3)
+    blob, sheet = patch(slice(330, 345), slice(280, 310)), patch(slice(330, 360), slice(280, 330))
+    assert not foreground(lifted(frame, blob, 4.5, None), GRID).pixels[blob].any()
+    for pixels, rise, colour in ((blob, 4.5, (90, 120, 60)), (blob, 12.0, None), (sheet, 4.5, None)):
+        assert foreground(lifted(frame, pixels, rise, colour), GRID).pixels[pixels].mean() > 0.9
 
 
 def test_a_shadow_of_the_projector_is_no_object():
