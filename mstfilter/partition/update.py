@@ -68,6 +68,7 @@ from mstfilter.scene import (
     check_grids,
     foreground,
     log_quality,
+    pixels_above_table,
     surface_agreement,
 )
 from mstfilter.smc import Candidates, Key, Population, Update, first_seen, key_of
@@ -170,10 +171,12 @@ class PartitionUpdate(Update):
         check_grids("predicted", () if predicted is None else predicted.particles, observation.grid)
         check_grids("proposed", () if proposed is None else proposed.particles, observation.grid)
         found = foreground(observation.after, observation.grid)
-        # Free-space projection does not use the estimates of missing depth.
+        # Free-space projection does not use the estimates of depth.
         mended = Clip((found.frame,), observation.grid, observation.index) if self.mend else observation
         readings = Readings.of(mended.after, mended.grid)
-        raised = readings.of_image(found.pixels)
+        raised = readings.of_image(
+            found.pixels if self.mend else found.pixels & pixels_above_table(observation.after)
+        )
         if predicted is None:
             assert proposed is not None
             described, segments = _distinct(proposed, _segments(proposed, readings, raised))

@@ -139,17 +139,17 @@ def test_objects_continue_what_lies_in_them():
     """A sample that sees two predicted objects as one, and one that cuts an object in two."""
     clip, later = clip_of(TOUCHING), clip_of(TOUCHING, 1)
     masks = masks_of(TOUCHING, clip.after)
-    state = step(PartitionUpdate(), clip, sample_of(clip, masks)).particles[0]
+    state = step(PartitionUpdate(mend=False), clip, sample_of(clip, masks)).particles[0]
     merged = sample_of(later, [masks[0] | masks[1]])
-    (one,) = step(PartitionUpdate(pairs=IMAGE), later, merged, state).particles
+    (one,) = step(PartitionUpdate(pairs=IMAGE, mend=False), later, merged, state).particles
     assert one.n_objects == 1 and len(one.objects[0].views) == 3  # the views of both
-    (one,) = step(PartitionUpdate(pairs=PREDICTION), later, merged, state).particles
+    (one,) = step(PartitionUpdate(pairs=PREDICTION, mend=False), later, merged, state).particles
     assert [record.id for record in one.objects] == [record.id for record in state.objects]
     half = masks[0] & (np.arange(masks[0].shape[1]) < np.nonzero(masks[0])[1].mean())
     cut = sample_of(later, [half, masks[0] & ~half, masks[1]])
-    (one,) = step(PartitionUpdate(pairs=IMAGE), later, cut, state).particles
+    (one,) = step(PartitionUpdate(pairs=IMAGE, mend=False), later, cut, state).particles
     assert one.n_objects == 3 and state.record(2).id in {record.id for record in one.objects}
-    (one,) = step(PartitionUpdate(pairs=PREDICTION), later, cut, state).particles
+    (one,) = step(PartitionUpdate(pairs=PREDICTION, mend=False), later, cut, state).particles
     assert [record.id for record in one.objects] == [record.id for record in state.objects]
 
 
@@ -188,9 +188,9 @@ def test_partitions_by_pairs_follow_image_and_past():
     clip = clip_of(TOUCHING)
     masks = masks_of(TOUCHING, clip.after)
     apart, merged = sample_of(clip, masks), sample_of(clip, [masks[0] | masks[1]])
-    state = step(PartitionUpdate(), clip, apart).particles[0]
+    state = step(PartitionUpdate(mend=False), clip, apart).particles[0]
     pairs = PairEvidence(constant=0.0, image=1.0, prediction=0.3, prediction_constant=0.0)
-    update = PartitionUpdate(pairs=pairs, completer=SurfaceOnly())
+    update = PartitionUpdate(pairs=pairs, completer=SurfaceOnly(), mend=False)
     proposed = Population((apart, merged))
     later = clip_of(TOUCHING, 1)
     found = update.update(np.random.default_rng(0), Population((state,)), proposed, later)
