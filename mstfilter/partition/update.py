@@ -68,7 +68,6 @@ from mstfilter.scene import (
     check_grids,
     foreground,
     log_quality,
-    pixels_above_table,
     surface_agreement,
 )
 from mstfilter.smc import Candidates, Key, Population, Update, first_seen, key_of
@@ -174,9 +173,8 @@ class PartitionUpdate(Update):
         # Free-space projection does not use the estimates of depth.
         mended = Clip((found.frame,), observation.grid, observation.index) if self.mend else observation
         readings = Readings.of(mended.after, mended.grid)
-        raised = readings.of_image(
-            found.pixels if self.mend else found.pixels & pixels_above_table(observation.after)
-        )
+        measured = mended.after.depth == found.frame.depth  # if not `mend`, objects have measured depth only
+        raised = readings.of_image(found.pixels & measured)
         if predicted is None:
             assert proposed is not None
             described, segments = _distinct(proposed, _segments(proposed, readings, raised))
