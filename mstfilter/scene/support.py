@@ -2,7 +2,7 @@
 
 >>> found = foreground(frame, grid)
 >>> found.pixels                        # (H, W) bool, may belong to an object
->>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading
+>>> found.frame.depth                   # metres, estimated where a pixel of an object has no reading of it
 
 Pixels with a depth reading are classified by depth. Isolated readings above the table are noise, and so are small
 and low regions with the colour of the table. Other connected regions of readings are objects. Dark or shiny surfaces
@@ -53,10 +53,8 @@ _LAYER = 0.75  # the same in voxels of the grid: at least one layer of voxel cen
 _LOW, _SMALL = 6.0, 500  # mean rise in sensor units, and pixels, of noise with the colour of the table
 _SAME_COLOUR, _OTHER_COLOUR = 2.0, 0.25  # squared distance of the colour of the table; share of pixels above it
 _OUTLINE = 6.0  # pixels on both sides of an outline that are assigned by colour
-_CORE, _CORE_REACH = (
-    2.0,
-    10.0,
-)  # pixels between an outline and the core of an object; reach of the colours of the core
+_CORE = 2.0  # pixels between an outline and the core of an object
+_CORE_REACH = 10.0  # standard deviation of the surroundings that show the colours of the core, pixels
 _ADDED, _REMOVED = 4.0, 8.0  # log odds that a reading on the table is right, and that a reading above the table is
 _FLAT, _HIGHER = 80, 0.4  # pixels of a flat object; its rise above the table around it, in sensor units
 _BESIDE = 0.05  # share of other objects around a flat object; with more, it can be a shadow
@@ -67,7 +65,7 @@ class Foreground:
     """The pixels that can belong to objects, and the frame with known or estimated depth at these pixels."""
 
     pixels: np.ndarray  #: (H, W) bool
-    frame: Frame  #: the frame, with estimated depth at pixels of objects without a reading
+    frame: Frame  #: the frame, with estimated depth at pixels without a reading of the object
 
 
 def above_table(frame: Frame) -> np.ndarray:
