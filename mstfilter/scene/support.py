@@ -124,9 +124,9 @@ def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
 
 
 def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
-    table, missing, seen = _on_table(frame), _without_readings(frame), _Colours.of(frame)
+    missing, seen = _without_readings(frame), _Colours.of(frame)
     measured = _without_noise(frame, _regions_of_readings(frame, grid), seen)
-    pixels = _joined(measured, _silent(frame, measured, table, missing, seen), table, missing)
+    pixels = _joined(measured, _silent(frame, measured, missing, seen), seen.table, missing)
     pixels = _outlined(frame, pixels, seen)
     flat = _flat(frame, pixels, seen)
     pixels |= flat
@@ -137,18 +137,17 @@ def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
     if grid is not None:
         pixels &= grid.contains(grid.index_of(posed_camera(frame).unproject(depth)))
     estimated = pixels & ~raised & ~flat
-    if not (flat | pixels & ~raised).any():
+    if not (flat | estimated).any():
         return Foreground(read_only(pixels), frame)
-    return Foreground(
-        read_only(pixels),
-        replace(frame, depth=np.where(pixels, depth, frame.depth), estimated=read_only(estimated)),
-    )
+    mended = replace(frame, depth=np.where(pixels, depth, frame.depth), estimated=read_only(estimated))
+    return Foreground(read_only(pixels), mended)
 
 
 @dataclass(frozen=True, eq=False)
 class _Colours:
     """The colours of an image, compared with the colours of the nearby table."""
 
+    table: np.ndarray  #: (H, W) bool, whether a pixel has a reading on the table
     lab: np.ndarray  #: (H, W, 3) CIELAB
     near: np.ndarray  #: (H, W) bool, whether the table is near
     brightness: np.ndarray  #: (H, W) difference from the table in standard deviations
@@ -158,14 +157,14 @@ class _Colours:
     @classmethod
     def of(cls, frame: Frame) -> _Colours:
         """The colours of a frame. Without table near a pixel, the pixel is compared with the whole table."""
-        lab, table = cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab), _on_table(frame)
+        table, lab = _on_table(frame), cv2.cvtColor(frame.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
         lab = cv2.GaussianBlur(lab, (0, 0), max(0.7, scaled_length(1, frame.camera.width)))
         share, mean, variance = _around(lab, table, _COLOUR_REACH)
         near = share > _TABLE_NEAR
         if table.any():
             mean[~near], variance[~near] = lab[table].mean(axis=0), lab[table].var(axis=0) + _COLOUR_NOISE
         deviation = (lab - mean) / np.sqrt(variance)
-        return cls(lab, near, deviation[..., 0], (deviation**2).sum(axis=-1), np.log(variance).sum(axis=-1))
+        return cls(table, lab, near, deviation[..., 0], (deviation**2).sum(axis=-1), np.log(variance).sum(axis=-1))
 
 
 def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
@@ -228,7 +227,7 @@ def _shadows(frame: Frame) -> np.ndarray:
     return shadow
 
 
-def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.ndarray, seen: _Colours) -> np.ndarray:
+def _silent(frame: Frame, measured: np.ndarray, missing: np.ndarray, seen: _Colours) -> np.ndarray:
     """The pixels (H, W) bool without a depth reading that are assigned to objects by colour or by outline.
 
     A pixel near the table must differ in colour from the nearby table. A pixel far from the table must differ from
@@ -239,7 +238,7 @@ def _silent(frame: Frame, measured: np.ndarray, table: np.ndarray, missing: np.n
     other = _opened(searched & (seen.distance > _COLOUR_DISTANCE), 1)
     enclosed = _enclosed(other & ~seen.near, measured, frame.valid)
     gaps = _opened(searched & (seen.brightness < _GLARE), scaled_length(_SOLID, frame.camera.width))
-    return (other & seen.near) | enclosed | _enclosed(gaps, table, frame.valid)
+    return (other & seen.near) | enclosed | _enclosed(gaps, seen.table, frame.valid)
 
 
 def _outlined(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
@@ -268,7 +267,7 @@ def _flat(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
     `pixels` (H, W) bool are those of other objects. A region beside another object can be its shadow, which the depth
     errors at the outline of the object raise, and is not used.
     """
-    table, rise = _on_table(frame), above_table(frame)
+    bare, rise = seen.table & ~pixels, above_table(frame)
     other = _opened(frame.valid & ~pixels & seen.near & (seen.distance > _COLOUR_DISTANCE), 1)
     regions, _ = ndimage.label(other)
     kept = np.bincount(regions.ravel()) >= scaled_area(_FLAT, pixels.size)
@@ -276,11 +275,11 @@ def _flat(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
         if kept[k]:
             ring, around = _ring(regions, k, box)
-            bare = ring & table[around] & ~pixels[around]
+            beside = ring & bare[around]
             kept[k] = (
                 pixels[around][ring].mean() <= _BESIDE
-                and bare.sum() >= _ON_TABLE * ring.sum()
-                and rise[box][regions[box] == k].mean() - rise[around][bare].mean() > _HIGHER
+                and beside.sum() >= _ON_TABLE * ring.sum()
+                and rise[box][regions[box] == k].mean() - rise[around][beside].mean() > _HIGHER
             )
     return np.asarray(kept[regions])
 

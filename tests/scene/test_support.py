@@ -130,6 +130,7 @@ def test_readings_of_objects_stay_and_estimates_are_above_the_table(seed, missin
     assert np.isfinite(found.frame.depth[found.pixels]).all()
     estimated = found.frame.estimated if found.frame.estimated is not None else np.zeros_like(raised)
     assert not (estimated & (raised | ~found.pixels)).any()
+    assert estimated[found.pixels & ~np.isfinite(holed.depth)].all()
     assert (found.frame.points[..., 2][found.pixels & ~raised] > 0.7 * GRID.voxel_size).all()
 
 
