@@ -262,11 +262,12 @@ class Frame:
             check_depth(some, "depth image of the frame")
         object.__setattr__(self, "rgb", frozen(rgb))
         object.__setattr__(self, "depth", read_only(depth))
-        if self.robot_mask is not None:
-            robot = np.asarray(self.robot_mask, dtype=bool)
-            if robot.shape != shape:
-                raise InputError(f"robot mask has shape {robot.shape}, expected {shape}")
-            object.__setattr__(self, "robot_mask", frozen(robot))
+        for name in ("robot_mask", "estimated"):
+            if (given := getattr(self, name)) is not None:
+                mask = np.asarray(given, dtype=bool)
+                if mask.shape != shape:
+                    raise InputError(f"{name} of the frame has shape {mask.shape}, expected {shape}")
+                object.__setattr__(self, name, frozen(mask))
         object.__setattr__(self, "views", tuple(self.views))
         if any(view.views for view in self.views):
             raise InputError("a view has views", "list all cameras as views of one frame")

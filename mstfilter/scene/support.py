@@ -32,6 +32,7 @@ from mstfilter.scene.voxels import VoxelGrid
 
 # Areas and lengths are those of an image of 640 x 480 pixels.
 _DENSE = 0.8  # share of readings beside a reading: with less, depth has holes everywhere
+_FEW_BESIDE = 0.1  # share of readings around a reading: with less, the reading is noise
 _SMALLEST = 25  # pixels of a region of readings
 _RISE = 1.75  # mean rise of a region of readings, in tolerances
 _SMALLEST_DARK = 60  # pixels of a region without readings
@@ -41,7 +42,8 @@ _COLOUR_DISTANCE = 11.3  # squared Mahalanobis distance of Lab colour from the t
 _COLOUR_NOISE = (9.0, 4.0, 4.0)  # variance of Lab colour in addition to that of the table
 _ON_TABLE = 0.4  # share of table around a region without readings
 _ENCLOSED, _FEW_AROUND = 0.55, 0.1  # share of the readings around a region that enclose it; least share of readings
-_SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare, standard deviations above the table
+_HOLE = 0.9  # share of the readings around a hole in an object that are readings of objects
+_SOLID, _GLARE = 8.0, 2.0  # radius of a solid gap, pixels; brightness of glare in standard deviations of the table
 _STEP, _SHADOW = 0.02, 1.2  # smallest step of depth in metres; tolerance of the width of a shadow
 _EDGE = 9  # pixels around the end of a gap that may have cast a shadow
 _FINE = 20.0  # pixels: means over less than this are computed at half of the resolution, others at a quarter
@@ -57,6 +59,7 @@ _CORE = 2.0  # pixels between an outline and the core of an object
 _CORE_REACH = 10.0  # standard deviation of the surroundings that show the colours of the core, pixels
 _ADDED, _REMOVED = 4.0, 8.0  # log odds that a reading on the table is right, and that a reading above the table is
 _FLAT, _HIGHER = 80, 0.4  # pixels of a flat object; its rise above the table around it, in sensor units
+_FEWEST = 20  # pixels of an image of any size: the mean rise of fewer pixels is noisy
 _BESIDE = 0.05  # share of other objects around a flat object; with more, it can be a shadow
 
 
@@ -125,7 +128,7 @@ def foreground(frame: Frame, grid: VoxelGrid | None = None) -> Foreground:
 
 def _foreground(frame: Frame, grid: VoxelGrid | None) -> Foreground:
     missing, seen = _without_readings(frame), _Colours.of(frame)
-    measured = _without_noise(frame, _regions_of_readings(frame, grid), seen)
+    measured = _regions_of_readings(frame, grid, seen)
     pixels = _joined(measured, _silent(frame, measured, missing, seen), seen.table, missing)
     pixels = _outlined(frame, pixels, seen)
     flat = _flat(frame, pixels, seen)
@@ -167,29 +170,24 @@ class _Colours:
         return cls(table, lab, near, deviation[..., 0], (deviation**2).sum(axis=-1), np.log(variance).sum(axis=-1))
 
 
-def _regions_of_readings(frame: Frame, grid: VoxelGrid | None) -> np.ndarray:
-    """Pixels (H, W) bool of connected regions of readings above the table."""
+def _regions_of_readings(frame: Frame, grid: VoxelGrid | None, seen: _Colours) -> np.ndarray:
+    """Pixels (H, W) bool of connected regions of readings above the table, without noise.
+
+    A small and low region with the colour of the table is noise.
+    """
     raised = readings_above_table(frame, grid)
     height = np.minimum(np.nan_to_num(filled_above_table(frame), posinf=1e3), 1e3)
     solid = raised | (~frame.valid & (height > TABLE_TOLERANCE))
     core = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    regions, n = ndimage.label(core)
-    area = np.bincount(regions.ravel(), minlength=n + 1)
-    rise = np.bincount(regions.ravel(), weights=height.ravel(), minlength=n + 1)
+    regions, _ = ndimage.label(core)
+    area, rise, other = (
+        np.bincount(regions.ravel(), weights=values.ravel())
+        for values in (np.ones(core.shape), height, seen.distance > _SAME_COLOUR)
+    )
     kept = (area >= scaled_area(_SMALLEST, raised.size)) & (rise > _RISE * TABLE_TOLERANCE * area)
+    kept &= (other > _OTHER_COLOUR * area) | (rise >= _LOW * area) | (area >= scaled_area(_SMALL, raised.size))
     kept[0] = False
     return (cv2.dilate(kept[regions].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & raised
-
-
-def _without_noise(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
-    """The `pixels` (H, W) bool without small and low connected regions that have the colour of the table."""
-    regions, n = ndimage.label(pixels)
-    index = np.arange(n + 1)
-    low = ndimage.mean(above_table(frame), regions, index) < _LOW
-    other = ndimage.mean(seen.distance > _SAME_COLOUR, regions, index) > _OTHER_COLOUR
-    kept = other | ~low | (np.bincount(regions.ravel()) >= scaled_area(_SMALL, pixels.size))
-    kept[0] = False
-    return np.asarray(kept[regions])
 
 
 def _on_table(frame: Frame) -> np.ndarray:
@@ -231,14 +229,16 @@ def _silent(frame: Frame, measured: np.ndarray, missing: np.ndarray, seen: _Colo
     """The pixels (H, W) bool without a depth reading that are assigned to objects by colour or by outline.
 
     A pixel near the table must differ in colour from the nearby table. A pixel far from the table must differ from
-    the colours of the whole table, and readings of objects (`measured`) must enclose its region. A large gap in the
-    readings of the table, without glare, also belongs to an object, for example a glass.
+    the colours of the whole table, and readings of objects (`measured`) must enclose its region. A gap of any colour
+    that is a hole in an object belongs to the object. A large gap in the readings of the table that is not brighter
+    than the table also belongs to an object, for example a glass.
     """
     searched = missing & _measured_part(frame)
     other = _opened(searched & (seen.distance > _COLOUR_DISTANCE), 1)
     enclosed = _enclosed(other & ~seen.near, measured, frame.valid)
     gaps = _opened(searched & (seen.brightness < _GLARE), scaled_length(_SOLID, frame.camera.width))
-    return (other & seen.near) | enclosed | _enclosed(gaps, seen.table, frame.valid)
+    holes = _enclosed(_opened(searched, 1), measured, frame.valid, _HOLE)
+    return (other & seen.near) | enclosed | holes | _enclosed(gaps, seen.table, frame.valid)
 
 
 def _outlined(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
@@ -270,7 +270,7 @@ def _flat(frame: Frame, pixels: np.ndarray, seen: _Colours) -> np.ndarray:
     bare, rise = seen.table & ~pixels, above_table(frame)
     other = _opened(frame.valid & ~pixels & seen.near & (seen.distance > _COLOUR_DISTANCE), 1)
     regions, _ = ndimage.label(other)
-    kept = np.bincount(regions.ravel()) >= scaled_area(_FLAT, pixels.size)
+    kept = np.bincount(regions.ravel()) >= max(_FEWEST, scaled_area(_FLAT, pixels.size))
     kept[0] = False
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
         if kept[k]:
@@ -300,14 +300,14 @@ def _opened(pixels: np.ndarray, radius: float) -> np.ndarray:
     return cv2.morphologyEx(pixels.astype(np.uint8), cv2.MORPH_OPEN, _ellipse(radius)) > 0
 
 
-def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The connected regions of `pixels` (H, W) bool that are surrounded mostly by readings in `by` (H, W) bool."""
+def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray, share: float = _ENCLOSED) -> np.ndarray:
+    """The connected regions of `pixels` (H, W) bool around which a share of the readings is in `by` (H, W) bool."""
     regions, n = ndimage.label(pixels)
     kept = np.zeros(n + 1, bool)
     for k, box in enumerate(ndimage.find_objects(regions), start=1):
         ring, around = _ring(regions, k, box)
         read = ring & valid[around]
-        kept[k] = read.sum() > _FEW_AROUND * ring.sum() and by[around][read].mean() >= _ENCLOSED
+        kept[k] = read.sum() > _FEW_AROUND * ring.sum() and by[around][read].mean() >= share
     kept[0] = False
     return np.asarray(kept[regions])
 
@@ -315,7 +315,8 @@ def _enclosed(pixels: np.ndarray, by: np.ndarray, valid: np.ndarray) -> np.ndarr
 def _measured_part(frame: Frame) -> np.ndarray:
     """The convex hull (H, W) bool of the readings. Registered depth images have empty margins."""
     part = np.zeros(frame.depth.shape, np.uint8)
-    points = cv2.findNonZero(cv2.erode(frame.valid.astype(np.uint8), np.ones((3, 3), np.uint8)))
+    beside = cv2.blur(frame.valid.astype(np.float32), (5, 5))
+    points = cv2.findNonZero((frame.valid & (beside > _FEW_BESIDE)).astype(np.uint8))
     if points is not None:
         cv2.fillConvexPoly(part, cv2.convexHull(points), 1)
     return part > 0

@@ -187,7 +187,7 @@ def _score_pause(pause: int, estimate: PauseEstimate, truth: PauseTruth) -> list
     seen, true = _comparable(pause, estimate, truth)
     labels, w = estimate.labels, np.asarray(estimate.weights, dtype=float)
     found = [seen(one) for one in labels]
-    floors = [[seen(floor(one).astype(np.uint16)) for one in labels] for floor in (one_blob, connected_components)]
+    floors = [[seen(floor(one)) for one in labels] for floor in (one_blob, connected_components)]
     belief = {}
     if truth.questions is not None:
         scores = score_belief(truth.questions, estimate.hypotheses, w, true)

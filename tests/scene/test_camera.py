@@ -125,7 +125,8 @@ def test_frames_are_checked_and_read_only():
         ((rgb, depth[:-1]), "depth image"),
         ((rgb.astype(float), depth), "uint8"),
         ((rgb, np.ones((480, 640), np.uint16)), "metres"),
-        ((rgb, depth, CAMERA, robot[:4]), "robot mask"),
+        ((rgb, depth, CAMERA, robot[:4]), "robot_mask of the frame"),
+        ((rgb, depth, CAMERA, None, (), robot[:4]), "estimated of the frame"),
     ):
         with pytest.raises(InputError, match=message):
             Frame(*wrong, *([CAMERA] if len(wrong) == 2 else []))
