@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.typing import ArrayLike
 from scipy.ndimage import binary_erosion, label
 
 from mstfilter.scene import Frame, foreground, pixels_above_table, readings_above_table, render
@@ -45,14 +46,17 @@ def test_noise_on_the_table_is_no_object():
     assert share(found, SEEN > 0) > 0.9
 
 
+def middle_of_an_object(radius: float) -> np.ndarray:
+    rows, columns = np.nonzero(SEEN == 1)
+    return (SEEN == 1) & (np.hypot(np.arange(480)[:, None] - rows.mean(), np.arange(640) - columns.mean()) < radius)
+
+
 @pytest.mark.parametrize("colour", [None, (200, 190, 170)])
 def test_a_hole_in_an_object_belongs_to_the_object(colour):
     """The colour of the table does not matter: readings of the object are on all sides."""
     frame = frame_of(TWO, width=640, noise=0.3)
-    rows, columns = np.nonzero(SEEN == 1)
     for radius in (4, 25):
-        middle = np.hypot(np.arange(480)[:, None] - rows.mean(), np.arange(640)[None] - columns.mean())
-        hole = (SEEN == 1) & (middle < radius)
+        hole = middle_of_an_object(radius)
         assert foreground(without(frame, hole, colour), GRID).pixels[hole].all()
 
 
@@ -72,11 +76,7 @@ def test_sparse_readings_show_the_same_objects(missing):
 @pytest.mark.parametrize("part", ["all of an object", "its middle"])
 def test_an_object_without_readings_is_found_by_its_colour(part):
     frame = frame_of(TWO, width=640, noise=0.3)
-    holes = SEEN == 1
-    if part == "its middle":
-        rows, columns = np.nonzero(holes)
-        middle = np.hypot(np.arange(480)[:, None] - rows.mean(), np.arange(640)[None] - columns.mean())
-        holes &= middle < 25
+    holes = middle_of_an_object(25) if part == "its middle" else SEEN == 1
     found = foreground(without(frame, holes), GRID)
     assert share(found.pixels, SEEN == 1) > 0.95
     error = np.abs(found.frame.depth - frame.depth)[holes & found.pixels]
@@ -158,7 +158,7 @@ def test_readings_of_objects_stay_and_estimates_are_above_the_table(seed, missin
     assert (found.frame.points[..., 2][found.pixels & ~raised] > 0.7 * GRID.voxel_size).all()
 
 
-def lifted(frame: Frame, pixels: np.ndarray, units: float, colour: tuple[int, int, int] | None) -> Frame:
+def lifted(frame: Frame, pixels: np.ndarray, units: ArrayLike, colour: tuple[int, int, int] | None) -> Frame:
     """The frame with readings in some pixels that are higher by some sensor units, perhaps of another colour."""
     depth = np.where(pixels, 315.0 / (315.0 / frame.depth + units), frame.depth).astype(np.float32)
     rgb = frame.rgb if colour is None else np.where(pixels[..., None], np.uint8(colour), frame.rgb)
@@ -190,11 +190,11 @@ def test_prints_on_the_table_are_no_flat_objects_in_small_images():
     frame, found = frame_of(0 * TWO, width=160), 0
     rows, columns = np.indices(frame.depth.shape)
     prints = (rows % 12 < 4) & (columns % 12 < 5) & (rows > 37) & (rows < 105) & (columns > 30) & (columns < 130)
-    rgb = np.where(prints[..., None], np.uint8((40, 40, 60)), frame.rgb)
+    printed = lifted(frame, prints, 0, (40, 40, 60))
     for seed in range(6):
         noise = np.random.default_rng(seed).normal(0, 0.9, frame.depth.shape)
-        depth = (315 / (315 / frame.depth + noise)).astype(np.float32)
-        found += label(foreground(Frame(rgb, depth, frame.camera)).pixels & prints)[1]
+        noisy = lifted(printed, np.ones_like(prints), noise, None)
+        found += label(foreground(noisy).pixels & prints)[1]
     assert found <= 3  # of 288
 
 
