@@ -2,10 +2,10 @@
 
 >>> run_training(CompletionTraining.recipe("cpu"), "completion-model")
 
-The loss is the log loss of the voxels that are not observed as free, at the mode of the latent variable. The log loss
-of a sample is divided by the number of voxels on or behind the visible surface, so that small objects count as much
-as large ones; the divisor depends on the input only, so the loss stays proper. At the end, scale and shift of the
-logits are fitted to the validation samples, over the voxels that are not free.
+The loss is the log loss of the voxels that are not observed as free. The log loss of a sample is divided by the
+number of voxels on or behind the visible surface, so that small objects count as much as large ones. The divisor
+depends on the input only, so the loss stays proper. At the end, scale and shift of the logits are fitted to the
+validation samples, over the voxels that are not free.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _OWN = Seen.SURFACE | Seen.BEHIND  # on or behind the visible surface of the obj
 class CompletionTraining(Training):
     """Settings of the training of the completion network. A scene gives about 35 samples."""
 
-    latent: int = 16  #: dimension of the latent variable
+    n_globals: int = 16  #: number of global features
 
     recipes: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "cpu": {},
         "gpu": {"n_scenes": 9000, "width": 32, "steps": 200_000, "batch": 64},
         "smoke": {
             **{"n_scenes": 6, "n_validation": 2, "n_test": 3},
-            **{"width": 8, "latent": 4, "steps": 150, "average": 0.97},
+            **{"width": 8, "n_globals": 4, "steps": 150, "average": 0.97},
         },
     }
     architecture: ClassVar[str] = ARCHITECTURE
@@ -50,7 +50,7 @@ class CompletionTraining(Training):
     losses: ClassVar[tuple[str, ...]] = ("loss",)
 
     def networks(self) -> dict[str, nn.Module]:
-        return {"net": CompletionNet(len(CHANNELS), self.width, self.latent)}
+        return {"net": CompletionNet(len(CHANNELS), self.width, self.n_globals)}
 
     def batches(self, samples: CompletionSamples, first: int, last: int) -> Iterator[tuple[Tensor, ...]]:
         """Batches in which each sample is turned and mirrored."""
@@ -90,7 +90,7 @@ class CompletionTraining(Training):
         figures, rows = measure(net, calibration, test, device)
         described = {
             "lattice_m": LATTICE,
-            "network": {"channels": list(CHANNELS), "width": self.width, "latent": self.latent},
+            "network": {"channels": list(CHANNELS), "width": self.width, "n_globals": self.n_globals},
             "calibration": {"scale": calibration[0], "shift": calibration[1]},
         }
         return described, figures, rows
@@ -107,7 +107,7 @@ def _turned(values: np.ndarray, symmetry: int) -> np.ndarray:
 
 
 def _logits(net: CompletionNet, samples: CompletionSamples, device: torch.device) -> Iterator[tuple[slice, Tensor]]:
-    """Logits of batches of samples, with the mode of the latent variable."""
+    """Logits of batches of samples."""
     with torch.inference_mode():
         for start in range(0, len(samples), 32):
             part = slice(start, min(start + 32, len(samples)))

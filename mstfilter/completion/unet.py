@@ -1,15 +1,13 @@
-"""The completion network: a small 3-D U-Net with a latent variable for the occluded shape. The module needs torch.
+"""The completion network: a small 3-D U-Net with a global feature vector. The module needs torch.
 
 >>> network = load_network("completion")
 >>> p = network.probabilities([seen], edge=32)      # (1, 32, 32, 32)
 
 The input is a crop of the workspace's voxel grid (`mstfilter.completion.crops`). The output is a logit for each
 voxel. The residual blocks work at a half, a quarter and an eighth of the resolution. At the input and the output, 2 x
-2 x 2 voxels are packed as channels. A latent vector z scales and shifts the features at the two coarse levels (FiLM;
-Perez et al., "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). The vector z is the mode of a
-prior that depends on the input. In training, z is drawn from a posterior that also depends on the true shape. The
-network is a conditional variational autoencoder (Sohn, Lee and Yan, "Learning structured output representation using
-deep conditional generative models", NeurIPS 2015).
+2 x 2 voxels are packed as channels. A vector z of global features scales and shifts the features at the two coarse
+levels (FiLM; Perez et al., "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). The vector z is a
+linear function of the mean features at an eighth of the resolution.
 
 `load_network` also loads a user's network: an `Architecture` with weights in a folder, or an ONNX file.
 """
@@ -50,13 +48,13 @@ def _to_voxels(x: Tensor) -> Tensor:
 
 
 class _Block(nn.Module):
-    """Residual block. The latent vector z scales and shifts the features between the two convolutions."""
+    """Residual block. The global vector z scales and shifts the features between the two convolutions."""
 
-    def __init__(self, width: int, latent: int = 0) -> None:
+    def __init__(self, width: int, n_globals: int = 0) -> None:
         super().__init__()
         self.norm1, self.norm2 = nn.GroupNorm(8, width), nn.GroupNorm(8, width)
         self.conv1, self.conv2 = nn.Conv3d(width, width, 3, padding=1), nn.Conv3d(width, width, 3, padding=1)
-        self.film = nn.Linear(latent, 2 * width) if latent else None
+        self.film = nn.Linear(n_globals, 2 * width) if n_globals else None
 
     def forward(self, x: Tensor, z: Tensor | None = None) -> Tensor:
         y = self.norm2(self.conv1(functional.silu(self.norm1(x))))
@@ -67,7 +65,7 @@ class _Block(nn.Module):
 
 
 class CompletionNet(nn.Module):
-    """The conditional variational autoencoder for completion (see the module).
+    """The U-Net for completion (see the module).
 
     Parameters
     ----------
@@ -75,11 +73,11 @@ class CompletionNet(nn.Module):
         Number of input channels.
     width : int
         Number of features at half the resolution, a multiple of 8. The coarser levels have 2 and 4 times this number.
-    latent : int
-        Dimension of z.
+    n_globals : int
+        Number of global features, the dimension of z.
     """
 
-    def __init__(self, channels: int, width: int, latent: int) -> None:
+    def __init__(self, channels: int, width: int, n_globals: int) -> None:
         super().__init__()
         self.stem = nn.Conv3d(8 * channels, width, 3, padding=1)
         self.fine = _Block(width)
@@ -87,11 +85,11 @@ class CompletionNet(nn.Module):
         self.middle = _Block(2 * width)
         self.down2 = nn.Conv3d(2 * width, 4 * width, 2, stride=2)
         self.coarse = nn.ModuleList([_Block(4 * width), _Block(4 * width)])
-        self.prior = nn.Linear(4 * width, 2 * latent)
-        self.mixed = nn.ModuleList([_Block(4 * width, latent), _Block(4 * width, latent)])
+        self.globals = nn.Linear(4 * width, n_globals)
+        self.mixed = nn.ModuleList([_Block(4 * width, n_globals), _Block(4 * width, n_globals)])
         self.up1 = nn.Conv3d(4 * width, 2 * width, 1)
         self.join1 = nn.Conv3d(4 * width, 2 * width, 1)
-        self.rise = _Block(2 * width, latent)
+        self.rise = _Block(2 * width, n_globals)
         self.up2 = nn.Conv3d(2 * width, width, 1)
         self.join2 = nn.Conv3d(2 * width, width, 1)
         self.end = _Block(width)
@@ -100,31 +98,22 @@ class CompletionNet(nn.Module):
         #: Logit of a voxel that is not extruded, and what extrusion adds: the network starts from this rule.
         self.rule = nn.Parameter(torch.tensor([-3.0, 4.4]))
 
-    def encode(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
-        """Features of an input (b, channels, X, Y, Z), and the mode of z. X, Y and Z are multiples of 8."""
+    def forward(self, x: Tensor) -> Tensor:
+        """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z). X, Y and Z are multiples of 8."""
         fine = self.fine(self.stem(to_channels(x)))
         middle = self.middle(self.down1(fine))
-        coarse = self.down2(middle)
+        y = self.down2(middle)
         for block in self.coarse:
-            coarse = block(coarse)
-        mode, _ = self.prior(coarse.mean(dim=(2, 3, 4)).float()).chunk(2, dim=1)  # and the logs of deviations
-        return [fine, middle, coarse, x[:, -1]], mode
-
-    def decode(self, features: list[Tensor], z: Tensor) -> Tensor:
-        """Logits (b, X, Y, Z) of a latent vector (b, latent)."""
-        fine, middle, x, extruded = features
+            y = block(y)
+        z = self.globals(y.mean(dim=(2, 3, 4)).float())
         for block in self.mixed:
-            x = block(x, z)
-        x = functional.interpolate(self.up1(x), scale_factor=2)
-        x = self.rise(self.join1(torch.cat([x, middle], dim=1)), z)
-        x = functional.interpolate(self.up2(x), scale_factor=2)
-        x = self.end(self.join2(torch.cat([x, fine], dim=1)))
-        logits = _to_voxels(self.head(functional.silu(x)).float())
-        return logits + self.rule[0] + self.rule[1] * extruded.float()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Logits (b, X, Y, Z) of an input (b, channels, X, Y, Z), with the mode of z."""
-        return self.decode(*self.encode(x))
+            y = block(y, z)
+        y = functional.interpolate(self.up1(y), scale_factor=2)
+        y = self.rise(self.join1(torch.cat([y, middle], dim=1)), z)
+        y = functional.interpolate(self.up2(y), scale_factor=2)
+        y = self.end(self.join2(torch.cat([y, fine], dim=1)))
+        logits = _to_voxels(self.head(functional.silu(y)).float())
+        return logits + self.rule[0] + self.rule[1] * x[:, -1].float()
 
 
 class TrainedNetwork:
@@ -179,7 +168,9 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
     if architecture is None and not name.endswith(".onnx"):
         model = open_model(name, ARCHITECTURE)
         net, scale, shift = calibrated_network(
-            model, CHANNELS, lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["latent"]))
+            model,
+            CHANNELS,
+            lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["n_globals"])),
         )
         return TrainedNetwork(net, model.key, scale, shift)
     if name.endswith(".onnx"):

@@ -23,13 +23,13 @@ STACK = boxes(((22, 22, 0), (38, 38, 6)), ((26, 26, 6), (34, 34, 14)))
 
 
 def describe(**network) -> dict:
-    values = {"channels": list(CHANNELS), "width": 8, "latent": 4, **network}
+    values = {"channels": list(CHANNELS), "width": 8, "n_globals": 4, **network}
     return {"architecture": ARCHITECTURE, "network": values, "calibration": {"scale": 0.9, "shift": 0.1}}
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """A network with random weights that uses its latent variable."""
+    """A network with random weights that uses its global features."""
     torch.manual_seed(0)
     net = CompletionNet(len(CHANNELS), 8, 4)
     torch.nn.init.normal_(net.head.weight, std=0.5)

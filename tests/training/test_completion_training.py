@@ -28,7 +28,7 @@ from tests.experiments.scripts import run_script
 from tests.segmentation.scenes import GRID, TWO, frame_of
 
 SMALL = CompletionTraining(
-    n_scenes=1, n_validation=1, n_test=1, width=8, latent=4, steps=40, batch=8, rate=4e-3, average=0.9
+    n_scenes=1, n_validation=1, n_test=1, width=8, n_globals=4, steps=40, batch=8, rate=4e-3, average=0.9
 )
 
 
@@ -170,8 +170,8 @@ def test_training_starts_from_a_model(files, tmp_path):
         (tmp_path / f"a/samples/{name}").mkdir(parents=True)
         shutil.copy(files[0], tmp_path / f"a/samples/{name}/scenes-000000.npz")
     model = open_model("completion")
-    width, latent = (model.description["network"][name] for name in ("width", "latent"))
-    run_training(replace(SMALL, start="completion", width=width, latent=latent, rate=0.0, steps=1), tmp_path / "a")
+    width, n = (model.description["network"][name] for name in ("width", "n_globals"))
+    run_training(replace(SMALL, start="completion", width=width, n_globals=n, rate=0.0, steps=1), tmp_path / "a")
     for name, tensor in model.tensors.items():
         assert np.allclose(open_model(str(tmp_path / "a")).tensors[name], tensor, atol=1e-6)
 
