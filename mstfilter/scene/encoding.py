@@ -20,9 +20,10 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
     """Convert hypotheses with the same grid to a dictionary of named arrays.
 
     The arrays are ``labels`` (n, X, Y, Z) uint16, ``origin`` (3,), ``voxel_size`` (), and arrays with one row per
-    object: ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` (4, 4), ``completion_key``.
-    The field `source` of the objects is stored as ``has_source``, ``source_offset`` (3,), ``source_shape`` (3,) and
-    ``source_bits``. The array ``source_bits`` concatenates the packed bits of all `Crop` objects.
+    object: ``owner`` (index of the hypothesis), ``label``, ``id``, ``birth``, ``motion`` and ``pose`` (4, 4),
+    ``completion_key``. The field `source` of the objects is stored as ``has_source``, ``source_offset`` (3,),
+    ``source_shape`` (3,) and ``source_bits``. The array ``source_bits`` concatenates the packed bits of all `Crop`
+    objects.
 
     If a hypothesis has probabilities, the occupancy is stored as ``voxel_owner`` and ``probability`` (n, X, Y, Z).
     ``source_probability`` concatenates the probabilities of all `Crop` objects. Each `ObjectView` has a row in
@@ -45,6 +46,7 @@ def encode_hypotheses(hypotheses: Sequence[Hypothesis]) -> dict[str, np.ndarray]
         "id": np.array([r.id for _, r in rows], np.int64),
         "birth": np.array([r.birth for _, r in rows], np.int64),
         "motion": _matrices(r.motion for _, r in rows),
+        "pose": _matrices(r.pose for _, r in rows),
         "completion_key": np.array([r.completion_key or "" for _, r in rows], np.str_),
         "has_source": np.array([c is not None for c in crops], bool),
         "source_offset": np.array([(0, 0, 0) if c is None else c.offset for c in crops], np.int64).reshape(-1, 3),
@@ -105,6 +107,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
     records: list[list[ObjectRecord]] = [[] for _ in labels]
     begin, views = 0, _decode_views(arrays)
     probabilities = _Reader(arrays["source_probability"]) if "source_probability" in arrays else None
+    poses = arrays.get("pose", arrays["motion"])  # version 0.1 has no poses
     for row, owner in enumerate(arrays["owner"].tolist()):
         crop = None
         if arrays["has_source"][row]:
@@ -125,6 +128,7 @@ def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...
                 RigidTransform(arrays["motion"][row], normalize=False),  # bit-identical
                 str(arrays["completion_key"][row]) or None,
                 tuple(views.get(row, ())),
+                RigidTransform(poses[row], normalize=False),
             )
         )
     found = []

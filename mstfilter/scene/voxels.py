@@ -236,9 +236,11 @@ class ObjectRecord:
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
     completion_key: str | None = None  #: key of the image segment from which the object was made
     views: tuple[ObjectView, ...] = ()  #: observations of the object in frames, oldest first
+    #: Rigid motion in world metres since the object was first proposed, also across changes of its voxels.
+    pose: RigidTransform = field(default_factory=lambda: _NO_MOTION)
 
     def __repr__(self) -> str:
-        moved = ", moved" * (self.motion is not _NO_MOTION)
+        moved = ", moved" * (self.pose is not _NO_MOTION)
         return f"ObjectRecord(label={self.label}, id={self.id}, birth={self.birth}{moved})"
 
     @classmethod
@@ -251,7 +253,8 @@ class ObjectRecord:
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
         """The `ObjectRecord` after a rigid motion T. `source` has the voxels before the first motion."""
         total = T if self.source is None else T * self.motion
-        return replace(self, source=source, motion=total, views=tuple(view.moved(T) for view in self.views))
+        views = tuple(view.moved(T) for view in self.views)
+        return replace(self, source=source, motion=total, views=views, pose=T * self.pose)
 
     def changed(self) -> ObjectRecord:
         """The `ObjectRecord` after a change of the voxels that is not a rigid motion."""
@@ -425,8 +428,8 @@ class Hypothesis:
     mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
-        """Rigid motion of an object in world metres since its first observation or its last change of shape."""
-        return self.record(label).motion
+        """Rigid motion of an object in world metres since the object was first proposed."""
+        return self.record(label).pose
 
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:
         """Oriented bounding box of the voxels of an object.

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from mstfilter.completion import Extrude, SurfaceOnly
 from mstfilter.errors import InputError
@@ -60,6 +61,16 @@ def test_guesses_are_not_added_up():
             assert [record.id for record in one.objects] == ids
         state = found.particles[-1]
         assert [len(record.views) for record in state.objects] == [min(index + 1, 3)] * 2
+
+
+def test_the_pose_of_an_object_stays_when_its_shape_is_completed_again():
+    update, clip = PartitionUpdate(), clip_of(TWO)
+    sample = sample_of(clip, masks_of(TWO, clip.after))
+    state = step(update, clip, sample).particles[0]
+    T = RigidTransform.from_translation([0.1, 0, 0])  # since the object was first proposed
+    before = replace(state, objects=tuple(replace(record, pose=T) for record in state.objects))
+    for one in step(update, clip_of(TWO, 1), sample, before).particles:
+        assert [one.pose(record.label).translation.tolist() for record in one.objects] == [[0.1, 0, 0]] * 2
 
 
 def test_hidden_objects_stay_until_the_frame_sees_through_them():

@@ -166,6 +166,7 @@ def test_encoding_is_lossless_and_reproducible():
                 o,
                 source=crop_of(array == o.label, n) if o.label == 4 else None,
                 motion=RigidTransform.from_exp_coords(rng.normal(size=6)),
+                pose=RigidTransform.from_exp_coords(rng.normal(size=6)),
                 completion_key="a" * n,
                 views=tuple(
                     ObjectView(
@@ -194,6 +195,7 @@ def test_encoding_is_lossless_and_reproducible():
         for p, q in zip(a.objects, b.objects, strict=True):
             assert (p.label, p.id, p.birth, p.completion_key or None) == (q.label, q.id, q.birth, q.completion_key)
             np.testing.assert_allclose(p.motion.as_matrix(), q.motion.as_matrix(), atol=1e-12)
+            np.testing.assert_allclose(p.pose.as_matrix(), q.pose.as_matrix(), atol=1e-12)
             assert (p.source is None) == (q.source is None)
             if p.source is not None:
                 np.testing.assert_array_equal(p.source.occupied, q.source.occupied)
@@ -203,6 +205,8 @@ def test_encoding_is_lossless_and_reproducible():
             for v, w in zip(p.views, q.views, strict=True):
                 for name in ("offset", "bits", "signed", "colours"):
                     np.testing.assert_array_equal(getattr(v, name), getattr(w, name))
+    older = decode_hypotheses({name: a for name, a in arrays.items() if name != "pose"})  # a file of version 0.1
+    assert all(o.pose.as_matrix().tolist() == o.motion.as_matrix().tolist() for h in older for o in h.objects)
     again = encode_hypotheses(loaded)
     assert {name: a.tobytes() for name, a in again.items()} == {name: a.tobytes() for name, a in arrays.items()}
 
@@ -226,7 +230,10 @@ def test_points_mesh_pose_and_box_of_an_object():
     assert np.allclose(hypothesis.pose(3).as_matrix(), np.eye(4))
     moved = RigidTransform.from_translation([0.02, 0, 0])
     record = hypothesis.record(3).moved(moved, hypothesis.crop(3))
-    assert np.allclose(replace(hypothesis, objects=(record,)).pose(3).as_matrix(), moved.as_matrix())
+    turned = RigidTransform.from_exp_coords([0, 0, 0.5, 0, 0.1, 0])
+    for one, expected in ((record, moved), (record.changed().moved(turned, hypothesis.crop(3)), turned * moved)):
+        found = replace(hypothesis, objects=(one,)).pose(3)  # also after a change of the voxels
+        np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-12)
     for method in (hypothesis.points, hypothesis.mesh, hypothesis.pose, hypothesis.box):
         with pytest.raises(InputError, match="no object with label 4"):
             method(4)
