@@ -138,7 +138,17 @@ def test_simulate_takes_changes_to_the_family(tmp_path, capsys):
     assert set(np.unique(recording.truth(0))) == {0, 1, 2}
 
 
-@pytest.mark.parametrize(("command", "message"), [("run", "resume"), ("simulate", "starts anew"), ("demo", "anew")])
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("run", "repeat the command to resume\n"),
+        ("run --replace", "resume, without --replace"),
+        ("run --live=5", "cannot be resumed"),
+        ("train", "resume"),
+        ("simulate", "starts anew"),
+        ("demo", "anew"),
+    ],
+)
 def test_an_interrupted_command_says_what_it_keeps(command, message, tmp_path, monkeypatch, capsys):
     def interrupt(*arguments, **named):
         raise KeyboardInterrupt
@@ -146,7 +156,11 @@ def test_an_interrupted_command_says_what_it_keeps(command, message, tmp_path, m
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mstfilter.simulation.simulate_recording", interrupt)
     monkeypatch.setattr("mstfilter.formats.open_recording", interrupt)
-    arguments = {"run": ("run", "x"), "simulate": ("simulate", "demo", "out"), "demo": ("demo",)}[command]
+    monkeypatch.setattr("mstfilter.formats.open_format", interrupt)
+    monkeypatch.setattr("mstfilter.resources.training_program", interrupt)
+    name, *options = command.split()
+    given = {"run": ("x", *options), "simulate": ("demo", "out"), "demo": (), "train": ("completion",)}[name]
+    arguments = (name, *given)
     code, _, err = call(*arguments, capsys=capsys)
     assert code == 130
     assert message in err

@@ -41,10 +41,10 @@ def warped(images, T, fill=0.0):
     return np.stack([cv2.warpAffine(image, np.float32(T), size, **how) for image in images])
 
 
-def shifted_camera():
-    """From the second pause on, the image is that of a camera which is rolled and displaced."""
+def shifted_camera(by=1.0):
+    """From the second pause on, the camera is rolled and displaced. `by` scales the motion."""
     arrays, _ = right()
-    T = [[1, -0.05, 20], [0.05, 1, -14]]
+    T = [[1, -0.05 * by, 20 * by], [0.05 * by, 1, -14 * by]]
     rgb, depth = warped(arrays["rgb"][1:], T), warped(arrays["depth"][1:], T, np.nan)
     return changed(rgb=np.r_[arrays["rgb"][:1], rgb], depth=np.r_[arrays["depth"][:1], depth])
 

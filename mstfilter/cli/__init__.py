@@ -104,6 +104,8 @@ def _print(kind: str, message: str, *hints: str) -> None:
 
 def _interrupted(given: list[str]) -> str:
     """Message that states how to continue an interrupted command."""
-    if given[:1] in (["run"], ["study"]):
-        return "interrupted: repeat the command to resume"
+    if given[:1] == ["run"] and any(option.startswith("--live") for option in given):
+        return "interrupted: a live run cannot be resumed; its pauses are complete"
+    if given[:1] in (["run"], ["study"], ["train"]):
+        return "interrupted: repeat the command to resume" + ", without --replace" * ("--replace" in given)
     return "interrupted: the command starts anew if it is repeated"

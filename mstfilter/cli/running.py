@@ -188,10 +188,12 @@ def view(
     if out is not None:
         check_output(out)
     if (source / "run.json").is_file():
+        if format or option or pauses:
+            raise InputError(f"{source} is a run: --format, -o and --pauses are for recordings")
         page, default = run_page(RunFolder.open(source)), source / "view.html"
     else:
         recording = read_source(source, format, option, pauses)
-        page, default = recording_page(recording), Path(f"{recording.name}.html")
+        page, default = recording_page(recording), Path(f"{safe_name(recording.name)}.html")
     print(f"page        {page.save(out or default)}")
 
 

@@ -100,6 +100,7 @@ _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _STILL = "remove the file if the camera stands still"
 _POLL_S = 0.02
 _WRITTEN_S = 0.3  # age of the last files after which they are complete
+_PARTNER_S = 2.0  # how long a pair waits for its second image, or to become readable
 INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
 _ENTRIES = INTRINSICS, "fps", "depth_scale"
 _READ = ("K", "fx", "fy", "cx", "cy", "intrinsic_matrix", "distortion", "width", "height")
@@ -144,17 +145,20 @@ class Redwood(VideoFormat):
         """Yield the time in seconds and the frame (without a pose) of each image pair that is added to a folder.
 
         A pair is read when a later pair exists, or when the files of the pair no longer change. A colour image
-        without a depth image of the same number is skipped, as is one without a robot mask if there is a folder
+        waits 2 s for the depth image of the same number, and a pair 2 s to become readable; then it is skipped. A
+        colour image is also skipped without a robot mask if there is a folder
         robot/. The iteration ends after `idle_s` seconds without a new pair.
         """
         known: set[str] = set()  # names of the images that were read
         pairs: list[tuple[Path, Path]] = []  # the first and the latest one
+        trial: tuple[Path, Path] | None = None  # the pair that is being read
         n, since, failed = 0, time.monotonic(), None
         while time.monotonic() - since < idle_s:
             try:
                 new, images = self._files(path, known)
                 new = [file for file in new if _mask(path, file).is_file()] if (path / "robot").is_dir() else new
                 for pair in _complete(new, images, after=pairs[-1:]):
+                    trial = pair
                     colour, depth = map(list, zip(*pairs[:1], pair, strict=True))
                     video = self._video(path, colour, depth)
                     camera, _, read = video.frame_reader()
@@ -163,9 +167,13 @@ class Redwood(VideoFormat):
                     yield seconds, read(len(video.times) - 1, camera)
                     pairs, n = [*pairs[:1], pair], n + 1
                     known.update(file.name for file in pair)
-                    since, failed = time.monotonic(), None
+                    since, failed, trial = time.monotonic(), None, None
             except InputError as error:  # there is no image yet, or a file is incomplete
                 failed = error
+                if trial and min(map(_age, trial)) > _PARTNER_S:
+                    warn_user(f"images {trial[0].name}, {trial[1].name} of {path} are skipped: {error.message}")
+                    known.update(file.name for file in trial)
+                    n, trial, failed = n + 1, None, None
             time.sleep(_POLL_S)
         if failed is not None:
             raise failed
@@ -259,15 +267,23 @@ def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Pat
     """Pairs of images with equal numbers that are completely written and later than the last pair in `after`."""
     last = _number(after[0][0]) if after else Decimal(-2)
     of_number = {_number(file): file for file in depth}
-    pairs = [(file, of_number[n]) for file in colour if (n := _number(file)) in of_number and n > last]
+    later = [file for file in colour if _number(file) > last]
+    late = [_number(file) for file in later if _number(file) not in of_number and _age(file) < _PARTNER_S]
+    later = [file for file in later if _number(file) < min(late, default=Decimal("inf"))]
+    pairs = [(file, of_number[n]) for file in later if (n := _number(file)) in of_number]
     if not pairs and not after:
         raise InputError(
             "no colour image has a depth image of the same number",
             "a live run pairs images by number: give both images of a pair the same name",
         )
-    if not pairs or time.time() - max(file.stat().st_mtime for file in pairs[-1]) > _WRITTEN_S:
+    if not pairs or min(map(_age, pairs[-1])) > _WRITTEN_S:
         return pairs
     return pairs[:-1]
+
+
+def _age(file: Path) -> float:
+    """Seconds since the last change of a file."""
+    return time.time() - file.stat().st_mtime
 
 
 def _numbers(file: Path) -> list[Decimal]:

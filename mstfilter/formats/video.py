@@ -200,7 +200,9 @@ class Video:
         stored, source, read = self.frame_reader()
         camera = stored.limited(self.max_pixels)
         read(0, camera)  # raises an error in the first frame before all frames are searched for pauses
-        found = pauses.find(self.times, self.read_rgb)
+        # A stream of the same frames finds the pauses in these images.
+        changed = bool(self.distortion) or camera.width != stored.width
+        found = pauses.find(self.times, (lambda k: read(k, camera).rgb) if changed else self.read_rgb)
         first_pause = found[0]
         camera = camera if world.pose is None else camera.at(world.pose)
         camera, grid = find_world(read(first_pause, camera), world.grid)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import chain
 from pathlib import Path
@@ -62,6 +63,8 @@ def filter_folder(
     if not isinstance(reader.pauses, Settled):
         name = type(reader.pauses).__name__
         raise InputError(f"a live run cannot find pauses by {name}, which needs later frames", "--pauses settled")
+    if (reader.start_s, reader.stop_s) != (0.0, math.inf):
+        raise InputError("a live run reads all images: start_s and stop_s are for recordings")
     check_run_folder(path, replace)
     if not replace and (path / "run.json").is_file():
         raise InputError(f"run folder {path} exists", "choose another folder, or remove this one: --replace")
@@ -79,8 +82,8 @@ def filter_folder(
         if folder is None:
             folder = first_pause(path, describe_run(entry, config, filter, seed), replace, *step)
         else:
+            folder.set_status("running", recording=entry)  # first: a list of more pauses than there are is allowed
             folder.write_pause(*step)
-            folder.set_status("running", recording=entry)
         on_pause(pause)
 
     def finish(status: str) -> None:

@@ -35,12 +35,14 @@ from mstfilter.scene import (
     WORKING_PIXELS,
     Camera,
     Clip,
+    Finding,
     Frame,
     Hypothesis,
     Look,
     VoxelGrid,
     check_depth,
     examine,
+    examine_hypotheses,
     examine_next,
     find_world,
     render_hypothesis,
@@ -110,7 +112,7 @@ class Stream:
     Notes
     -----
     If `max_frames` frames are queued, new frames are dropped. If a clip reaches `max_frames`, frames with little
-    motion are removed from the clip. `counts` has the numbers. At most three times `max_frames` frames are in memory.
+    motion are removed from the clip. `counts` has the numbers. At most four times `max_frames` frames are in memory.
     An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
@@ -140,10 +142,13 @@ class Stream:
         self._world: Camera | None = None  # the camera of the first pause
         self._first: Look | None = None  # what the first pause shows
         self._reported: set[tuple[str, ...]] = set()
+        self._doubts: list[Finding] = []  # about the hypotheses
         self._clip: list[_Item] = []
         self._trackers: list[Any] = []
         self._n_pauses = 0
         self._last_time = -np.inf
+        self._posed: bool | None = None  # whether the frames have poses
+        self._closing, self._closed = threading.Lock(), False
         self._step: Future[None] | None = None
         self._error: BaseException | None = None
         self.last: Pause | None = None  #: the result at the last pause
@@ -197,8 +202,7 @@ class Stream:
         if wait:
             self._check_caller("push(wait=True)")
         self._check()
-        if not self._watcher.is_alive():
-            raise InputError("the stream is closed", "make a new Stream")
+        self._check_open()
         number, time = self.counts["pushed"], arrived if time is None else float(time)
         self.counts["pushed"] += 1
         if not np.isfinite(time):
@@ -209,12 +213,15 @@ class Stream:
             return self._dropped("no depth", number, pause)
         if time <= self._last_time:
             return self._dropped("late", number, pause)
-        if self._queue.full() and not wait:
+        if self._queue.full() and not wait:  # before the images are copied
             return self._dropped("overflow", number, pause)
         camera = self._camera
         if not isinstance(camera, Camera):
             camera = Camera(camera, np.shape(rgb)[1], np.shape(rgb)[0])
         known = camera
+        if self._posed not in (None, pose is not None):
+            text = f"frame {number} has {'a' if self._posed is False else 'no'} pose, unlike the frames before"
+            raise InputError(text, "give the pose of every frame, or of none; leave out a frame without a known pose")
         if pose is not None:
             rigid = pose if isinstance(pose, RigidTransform) else rigid_from_matrix(pose, f"pose of frame {number}")
             camera = camera.at(rigid)
@@ -223,8 +230,16 @@ class Stream:
         frame = Frame(np.array(rgb), depth, camera, None if robot_mask is None else np.array(robot_mask))
         check_depth(frame.depth, f"depth image of frame {number}")
         frame = frame.resized(camera.limited(self._max_pixels))
-        self._last_time, self._camera = time, known
-        self._queue.put(_Item(number, frame, time, pause, arrived))
+        while True:
+            with self._closing:  # which is never held while a thread waits for a place in the queue
+                self._check_open()
+                if not self._queue.full():
+                    self._queue.put(_Item(number, frame, time, pause, arrived))
+                    break
+            if not wait:
+                return self._dropped("overflow", number, pause)
+            clock.sleep(0.002)
+        self._last_time, self._camera, self._posed = time, known, pose is not None
         return True
 
     def _dropped(self, why: str, number: int, pause: bool | None = None) -> bool:
@@ -266,9 +281,11 @@ class Stream:
     def close(self) -> None:
         """Process the queued frames, and end the threads. Raises InputError in `on_pause`."""
         self._check_caller("close()")
-        if self._watcher.is_alive():
+        with self._closing:
+            first, self._closed = not self._closed, True
+        if first:
             self._queue.put(None)
-            self._watcher.join()
+        self._watcher.join()
         self._pool.shutdown()
         self._check()
 
@@ -285,6 +302,10 @@ class Stream:
     def _check_caller(self, name: str) -> None:
         if threading.current_thread().name.startswith(f"mstfilter-step-{id(self)}"):
             raise InputError(f"{name} of a stream is called in on_pause", "call it in the thread that pushes")
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError("the stream is closed", "make a new Stream")
 
     def _check(self) -> None:
         if self._error is not None:
@@ -334,7 +355,7 @@ class Stream:
         look, first = Look(item.frame, grid, item.number), self._first
         found = examine([item.frame], [0], grid) if first is None else examine_next(first, look, times)
         self._first = first or look
-        found = [one for one in found if one.hints not in self._reported]
+        found = [one for one in found if one.stop or one.hints not in self._reported]
         self._reported.update(one.hints for one in found)
         report_findings(found, "stream")
 
@@ -371,7 +392,7 @@ class Stream:
     # --- thread of the filter -----------------------------------------------------------------------------------
     def _load(self, frame: Frame, state: State) -> None:
         """Filter a frame before the first pause to load libraries and networks, and discard the result."""
-        with contextlib.suppress(InputError):  # the frame need not show the scene at rest
+        with contextlib.suppress(Exception):  # the frame need not show the scene at rest
             camera, grid = find_world(frame, self._grid)
             self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
 
@@ -384,6 +405,9 @@ class Stream:
             latency = clock.perf_counter() - items[-1].arrived
             numbers = tuple(item.number for item in items)
             self.last = Pause(clip.index, clip, numbers, self._state, info, latency, dict(self.counts))
+            if not self._doubts and self._state.population is not None:  # said once
+                self._doubts = examine_hypotheses(self.hypotheses, clip.after)
+                report_findings(self._doubts, f"pause {clip.index} of the stream")
             if self._on_pause is not None:
                 self._on_pause(self.last)
             if self._flows:

@@ -195,7 +195,8 @@ def time_figure(
             axes.set_xlim(min(pauses) - 0.5, max(pauses) + 0.5)
             axes.set_xticks(pauses)
             drawn = np.concatenate([np.asarray(q) for by_pause in of_arms.values() for q in by_pause.values()])
-            axes.set_ylim(max(-0.02, drawn.min() - 0.05), min(1.02, drawn.max() + 0.05))
+            most = 1.02 if "quality" in measure else np.inf
+            axes.set_ylim(max(-0.02, drawn.min() - 0.05), min(most, drawn.max() + 0.05))
             axes.set_title(family)
             axes.set_ylabel(measure)
         panels[-1].set_xlabel("pause")

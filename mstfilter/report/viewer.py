@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -94,9 +95,8 @@ def _page(
     }
     template = (files("mstfilter.report") / "templates" / "viewer.html").read_text(encoding="utf-8")
     text = json.dumps(data).replace("<", "\\u003c")
-    for name, value in (("title", html.escape(title)), ("note", html.escape(note)), ("data", text)):
-        template = template.replace(f"{{{{ {name} }}}}", value)
-    return ScenePage(template, title)
+    values = {"title": html.escape(title), "note": html.escape(note), "data": text}
+    return ScenePage(re.sub(r"\{\{ (title|note|data) \}\}", lambda found: values[found[1]], template), title)
 
 
 def _scene_data(scene: ShownPause, photos: bool) -> dict[str, Any]:

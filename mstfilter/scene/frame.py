@@ -47,6 +47,7 @@ def depth_sigma(z: ArrayLike) -> np.ndarray:
 
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 
 
@@ -58,6 +59,8 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
         # The decoder would fill the missing rows with zeros without an error.
         raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of PNG)", "copy the file again")
+    if data.startswith(_JPEG_START) and data.rfind(_JPEG_END) < len(data) // 2:  # the header may hold a small JPEG
+        raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of JPEG)", "copy the file again")
     return decode_image(data, flags, f"image cannot be decoded: {path} ({len(data)} bytes)")
 
 

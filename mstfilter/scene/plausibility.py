@@ -419,11 +419,12 @@ def drift(first: Look, look: Look) -> tuple[float, float, float]:
 
 
 def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
-    """A finding for the first pause at which the camera is not at its given pose."""
+    """A finding if the camera is not at its given pose at a pause: for the first that stops, or for the farthest."""
     hints = (
         "fix the camera, or give its pose in every frame: T_world_camera of shape (T, 4, 4)",
         "poses of the camera map its points to the world, in metres; check that they belong to these frames",
     )
+    largest, moved = 1.0, ""
     for look in looks[1:]:
         if looks[0].table and not look.table and look.on_table.mean() < _TABLE_LEFT * looks[0].on_table.mean():
             text = f"frame {look.index} shows no table at z = 0, but frame {looks[0].index} does"
@@ -431,12 +432,15 @@ def _moved(looks: Sequence[Look]) -> Iterator[Finding]:
             return
         found = drift(looks[0], look)
         size = max(value / limit for value, limit in zip(found, _DRIFT, strict=True))
-        if size > 1:
-            text = f"the camera moves from frame {looks[0].index} to {look.index}, but not its pose: the table is "
-            text += f"tilted by {found[0]:.1f} degrees and {found[1]:.3f} m higher, still corners are shifted by "
-            text += f"{found[2]:.3f} m"
-            yield Finding(size > 2, text, hints)
-            return
+        if size > largest:
+            largest = size
+            moved = f"the camera moves from frame {looks[0].index} to {look.index}, but not its pose: the table is "
+            moved += f"tilted by {found[0]:.1f} degrees and {found[1]:.3f} m higher, still corners are shifted by "
+            moved += f"{found[2]:.3f} m"
+        if size > 2:
+            break
+    if moved:
+        yield Finding(largest > 2, moved, hints)
 
 
 def _registration(looks: Sequence[Look]) -> Iterator[Finding]:

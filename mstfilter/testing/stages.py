@@ -21,7 +21,7 @@ from mstfilter.completion.completer import fault_of
 from mstfilter.crossover import Crossover, CrossoverUpdate, Structure
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.partition import PairOdds, PartitionUpdate
-from mstfilter.scene import Clip, Hypothesis, Projection, render_hypothesis
+from mstfilter.scene import Clip, Hypothesis, Projection, render_hypothesis, scene_cache
 from mstfilter.segmentation import BoundaryModel, CutSampler, CutValue, TreeBuilder, TreeCutProposal
 from mstfilter.smc import Component, Population, Proposal, Transition, child
 from mstfilter.smc.testing.contract import (
@@ -104,6 +104,7 @@ class StageContract(Contract):
         """The result of the proposal, transition or update that uses the component."""
         owner = next(use for interface, use in STAGE_OWNERS.items() if isinstance(component, interface))(component)
         population, clip = inputs["population"], inputs["observation"]
+        scene_cache.clear()  # a repeated call runs the component again
         if isinstance(owner, Proposal):
             found = owner.sample(rng, clip, len(population))
         elif isinstance(owner, Transition):

@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from mstfilter.formats import Redwood, Settled, Still, open_format
 from mstfilter.live import filter_folder
 from mstfilter.presets import load_config
 from mstfilter.report import write_report
-from mstfilter.runs import filter_recording
-from mstfilter.scene import Recording, encode_hypotheses, scene_cache, write_image
+from mstfilter.runs import RunFolder, filter_recording
+from mstfilter.scene import Finding, Recording, encode_hypotheses, scene_cache, write_image
+from mstfilter.smc import Proposal
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
 from tests.wrong_inputs import shifted_camera
@@ -147,12 +149,120 @@ def test_a_fault_of_several_pauses_gives_one_warning():
     ]
 
 
+def test_a_warning_does_not_hide_a_later_fault():
+    """Half the shift of `shifted_camera` gives a warning, the whole shift an error with the same hints."""
+    arrays, half = shifted_camera(), shifted_camera(0.5)
+    frames = [(one["rgb"][k], one["depth"][k]) for one, k in ((arrays, 0), (half, 1), (arrays, 1))]
+    with pytest.raises(InputError, match="from frame 0 to 2, but not its pose"):
+        Recording.from_arrays(*(np.stack(images) for images in zip(*frames, strict=True)), arrays["K"])
+    stream = mstfilter.Stream(arrays["K"], FAST, pauses=None)
+    with pytest.warns(InputWarning, match="from frame 0 to 1, but not its pose"):
+        for k in (0, 1):
+            stream.push(*frames[k], float(k), pause=True)
+        stream.wait()
+    stream.push(*frames[2], 2.0, pause=True)
+    with pytest.raises(InputError, match="from frame 0 to 2, but not its pose"):
+        stream.wait()
+    with contextlib.suppress(InputError):
+        stream.close()
+
+
 def test_a_live_folder_has_the_robot_masks(tmp_path):
     path = write_redwood(tmp_path / "data", (0, 1))
     (path / "robot").mkdir()
     write_image(path / "robot" / "00001.png", np.where(DEPTH[0] < 0.7, 255, 0).astype(np.uint8))
     (frame,) = [frame for _, frame in Redwood().arriving(path, idle_s=0.8)]
     np.testing.assert_array_equal(frame.robot_mask, DEPTH[0] < 0.7)
+
+
+def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
+    path = write_redwood(tmp_path / "data", (0, 1, 2, 3, 4))
+    late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
+    write_image(path / "depth" / "00003.png", np.zeros(DEPTH[0].shape, np.uint16))
+    threading.Timer(0.2, lambda: late.rename(path / "depth" / "00001.png")).start()
+    for file in (path / "color").iterdir():
+        file.touch()
+    with pytest.warns(InputWarning, match="00003.png, 00003.png of .* are skipped: .* no reading"):
+        times = [when for when, _ in Redwood(fps=10).arriving(path, idle_s=1.5)]
+    assert times == pytest.approx([0, 0.1, 0.2, 0.4])
+
+
+def test_no_frame_is_accepted_that_is_not_processed():
+    """A camera pushes while another thread closes the stream, and closes it too."""
+    stream = mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_frames=4, on_pause=lambda pause: time.sleep(0.1))
+    accepted, refused = [], []
+
+    def film():
+        for k in range(1000):
+            try:
+                accepted.append(stream.push(RGB[k % 2], DEPTH[k % 2], float(k), pause=True, wait=True))
+            except InputError as error:
+                refused.append(error.message)
+                return stream.close()
+
+    camera = threading.Thread(target=film)
+    camera.start()
+    while len(accepted) < 6:
+        time.sleep(0.01)
+    stream.close()
+    camera.join()
+    stream.wait()
+    assert refused == ["the stream is closed"]
+    assert all(accepted) and stream.last.index == len(accepted) - 1  # every frame was a pause
+
+
+def test_all_frames_have_poses_or_none():
+    pose = CAMERA.T_world_camera
+    for first, second in ((pose, None), (None, pose)):
+        with mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+            stream.push(RGB[0], DEPTH[0], 0.0, pose=first)
+            with pytest.raises(InputError, match=f"frame 1 has {'no' if second is None else 'a'} pose"):
+                stream.push(RGB[1], DEPTH[1], 1.0, pose=second)
+            assert stream.push(RGB[1], DEPTH[1], 2.0, pose=first)
+
+
+def test_doubts_about_the_hypotheses_are_said_once(monkeypatch):
+    doubt = Finding(False, "an object is the table", ())
+    monkeypatch.setattr("mstfilter.live.stream.examine_hypotheses", lambda hypotheses, frame: [doubt])
+    with warnings.catch_warnings(record=True) as caught, mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+        warnings.simplefilter("always")
+        for k in range(2):
+            stream.push(RGB[k], DEPTH[k], float(k), pause=True)
+        stream.wait()
+    said = [str(one.message) for one in caught if one.category is InputWarning]
+    assert [text for text in said if "the table" in text] == ["pause 0 of the stream: an object is the table"]
+
+
+def test_an_error_while_libraries_are_loaded_is_no_error_of_the_stream():
+    @dataclass(frozen=True)
+    class Fragile(Proposal):
+        inner: Proposal = FAST.proposal
+
+        def sample(self, rng, observation, n):
+            if observation.after.rgb.max() == 0:
+                raise ZeroDivisionError
+            return self.inner.sample(rng, observation, n)
+
+    with mstfilter.Stream(CAMERA.K, replace(FAST, proposal=Fragile()), pauses=None) as stream:
+        stream.push(np.zeros_like(RGB[0]), DEPTH[0], 0.0)
+        stream.push(RGB[0], DEPTH[0], 1.0, pause=True)
+        stream.wait()
+        assert stream.last.index == 0
+
+
+def test_a_recording_searches_the_pauses_in_the_images_that_a_stream_gets(tmp_path):
+    class Seen(Settled):
+        def find(self, times, read_rgb):
+            np.testing.assert_array_equal(read_rgb(3), small.rgb)
+            return super().find(times, read_rgb)
+
+    path = write_redwood(tmp_path / "data")
+    with mstfilter.Stream(CAMERA.K, FAST, pauses=None, max_pixels=5000) as stream:
+        stream.push(RGB[3], DEPTH[3], 0.0, pause=True)
+        stream.wait()
+        small = stream.last.clip.after
+    assert Redwood(fps=FPS, pauses=Seen(hold_s=0.3), max_pixels=5000).open(path).pauses == PAUSES
 
 
 def test_a_full_queue_drops_frames_and_says_so():
@@ -246,10 +356,14 @@ def test_a_folder_is_filtered_while_it_is_filled(tmp_path):
     assert live.description["recording"]["pauses"] == list(PAUSES)
     assert live.description["status"] == "done"
     assert "pause 1" in write_report(live).read_text()
+    shutil.rmtree(live.pause(1))  # as if the program was killed between the entry of a pause and the pause
+    assert RunFolder.open(live.path).check().n_pauses == 1
     assert open_format(whole, options=["pauses.hold_s=0.3"], pauses="settled").pauses == RULE
     with pytest.raises(InputError, match="exists"):
         filter_folder(growing, reader, config, tmp_path / "live")
     with pytest.raises(InputError, match="later frames"):
         filter_folder(growing, Redwood(pauses=Still()), config, tmp_path / "other")
+    with pytest.raises(InputError, match="start_s and stop_s"):
+        filter_folder(growing, Redwood(pauses=RULE, stop_s=2.0), config, tmp_path / "other")
     with pytest.raises(InputError, match="missing|no image"):
         filter_folder(tmp_path, reader, config, tmp_path / "other", idle_s=0.1)

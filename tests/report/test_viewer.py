@@ -8,11 +8,13 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
+from mstfilter.formats import save_recording
 from mstfilter.report import recording_page, run_page, viewer
 from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
 from tests.report.pages import check_html
@@ -115,9 +117,21 @@ def test_the_command_writes_a_file_of_the_run(run, tmp_path, capsys):
     code, out, _ = call("view", run.path, capsys=capsys)
     assert code == 0 and str(run.path / "view.html") in out
     assert (run.path / "view.html").read_text() == run_page(run).text
+    code, _, err = call("view", run.path, "--pauses", "0,1", capsys=capsys)
+    assert code == 2 and "are for recordings" in err
     run.check_replaceable()
     assert call("view", run.path, "--out", tmp_path / "page.html", capsys=capsys)[0] == 0
     assert (tmp_path / "page.html").is_file()
+
+
+def test_the_name_of_a_recording_is_no_path_and_no_place_of_the_page(tmp_path, monkeypatch, capsys):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    source = save_recording(replace(recording(), name="../{{ data }}"), tmp_path / "got")
+    assert call("view", source, capsys=capsys)[0] == 0
+    (page,) = (tmp_path / "here").iterdir()
+    assert {p.name for p in tmp_path.iterdir()} == {"here", "got"}
+    assert "<title>../{{ data }}" in page.read_text()
 
 
 def test_the_page_of_a_recording():

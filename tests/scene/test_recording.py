@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
@@ -103,6 +104,12 @@ def cut_file(path, n):
     path.write_bytes(path.read_bytes()[:n])
 
 
+def half_jpeg(folder):
+    path = folder / "rgb/000003.png"
+    data = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
 @pytest.mark.parametrize("name", ["T_world_cam", "t_world_camera", "camera_pose", "T_camera_world", "pose"])
 def test_a_pose_of_a_frame_under_another_name_gives_a_warning(folder, name):
     change(folder, "manifest.json", lambda m: m["frames"][1].update({name: np.eye(4).tolist(), "action": 3}))
@@ -148,6 +155,7 @@ FAULTS = {
     "empty folder": (clear, "folder is empty"),
     "no folder": (shutil.rmtree, "does not exist"),
     "truncated PNG": (lambda f: cut_file(f / "rgb/000003.png", -40), "truncated"),
+    "truncated JPEG": (half_jpeg, "no end of JPEG"),
     "no manifest": (lambda f: (f / "manifest.json").unlink(), "manifest.json is missing"),
     "not JSON": (lambda f: (f / "camera.json").write_text("{"), "camera.json cannot be read: Expecting"),
     "no pause": (
@@ -295,8 +303,6 @@ def test_paired_images(tmp_path, folder):
 
 def test_real_frames_find_their_table(shared_data):
     """On 45 real frames the table is found: intersection over union with the labelled table above 0.9 on average."""
-    import cv2
-
     path = shared_data("real/osd_learn")
     scores = []
     for name in ("learn0", "learn9", "learn17", "learn25", "learn33", "learn41"):

@@ -388,9 +388,21 @@ WARNINGS = {
     **{name: (Completes(change=change), words) for name, (change, words) in STRANGE_PROBABILITIES.items()},
     "too far": (Moves(change=TOO_FAR), "motions are in metres"),
 }
+
+
+@dataclass(frozen=True)
+class DrawsGlobally(BoundaryModel):
+    """A boundary map with random numbers of the global generator."""
+
+    def boundary(self, frame):
+        strength = ColourDepthBoundary().boundary(frame)
+        return np.clip(strength + np.random.rand(*strength.shape), 0, 1).astype(np.float32)  # noqa: NPY002
+
+
 #: Components that only the contract finds, or also a run.
 ONLY_BROKEN: dict[str, tuple[Any, str]] = {
     **COMPLETERS,
+    "global generator": (DrawsGlobally(), "does not come from `rng`"),
     "track": (WritesIntoTheTrack(), "in place"),
     "state of a rule": (RuleDependsOnCalls(), "keeps state"),
     "far": (Moves(change=TOO_FAR), "moves an object too far: by 15 m"),
