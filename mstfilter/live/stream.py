@@ -405,11 +405,11 @@ class Stream:
             latency = clock.perf_counter() - items[-1].arrived
             numbers = tuple(item.number for item in items)
             self.last = Pause(clip.index, clip, numbers, self._state, info, latency, dict(self.counts))
+            if self._on_pause is not None:
+                self._on_pause(self.last)
             if not self._doubts and self._state.population is not None:  # said once
                 self._doubts = examine_hypotheses(self.hypotheses, clip.after)
                 report_findings(self._doubts, f"pause {clip.index} of the stream")
-            if self._on_pause is not None:
-                self._on_pause(self.last)
             if self._flows:
                 for hypothesis in self.hypotheses:  # cached, since the next step tracks what is visible now
                     render_hypothesis(hypothesis, clip.after.camera)
