@@ -38,6 +38,7 @@ import sys
 import tomllib
 import typing
 from collections.abc import Iterable, Iterator, Mapping
+from datetime import date, time
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -287,11 +288,12 @@ def _nested(override: str) -> dict[str, Any]:
 
 
 def _toml_value(text: str) -> Any:
-    """The value of a text in TOML syntax, or the text itself if it is not valid TOML."""
+    """The value of a text in TOML syntax, or the text itself if it is a date or time or not valid TOML."""
     try:
-        return tomllib.loads(f"v = {text}")["v"]
+        value = tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         return text
+    return text if isinstance(value, date | time) else value
 
 
 def nested_components(component: Any) -> Iterator[Any]:

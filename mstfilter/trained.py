@@ -10,10 +10,11 @@ does not match. Weights are stored in half precision. No file is unpickled.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
@@ -27,6 +28,19 @@ from mstfilter.resources import models_folder
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.toml"
 _HINT = "train it with: mstfilter train completion or border --out FOLDER; others are written by write_model"
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Use one thread of torch in the block, because sums of convolutions depend on the number of threads."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @dataclass(frozen=True, eq=False)

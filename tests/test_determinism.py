@@ -27,19 +27,36 @@ def completed() -> bytes:
     return NetworkCompleter().complete(np.random.default_rng(0), frame, [mask], GRID)[0].probability.tobytes()
 
 
-def test_the_completion_network_uses_one_thread_and_restores_the_number(monkeypatch):
+def borders() -> bytes:
+    """The output of the border network for an image."""
+    from mstfilter.segmentation.border_network import load_border_network
+
+    rgb, depth, _ = table_scene()
+    return load_border_network("border").look(Frame(rgb, depth, CAMERA)).border.tobytes()
+
+
+@pytest.mark.parametrize("result", [completed, borders])
+def test_networks_use_one_thread_and_restore_the_number(monkeypatch, result):
     import torch
 
     from mstfilter.completion import NetworkCompleter
+    from mstfilter.segmentation.border_network import load_border_network
 
-    network, used = NetworkCompleter().network, []
-    forward = network.forward
-    monkeypatch.setattr(network, "forward", lambda *given: used.append(torch.get_num_threads()) or forward(*given))
+    network, name = (
+        (NetworkCompleter().network, "forward")
+        if result is completed
+        else (
+            load_border_network("border"),
+            "net",
+        )
+    )
+    used, forward = [], getattr(network, name)
+    monkeypatch.setattr(network, name, lambda *given: used.append(torch.get_num_threads()) or forward(*given))
     before, found = torch.get_num_threads(), []
     try:
         for n in (1, 2, 5):
             torch.set_num_threads(n)
-            found.append(completed())
+            found.append(result())
             assert torch.get_num_threads() == n
     finally:
         torch.set_num_threads(before)

@@ -73,6 +73,11 @@ class Completion:
         odds = np.exp(np.float32(np.clip(log_odds, -80, 80))) * p  # float32 overflows at 89
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
 
+    def with_surface(self) -> Completion:
+        """The completion, with probability 1 for the voxels of the visible surface if no voxel reaches 0.5."""
+        p = self.probability
+        return self if (p >= 0.5).any() else replace(self, probability=read_only(np.where(self.points > 0, 1, p)))
+
 
 def _check_filled(self: Completer, found: Any, rngs: Any, seen: Sequence[ObservedBox]) -> list[np.ndarray]:
     found = check_list(found, len(seen), object, "arrays")

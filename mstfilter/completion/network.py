@@ -93,7 +93,7 @@ class NetworkCompleter(Completer, UsesFiles):
         found = super().complete_each(rngs, frame, masks, lattice, views)
         if lattice is not grid:
             found = [self._on_grid(one, frame, m, grid, lattice) for one, m in zip(found, masks, strict=True)]
-        return [one.shifted(self.log_odds) for one in found]
+        return [one.shifted(self.log_odds).with_surface() for one in found]
 
     def _on_grid(
         self, one: Completion, frame: Frame, mask: np.ndarray, grid: VoxelGrid, lattice: VoxelGrid

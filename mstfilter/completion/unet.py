@@ -14,10 +14,9 @@ linear function of the mean features at an eighth of the resolution.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architectu
 from mstfilter.completion.observed import ObservedBox, encode_box
 from mstfilter.errors import InputError, describe_error, missing_library
 from mstfilter.reading import MAX_WEIGHTS, read_bytes
-from mstfilter.trained import calibrated_network, load_once, open_model
+from mstfilter.trained import calibrated_network, load_once, one_thread, open_model
 
 ARCHITECTURE = "completion-unet"
 
@@ -142,21 +141,10 @@ class TrainedNetwork:
             bits[k, :a, :b, :c], signed[k, :a, :b, :c] = encode_box(one)
             step = one.height[1] - one.height[0] if c > 1 else 0.01
             height = one.height[0] + step * np.arange(edge)
-        with torch.inference_mode(), _one_thread():
+        with torch.inference_mode(), one_thread():
             x = channels(torch.from_numpy(bits), torch.from_numpy(signed), torch.from_numpy(height).float())
             p = torch.sigmoid(self.scale * self.forward(x) + self.shift)
         return np.asarray(p.numpy()[: len(seen)])
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Use one thread of torch in the block, because sums of convolutions depend on the number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @load_once

@@ -59,7 +59,7 @@ class BagFile:
         self.path = path
         if not path.exists():
             raise InputError(f"bag does not exist: {path}")
-        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        for file in sorted(file for file in path.iterdir() if not file.is_dir()) if path.is_dir() else [path]:
             limit = MAX_TEXT if file.suffix == ".yaml" else 2**63
             with reading(file, "a bag"), open_regular(file, limit) as opened:
                 if file.suffix == ".bag" and opened.read(13) != b"#ROSBAG V2.0\n":
@@ -156,7 +156,7 @@ def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
 
     if compressed:
         problem = f"{where} cannot be decoded: {message.format!r}, {len(message.data)} bytes"
-        image = decode_image(bytes(message.data), cv2.IMREAD_COLOR, problem)
+        image = decode_image(bytes(message.data), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, problem)
         return np.ascontiguousarray(image[..., ::-1])
     encoding = str(message.encoding)
     _check_encoding(encoding, _COLOUR, f"{where}: colour")
@@ -182,7 +182,7 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
         if np.any(metres > 0):
             check_depth(metres, where)
     else:
-        metres = _pixels(message, np.dtype(np.uint16), 1, where)[..., 0] * np.float32(depth_scale)
+        metres = _metres(_pixels(message, np.dtype(np.uint16), 1, where)[..., 0], depth_scale)
     with np.errstate(invalid="ignore"):
         return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(np.nan)).astype(np.float32)
 
@@ -200,6 +200,11 @@ def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.
     return np.ascontiguousarray(rows).view(order).reshape(height, width, channels).astype(kind)
 
 
+def _metres(units: np.ndarray, depth_scale: float) -> np.ndarray:
+    """Depth in metres of an image (H, W) uint16. The values 0 and 65535 mean that the pixel has no reading."""
+    return np.where(units < 65535, units * np.float32(depth_scale), np.float32(np.nan))
+
+
 def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str) -> np.ndarray:
     import cv2
 
@@ -212,7 +217,7 @@ def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str
     if image.ndim != 2 or image.dtype != np.uint16:
         raise InputError(problem, hint)
     if encoding != "32FC1":
-        return image * np.float32(depth_scale)
+        return _metres(image, depth_scale)
     if start != 12:
         raise InputError(f"{where} is compressed 32FC1 without its header of 12 bytes")
     a, b = struct.unpack("<ff", data[4:12])
@@ -241,19 +246,28 @@ class _Stream:
         return f"{self.name} ({self.count} x {self.encoding}, {width} x {height}, frame {self.frame_id!r})"
 
     @property
+    def _parts(self) -> list[str]:
+        """The parts of the name, without the transport."""
+        parts = self.name.split("/")
+        return parts[:-1] if parts[-1] in ("compressed", "compressedDepth") else parts
+
+    @property
     def info(self) -> str:
         """The name of the CameraInfo topic of the images, by the convention of image_transport."""
-        parts = self.name.split("/")
-        if parts[-1] in ("compressed", "compressedDepth"):
-            parts = parts[:-1]
-        return "/".join([*parts[:-1], "camera_info"])
+        return "/".join([*self._parts[:-1], "camera_info"])
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the images are rectified, by the convention of image_proc: ``image_rect``, ``image_rect_color``."""
+        return "rect" in self._parts[-1]
 
 
 @dataclass(frozen=True)
 class Bag(VideoFormat):
     """Reader of ROS 1 bags, ROS 2 bags and MCAP: image, compressed image, depth and CameraInfo topics.
 
-    Further parameters: `VideoFormat`. The parameter `K` replaces the camera matrix of the CameraInfo messages.
+    Further parameters: `VideoFormat`. The parameter `K` replaces the camera matrix of the
+    CameraInfo messages, and `distortion` their distortion.
 
     Parameters
     ----------
@@ -327,15 +341,19 @@ class Bag(VideoFormat):
         self, bag: BagFile, colour: _Stream, depth: _Stream
     ) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """fx, fy, cx, cy and the distortion of the colour image."""
-        if self.K:
-            return self.K, self.distortion
         infos, name = bag.topics(_INFO), colour.info
+        if self.K:
+            distortion = self.distortion
+            if name in infos and not distortion:
+                with contextlib.suppress(InputError):
+                    distortion = _camera_info(bag, name, colour.rectified)[1]
+            return self.K, distortion
         if name not in infos:
             raise InputError(
                 f"{bag.path}: intrinsics are missing, there is no {name} for {colour.name}",
                 "give them: K=fx,fy,cx,cy, and distortion=k1,k2,p1,p2,k3 if the images are distorted",
             )
-        matrix, distortion, size = _camera_info(bag, name, "rect" in colour.name)
+        matrix, distortion, size = _camera_info(bag, name, colour.rectified)
         if size[0] and size != colour.size:
             raise InputError(
                 f"{bag.path}: {name} is of images of {size[0]} x {size[1]}, {colour} is not",
@@ -343,7 +361,7 @@ class Bag(VideoFormat):
             )
         other = depth.info
         if not self.registered and other in infos and other != name:
-            of_depth, _, size = _camera_info(bag, other, "rect" in depth.name)
+            of_depth, _, size = _camera_info(bag, other, depth.rectified)
             if size[0] and not np.allclose(of_depth, matrix, atol=1.0):
                 text = f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour"
                 raise InputError(text, _REGISTERED)

@@ -301,7 +301,8 @@ def _paired(
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
     """Pairs of files, and the times of the pairs in seconds; no times if the names are frame numbers."""
     numbers = [[_number(file) for file in files] for files in (colour, depth)]
-    seconds = [[_seconds(number) for number in side] for side in numbers]
+    decimals = any(number.as_tuple().exponent != 0 for side in numbers for number in side)
+    seconds = [[_seconds(n) or (n if decimals else None) for n in side] for side in numbers]
     if all(value is not None for side in seconds for value in side):
         stamps = [[float(value - seconds[0][0]) for value in side] for side in seconds]  # type: ignore[operator]
         chosen = pair_stamps(stamps[0], stamps[1], tolerance_s, str(path))

@@ -224,7 +224,7 @@ class Video:
             import cv2
 
             size = camera.width, camera.height
-            return np.asarray(cv2.resize(_undistort(image, source), size, interpolation=cv2.INTER_NEAREST))
+            return np.asarray(cv2.resize(_undistort(image, source), size, interpolation=cv2.INTER_NEAREST_EXACT))
 
         return Recording(
             LazyFrames(lambda index: read(index, camera_at(index)), len(self.times)),

@@ -17,6 +17,7 @@ import numpy as np
 
 from mstfilter.completion import Completer, Extrude
 from mstfilter.errors import warn_user
+from mstfilter.fields import Share
 from mstfilter.frontends.mask_files import has_masks, read_masks, write_masks
 from mstfilter.frontends.mask_trees import nested_masks, node_values
 from mstfilter.scene import Clip, Recording, UsesFiles, content_key
@@ -47,7 +48,7 @@ class MaskProposal(Proposal, UsesFiles):
     sampler: CutSampler = field(default_factory=lambda: ExactCuts(temperature=1.0))
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
-    threshold: float = 0.5
+    threshold: Share = 0.5
 
     properly_weighted: ClassVar[bool] = False
 

@@ -275,8 +275,9 @@ def _fitted_mixture(joined: np.ndarray, same: np.ndarray, weights: np.ndarray) -
 
     `same` (e,) are the probabilities that the cells of a pair belong to one object. `joined` (p, e) states which
     partitions join each pair. The mixture minimises the cross entropy between `same` and the total probability of the
-    partitions that join each pair. `weights` (e,) are the weights of the pairs. The convex problem is solved by
-    expectation maximisation for the proportions of a mixture.
+    partitions that join each pair. `weights` (e,) are the weights of the pairs. At most `_STEPS` steps of expectation
+    maximisation start at equal proportions. If most pairs are joined by all partitions, or by none, the steps are
+    small, and the result lies between equal proportions and the minimum.
     """
     q = np.full(len(joined), 1 / len(joined))
     divided, one_object, two_objects = 1 - joined, weights * same, weights * (1 - same)

@@ -126,11 +126,11 @@ class PartitionUpdate(Update):
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
     quality_exponent : float
-        Exponent lambda of Q, A and q. If lambda is 0, every prediction is valid, and every occluded object is kept.
+        Exponent lambda of Q, A and q. If lambda is 0, R is 1 and every occluded object is kept.
     n_candidates : int
         Largest number of candidates after the first pause. 0 means 20 for each predicted hypothesis.
     n_scored : int
-        Number of candidates that are built and scored by `evidence`.
+        Number of candidates that are built and scored by `evidence`. The other candidates are discarded.
     reach : float
         Largest distance in voxels between a reading and the predicted object to which the reading belongs.
     n_views : int
@@ -335,7 +335,9 @@ class PartitionUpdate(Update):
             name, score = type(term).__name__, term.log_score(built.particles, clip)
             scores[f"{name} {k}" if name in scores else name] = score.round(3).tolist()
             total += score
-        return replace(built, log_weights=built.log_weights + total, notes={**built.notes, "scores": scores})
+        discarded = round(max(0.0, 1 - float(np.exp(candidates.log_weights[kept]).sum())), 4)
+        notes = {**built.notes, "discarded_mass": discarded, "scores": scores}
+        return replace(built, log_weights=built.log_weights + total, notes=notes)
 
 
 def _segments(proposed: Population, readings: Readings, raised: np.ndarray) -> list[np.ndarray]:

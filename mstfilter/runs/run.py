@@ -14,7 +14,7 @@ import logging
 import os
 import platform
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -236,7 +236,18 @@ def code_version() -> str:
 def _hash_of(path: Path, pattern: str = "*") -> str:
     """A hash of a file, or of the names and contents of the files below a folder that match a pattern."""
     digest = hashlib.sha256()
-    for file in sorted(path.rglob(pattern)) if path.is_dir() else [path]:
-        if file.is_file():
+    for file in sorted(_files_below(path)) if path.is_dir() else [path]:
+        if file.is_file() and (file.match(pattern) or file == path):
             digest.update(file.relative_to(path).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    """All files below a folder, also below links to folders. Links that form a cycle are followed once."""
+    seen: set[str] = set()
+    for path, folders, names in os.walk(folder, followlinks=True):
+        if (real := os.path.realpath(path)) in seen:
+            folders.clear()
+        else:
+            seen.add(real)
+            yield from (Path(path) / name for name in names)

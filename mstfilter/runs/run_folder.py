@@ -257,6 +257,11 @@ class RunFolder:
         """
         assert state.population is not None
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
+        if instance is not None:
+            what, shape = f"true label image of pause {info.t}", clip.after.depth.shape
+            instance = instance if instance.dtype == np.uint8 else as_labels(instance, what)
+            if instance.shape != shape:
+                raise InputError(f"{what} has shape {instance.shape}, expected {shape}")
         with atomic_folder(self.pause(info.t)) as folder:
             write_image(folder / "rgb.png", clip.after.rgb)
             if instance is not None:

@@ -61,28 +61,47 @@ def component_key(component: object) -> bytes:
 
 
 def _code(cls: type) -> str:
-    """The code of the methods of a user-defined class, as text."""
-    own = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")]
-    values = [value for base in own for value in vars(base).values()]
-    inner = [getattr(v, "fget", None) or getattr(v, "func", None) or getattr(v, "__func__", v) for v in values]
-    inner = [inspect.unwrap(v) if callable(v) else v for v in inner]  # methods whose results are checked
-    seen: set[CodeType] = set()
-    return "".join(_with_globals(value, seen) for value in inner if isinstance(value, FunctionType))
+    """The methods and class attributes of a user-defined class, as text."""
+    return _described(cls, "", set())
 
 
-def _with_globals(function: FunctionType, seen: set[CodeType]) -> str:
-    """The code of a function, and the constants and functions that the function names."""
-    seen.add(function.__code__)
-    text = _text(function.__code__)
-    for name in _names(function.__code__):
-        value = function.__globals__.get(name)
-        if isinstance(value, FunctionType) and value.__code__ not in seen:
-            same_module = value.__globals__ is function.__globals__
-            text += _with_globals(value, seen) if same_module else _text(value.__code__)
-        elif all(isinstance(v, (str, bytes, int, float)) for v in (value if isinstance(value, tuple) else [value])):
-            text += repr(value)
-        elif isinstance(value, np.ndarray):
-            text += content_key(value).hex()
+def _described(value: Any, module: str, seen: set[int]) -> str:
+    """Text of a value on which the code of a user depends. `module` is the module of the code that names the value.
+
+    The text of a function includes its defaults, and the values that the function names. Instances of other classes,
+    and the inner parts of functions of other modules, are left out.
+    """
+    if isinstance(value, np.ndarray):
+        return content_key(value).hex()
+    if isinstance(value, (str, bytes, int, float, complex, np.generic, type(None))):
+        return repr(value)
+    if isinstance(value, Mapping):
+        return "".join(_described(part, module, seen) for item in value.items() for part in item)
+    if isinstance(value, (tuple, list, set, frozenset)):
+        parts = [_described(part, module, seen) for part in value]
+        return "".join(parts if isinstance(value, (tuple, list)) else sorted(parts))
+    if id(value) in seen or (module not in ("", getattr(value, "__module__", module)) and isinstance(value, type)):
+        return ""
+    if isinstance(value, type):
+        seen.add(id(value))
+        own = [
+            base for base in value.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")
+        ]
+        items = ((base.__module__, *item) for base in own for item in vars(base).items())
+        chosen = [item for item in items if isinstance(item[2], FunctionType) or not item[1].startswith("__")]
+        return "".join(name + _described(part, of, seen) for of, name, part in chosen)
+    inner = getattr(value, "fget", None) or getattr(value, "func", None) or getattr(value, "__func__", value)
+    inner = inspect.unwrap(inner) if callable(inner) else inner  # methods whose results are checked
+    if not isinstance(inner, FunctionType) or id(inner) in seen:
+        return ""
+    text = _text(inner.__code__)
+    if module != inner.__module__:
+        return text
+    seen.add(id(inner))
+    closure = inspect.getclosurevars(inner).nonlocals
+    named = [inner.__globals__.get(name) for name in _names(inner.__code__)]
+    for part in (inner.__defaults__, inner.__kwdefaults__, closure, named):
+        text += _described(part, module, seen)
     return text
 
 

@@ -166,10 +166,10 @@ class Camera:
     def scaled(self, factor: float) -> Camera:
         """The camera for images resized by `factor`. The corner (-0.5, -0.5) of the first pixel does not move."""
         width, height = round(self.width * factor), round(self.height * factor)
+        factors = np.array([width / self.width, height / self.height])  # of the rounded size
         K = self.K.copy()
-        K[:2, :2] *= factor
-        K[0, 2] = (self.K[0, 2] + 0.5) * factor - 0.5
-        K[1, 2] = (self.K[1, 2] + 0.5) * factor - 0.5
+        K[:2, :2] *= factors[:, None]
+        K[:2, 2] = (self.K[:2, 2] + 0.5) * factors - 0.5
         return Camera(K, width, height, self.T_world_camera)
 
     def limited(self, max_pixels: int) -> Camera:

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from mstfilter.errors import InputError
 from mstfilter.files import reading
 from mstfilter.lazy import late
-from mstfilter.reading import read_bytes
+from mstfilter.reading import read_arrays, read_bytes
 from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
@@ -160,7 +160,10 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
     """
     import cv2
 
-    image = _load_array(path) if path.suffix.lower() == ".npy" else _decode(path, cv2.IMREAD_UNCHANGED)
+    if path.suffix.lower() == ".npy":
+        image = read_arrays(path, "an image", "expected .npy with an array (H, W)").get("", np.zeros(0))
+    else:
+        image = _decode(path, cv2.IMREAD_UNCHANGED)
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim != 2 or not (image.dtype in (np.uint16, np.int16) or np.issubdtype(image.dtype, np.floating)):
         raise InputError(
@@ -174,14 +177,6 @@ def read_depth(path: Path, scale: float) -> np.ndarray:
         image = image.astype(np.float32)
     read = (image > 0) & (image != 65535)
     return np.where(read, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
-
-
-def _load_array(path: Path) -> np.ndarray:
-    """The array of a .npy file."""
-    try:
-        return np.asarray(np.load(path, allow_pickle=False))
-    except (OSError, EOFError, ValueError) as error:
-        raise InputError(f"image cannot be read: {path} ({error})", "expected .npy with an array (H, W)") from error
 
 
 def read_labels(path: Path) -> np.ndarray:
@@ -198,6 +193,8 @@ def write_image(path: Path, image: np.ndarray) -> None:
     """Write an image (H, W, 3) uint8 RGB, or (H, W) uint8 or uint16, as a PNG file."""
     import cv2
 
+    if image.dtype not in (np.uint8, np.uint16):  # OpenCV would clip the values to 8 bits
+        raise InputError(f"image cannot be written: {path}, type {image.dtype}, expected uint8 or uint16")
     data = image[..., ::-1] if image.ndim == 3 else image
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(data), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
@@ -311,8 +308,8 @@ class Frame:
             return Frame(self.rgb, self.depth, camera, self.robot_mask)
         robot = self.robot_mask
         if robot is not None:
-            robot = cv2.resize(robot.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        depth = cv2.resize(self.depth, size, interpolation=cv2.INTER_NEAREST)
+            robot = cv2.resize(robot.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+        depth = cv2.resize(self.depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
         return Frame(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA), depth, camera, robot)
 
     @property

@@ -203,6 +203,7 @@ def shares_with_depth(frame: Frame, grid: VoxelGrid) -> tuple[float, float]:
 
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
 
+_CELL, _STRIP = 0.1, 0.02  # metres: gap between a table and another surface; standard deviation across a strip
 _BORDER = 0.03  # metres: a wall may stand at the border of the visible table
 _MARGIN = 0.05  # metres of the workspace around the visible table
 _LEAST_SIDE, _LARGEST_SIDE, _HEIGHT = 1.0, 2.0, 0.5  # metres
@@ -217,7 +218,7 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     """
     check_number("voxel size", voxel_size, above=0, at_most=0.5, unit="number of metres")
     points = frame.points[frame.valid]
-    table = points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2]
+    table = _without_strips(points[np.abs(points[:, 2]) < _MIN_HEIGHT, :2])
     raised = points[(points[:, 2] > _MIN_HEIGHT) & (points[:, 2] < _HEIGHT), :2]
     if len(table):
         low, high = np.percentile(table, (1, 99), axis=0)
@@ -236,6 +237,26 @@ def workspace(frame: Frame, voxel_size: float = 0.01) -> VoxelGrid:
     centre = np.clip(np.percentile(chosen, (2, 98), axis=0).mean(axis=0), *reach)
     origin = np.append(np.round((centre - side / 2) / voxel_size) * voxel_size, 0.0)
     return VoxelGrid(origin, voxel_size, (*map(round, side / voxel_size), round(_HEIGHT / voxel_size)))
+
+
+def _without_strips(points: np.ndarray) -> np.ndarray:
+    """Table readings (N, 2) without those of a wall behind the table, which form a thin separate strip at z = 0."""
+    from scipy import ndimage
+
+    if not len(points):
+        return points
+    points = points[(np.abs(points - np.median(points, axis=0)) < 5.0).all(axis=1)]
+    cell = np.floor((points - points.min(axis=0)) / _CELL).astype(np.int64)
+    occupied = np.zeros(cell.max(axis=0) + 1, bool)
+    occupied[tuple(cell.T)] = True
+    groups, n_groups = ndimage.label(occupied, np.ones((3, 3)))
+    group = groups[tuple(cell.T)]
+    largest = np.bincount(group).argmax()
+    for k in {*range(1, n_groups + 1)} - {largest}:
+        part = points[group == k]
+        if len(part) < 3 or np.linalg.eigvalsh(np.cov(part.T))[0] < _STRIP**2:
+            points, group = points[group != k], group[group != k]
+    return points
 
 
 _SHIFTS = 16  # pixels of an image of 320 columns

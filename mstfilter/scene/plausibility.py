@@ -291,17 +291,27 @@ def _other_support(first: Look) -> Iterator[Finding]:
     plane = first.plane(raised) if raised.mean() > _MIN_ON_TABLE else None
     if plane is None:
         return
-    tilt, height, normal = plane
+    tilt, _, normal = plane
     heights = first.points[raised, 2]
     hint = "or remove the depth readings beyond the table (NaN or 0), or turn the camera towards the table"
-    on_plane = raised.mean() * (np.abs(heights - height) < _ON_TABLE).mean()
-    if tilt < 15 and height > _TALL and on_plane > _MIN_ON_TABLE:
-        text = f"the floor is taken for the table: a second plane is {height:.2f} m above z = 0"
-        yield _stop(text, _GIVE_POSE, hint)
+    level = plane if tilt < 60 else _level(first)  # a wall may be larger than the table
+    if level is not None and level[0] < 15 and level[1] > _TALL:
+        on_plane = (np.abs(first.points[:, 2] - level[1]) < _ON_TABLE).mean()
+        if on_plane > _MIN_ON_TABLE:
+            text = f"the floor is taken for the table: a second plane is {level[1]:.2f} m above z = 0"
+            yield _stop(text, _GIVE_POSE, hint)
     up = first.frame.camera.pose.rotation.inv().apply([0.0, 0.0, 1.0])
     if 60 < tilt < 120 and np.percentile(heights, 98) > _TALL and up[1] > -0.1 and -normal[1] > _UPRIGHT:
         text = f"a wall is taken for the table: another plane is tilted by {tilt:.0f} degrees"
-        yield _stop(text, _GIVE_POSE, hint)
+        yield _stop(text, _GIVE_POSE, hint, "if the camera is upside down, turn the images by 180 degrees")
+
+
+def _level(first: Look) -> tuple[float, float, np.ndarray] | None:
+    """The plane of the most frequent height above `_TALL`, as `Look.plane` returns it."""
+    heights = first.points[:, 2]
+    counts, edges = np.histogram(heights, np.arange(_TALL, max(heights.max(), _TALL) + 0.1, 0.05))
+    k = counts.argmax()
+    return first.plane((heights > edges[k] - 0.05) & (heights < edges[k + 1] + 0.05))
 
 
 def _scale(first: Look) -> Iterator[Finding]:

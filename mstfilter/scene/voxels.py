@@ -428,7 +428,11 @@ class Hypothesis:
     mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
-        """Rigid motion of an object in world metres since the object was first proposed."""
+        """Rigid motion of an object in world metres since the object was first proposed.
+
+        The motion consists of the tracked motions. It does not include a motion that the camera did not record,
+        after which the object was recognised at another place.
+        """
         return self.record(label).pose
 
     def box(self, label: int) -> tuple[RigidTransform, np.ndarray]:

@@ -28,7 +28,7 @@ from torch.nn import functional
 from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, posed_camera
 from mstfilter.segmentation.boundary import SENSOR_FOCAL, filled_disparity
 from mstfilter.segmentation.regions import SeenBorders
-from mstfilter.trained import TrainedModel, calibrated_network, load_once, open_model
+from mstfilter.trained import TrainedModel, calibrated_network, load_once, one_thread, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
 PAIR_TENSORS = "pairs."  #: prefix of the names of the tensors of a pair network in a border model
@@ -203,7 +203,7 @@ class BorderNetwork:
         small = reduced(frame)
         x = encode_image(small)
         missing = [-n % _MULTIPLE for n in x.shape[1:]]
-        with torch.inference_mode():
+        with torch.inference_mode(), one_thread():
             padded = functional.pad(torch.from_numpy(x)[None], (0, missing[1], 0, missing[0]))
             y = self.net(padded)[0, :, : x.shape[1], : x.shape[2]].permute(1, 2, 0).contiguous().numpy()
         y = cv2.resize(y, (w, h), interpolation=cv2.INTER_LINEAR)

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
+from mstfilter.fields import Share
 from mstfilter.scene import (
     Clip,
     Foreground,
@@ -156,7 +157,7 @@ class TreeCutProposal(Proposal):
     objects: ObjectRule = field(default_factory=ObjectRule)
     completer: Completer = field(default_factory=Extrude)
     weight_rule: Literal["equal", "p"] = "equal"
-    threshold: float = 0.5
+    threshold: Share = 0.5
 
     properly_weighted: ClassVar[bool] = False
 

@@ -51,7 +51,7 @@ class DepthSensor(Bounded):
         Probability that a patch of pixels within two pixels of a depth edge has no reading. `edge_dropout` and `fill`
         were fitted to the frequencies of missing readings 1 .. 10 pixels beside objects in 45 real frames.
     fill : float
-        Largest width of a projector shadow that the sensor fills, in pixels of the sensor's raster.
+        Width by which the sensor narrows a projector shadow, in pixels of the sensor's raster.
     """
 
     lateral: NonNegativeFloat = 0.5

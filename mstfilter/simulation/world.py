@@ -211,7 +211,7 @@ class PhysicsWorld:
         return calm >= 5
 
     def contacts(self) -> list[tuple[int, int]]:
-        """Pairs (i, j), i < j, of objects less than half a millimetre apart. Call `forward` before."""
+        """Pairs (i, j), i < j, of objects at most a millimetre apart. Call `forward` before."""
         pairs = np.sort(self.geom_object[self.data.contact.geom.reshape(-1, 2)], axis=1)
         objects = (pairs[:, 0] >= 1) & (pairs[:, 1] < FINGER_ID)
         return [(i - 1, j - 1) for i, j in np.unique(pairs[objects], axis=0).tolist()]

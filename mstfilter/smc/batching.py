@@ -26,7 +26,7 @@ import numpy as np
 from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence, resampled, stacked
-from mstfilter.smc.inputs import split_input
+from mstfilter.smc.inputs import same_component, split_input
 from mstfilter.smc.interfaces import Info, State, WeightResampler
 from mstfilter.smc.population import Population, identity
 from mstfilter.smc.streams import Key, RunGenerators, RunKeys, each_array, of_runs, rows_of, summaries
@@ -186,7 +186,7 @@ class _Sweep:
                 self.lose(t, slot, np.flatnonzero(top == -np.inf))
                 particles, log_weights, top = of_runs(particles, rows), log_weights[rows], top[rows]
             self.top = log_weights, top
-        if self.check and len(rows):
+        if len(rows):
             self.compare(t, slot, rows, particles, log_weights)
         self.particles, self.log_weights = particles, log_weights
         if len(rows) < len(self.runs):
@@ -241,11 +241,7 @@ class _Sweep:
     # --- checks ---------------------------------------------------------------------------------------------------
     def compare(self, t: int, slot: str, rows: np.ndarray, particles: Any, log_weights: np.ndarray) -> None:
         """At some steps, compare one or two of the runs with single runs."""
-        last, count = self.checked.get(slot, (0, 0))
-        if t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == len(rows):
-            return
-        self.checked[slot] = len(rows), count + 1
-        for k in {count % len(rows)} if last == len(rows) else {0, len(rows) - 1}:
+        for k in self.compared(t, slot, len(rows)):
             run = int(self.runs[rows[k]])
             self.same_scheme(self.filters.one(run))
             try:
@@ -255,10 +251,18 @@ class _Sweep:
             self.agree(t, slot, run, "particles", of_runs(particles, k), alone.particles)
             self.agree(t, slot, run, "log weights", log_weights[k], alone.log_weights)
 
+    def compared(self, t: int, slot: str, n_rows: int) -> set[int]:
+        """The rows, of `n_rows`, that are compared with single runs at this step."""
+        last, count = self.checked.get(slot, (0, 0))
+        if not self.check or (t not in _COMPARED_STEPS and t != self.n_steps - 1 and last == n_rows):
+            return set()
+        self.checked[slot] = n_rows, count + 1
+        return {count % n_rows} if last == n_rows else {0, n_rows - 1}
+
     def same_scheme(self, other: ParticleFilter) -> None:
         """Raise `NotTogether` if the filter of a run has another number of particles, resampler or trigger."""
         for name in ("n", "resample", "resampler", "trigger"):
-            if other is not self.filter and getattr(other, name) != getattr(self.filter, name):
+            if not same_component(getattr(other, name), getattr(self.filter, name)):
                 raise NotTogether("all", f"the filters of the runs differ in {name}")
 
     def agree(self, t: int, slot: str, run: int, what: str, ours: Any, alone: Any) -> None:
@@ -311,23 +315,43 @@ class _Sweep:
             runs: Any = SimpleNamespace(
                 particles=self.particles, log_weights=self.log_weights, ess=self.ess, log_mean_weight=self.log_mean
             )
-            return trigger.wants(runs, t)
-        rows = range(len(self.runs))
-        return [trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t) for row in rows]
+            found = np.broadcast_to(np.asarray(trigger.wants(runs, t), bool), len(self.runs))
+            for row in self.compared(t, "trigger", len(self.runs)):
+                self.agree(t, "trigger", int(self.runs[row]), "answer", found[row], np.bool_(self.wants(t, row)))
+            return found
+        return [self.wants(t, row) for row in range(len(self.runs))]
+
+    def wants(self, t: int, row: int) -> bool:
+        """Whether the trigger resamples one run."""
+        return self.filter.trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t)
 
     def selected(self, t: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Ancestors (len(rows), n) and log weights of the runs `rows`, as `WeightResampler.select` returns them."""
         resampler, n = self.filter.resampler, self.filter.n
         assert isinstance(resampler, WeightResampler)
-        if resampler.batched:
-            streams: Any = RunGenerators(self.streams.generators("resampler", t, self.runs[rows]))
-            return resampler.select(streams, self.log_weights[rows], n)
-        drawn = [
-            resampler.select(self.key(t, "resampler", row).generator(), self.log_weights[row], n)
-            for row in rows.tolist()
-        ]
-        out = [log_weights for _, log_weights in drawn if log_weights is not None]
-        return np.stack([index for index, _ in drawn]), np.stack(out) if out else None
+        if not resampler.batched:
+            drawn = [self.selected_alone(t, row) for row in rows.tolist()]
+            out = [log_weights for _, log_weights in drawn if log_weights is not None]
+            return np.stack([index for index, _ in drawn]), np.stack(out) if out else None
+        streams: Any = RunGenerators(self.streams.generators("resampler", t, self.runs[rows]))
+        index, found = resampler.select(streams, self.log_weights[rows], n)
+        if np.shape(index) != (len(rows), n):
+            raise NotTogether("resampler", f"step {t}: ancestors have shape {np.shape(index)}, not {(len(rows), n)}")
+        for k in self.compared(t, "resampler", len(rows)):
+            run, (alone, weights) = int(self.runs[rows[k]]), self.selected_alone(t, int(rows[k]))
+            self.agree(t, "resampler", run, "ancestors", index[k], alone)
+            if found is not None and weights is not None:
+                self.agree(t, "resampler", run, "log weights", found[k], weights)
+        return index, found
+
+    def selected_alone(self, t: int, row: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Ancestors (n,) and log weights of one run."""
+        resampler, n = self.filter.resampler, self.filter.n
+        assert isinstance(resampler, WeightResampler)
+        index, log_weights = resampler.select(self.key(t, "resampler", row).generator(), self.log_weights[row], n)
+        if len(index) != n:
+            raise NotTogether("resampler", f"step {t}: it returns {len(index)} particles of {n}")
+        return index, log_weights
 
     # --- results --------------------------------------------------------------------------------------
     def key(self, t: int, slot: str, row: int) -> Key:

@@ -163,12 +163,16 @@ class ExactEquality(Equivalence):
 
 @dataclass(frozen=True)
 class Bins(Equivalence):
-    """Array particles are equal if they lie in the same cell of a regular grid with cells of side `width`."""
+    """Array particles are equal if they lie in the same cell of a regular grid with cells of side `width`.
+
+    Entries that are NaN lie in one cell.
+    """
 
     width: Annotated[float, Bounds(above=0, unit="side of a cell")] = 1.0
 
     def classes(self, particles: Any) -> np.ndarray:
         cells = np.floor(as_matrix(particles) / self.width)
+        cells[np.isnan(cells)] = -np.inf  # np.unique would give each row with NaN a cell of its own
         _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))

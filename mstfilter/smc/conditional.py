@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
+from mstfilter.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.batching import difference
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.inputs import check_observations, split_input
@@ -139,7 +139,12 @@ def _moved(
     """The particles of a step before the update. Particle 0 is the given particle with the weight of its move."""
     component: Any
     slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
-    particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
+    try:
+        particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
+    except LostRunError:  # all particles have weight 0, but perhaps not the given one
+        if given is None:
+            raise
+        particles, log_weights = take(given, np.zeros(filter.n, np.int64)), np.full(filter.n, -np.inf)
     if len(log_weights) != filter.n:
         raise InputError(
             f"{slot} made {len(log_weights)} particles of {filter.n}: conditional SMC needs one for each"

@@ -49,9 +49,16 @@ def _energy(particles: Any, masses: np.ndarray, distance: Callable[[Any], np.nda
         d = np.asarray(distance(particles), dtype=np.float64)
         if d.shape != (len(masses),) * 2:
             raise InputError(f"distances have shape {d.shape}, expected {(len(masses),) * 2}")
+        if not np.isfinite(d).all():
+            raise InputError("distances are NaN or infinite")
         return max(0.0, -float(masses @ d @ masses))
     x, some = as_matrix(particles), masses != 0
     x, masses = x[some], masses[some]
+    if not np.isfinite(x).all():
+        raise InputError(
+            "particles have entries that are NaN or infinite",
+            "leave out these variables, or give a distance that is defined for such entries",
+        )
     if x.shape[1] == 1:  # 2 times the integral of the squared difference of the distribution functions
         order = np.argsort(x[:, 0])
         gaps, below = np.diff(x[order, 0]), np.cumsum(masses[order])[:-1]

@@ -470,10 +470,12 @@ class FromScipy(Distribution):
         return np.asarray(wrapped.rvs(size=shape, random_state=rng))
 
     def log_prob(self, value: Any) -> np.ndarray:
-        if type(self.wrapped).__name__ in _PARTICLES_LAST and np.ndim(value) == len(self.parameter_shape):
+        vector = self.__dict__["_vector"]
+        rows = np.shape(value)[:1] if vector and np.ndim(value) > len(self.event_shape) else ()
+        if type(self.wrapped).__name__ in _PARTICLES_LAST and rows:
             value = np.moveaxis(value, 0, -1)
         log_prob = self.wrapped.logpmf(value) if self.discrete else self.wrapped.logpdf(value)
-        return np.asarray(log_prob) if self.__dict__["_vector"] else _sum_rows(log_prob)
+        return np.reshape(log_prob, rows or np.shape(log_prob)) if vector else _sum_rows(log_prob)
 
     @property
     def mean(self) -> np.ndarray:

@@ -35,7 +35,7 @@ from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import progress_of
 from mstfilter.processes import together
 from mstfilter.smc.components import EssBelow
-from mstfilter.smc.inputs import AtStep, check_observations, split_input
+from mstfilter.smc.inputs import AtStep, check_observations, same_component, split_input
 from mstfilter.smc.interfaces import (
     Component,
     Info,
@@ -268,7 +268,7 @@ class _Step:
 
     def _first(self) -> Population | None:
         initial, n = self.filter.initial, self.filter.n
-        if initial is None or self.given.initial == self.given.proposal:
+        if initial is None or same_component(self.given.initial, self.given.proposal):
             return None
         with self.slot("initial"):
             population = _checked(initial.sample(self.rng("initial"), self.observation, n), initial)

@@ -34,8 +34,6 @@ from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.population import Population, union
 from mstfilter.smc.state_space import StateSpaceModel
 
-_Map = Callable[[np.ndarray], np.ndarray]  #: of particles (n, d)
-
 
 def nonlinear_gaussian(
     f: Callable[..., Any], Q: Any, h: Callable[..., Any], R: Any, m0: Any, P0: Any
@@ -80,7 +78,7 @@ class _Noise:
 
     def __init__(self, name: str, cov: np.ndarray, k: int | None, semidefinite: bool) -> None:
         root, self.singular = _covariance(name, cov, k, semidefinite)
-        self.size, self.root = len(root), root.T
+        self.size, self.root, self.covariance = len(root), root.T, np.asarray(cov, np.float64)
         if not self.singular:
             self.whiten = np.linalg.inv(root).T
             self.constant = np.log(np.diag(self.whiten)).sum() - 0.5 * self.size * np.log(2 * np.pi)
@@ -262,33 +260,39 @@ def rao_blackwellised(model: ConditionallyLinear, n: int, **components: Any) -> 
 
 
 def ukf_proposal(
-    f: _Map, Q: Any, h: _Map, R: Any, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
-) -> Callable[[np.ndarray, Any], MultivariateNormal]:
+    f: Callable[..., Any],
+    Q: Any,
+    h: Callable[..., Any],
+    R: Any,
+    alpha: float = 1.0,
+    beta: float = 2.0,
+    kappa: float = 0.0,
+) -> Callable[..., MultivariateNormal]:
     """A proposal for `guided`: for each particle, the posterior of x_t by an unscented Kalman filter.
 
     Given x_{t-1}, the predicted x_t is N(f(x_{t-1}), Q). The proposal needs no derivatives (van der Merwe, Doucet,
     de Freitas, Wan 2000). `alpha` (spread of the sigma points), `beta` (weight of the central point) and `kappa`
     (secondary spread) are the parameters of filterpy's MerweScaledSigmaPoints. The other arguments are as in
-    `nonlinear_gaussian`.
+    `nonlinear_gaussian`, except that `Q` must not be singular.
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 
-    for name, given in (("Q", Q), ("R", R)):
-        _covariance(name, given)
-    Q, R = np.asarray(Q, np.float64), np.asarray(R, np.float64)
-    points = MerweScaledSigmaPoints(len(Q), alpha, beta, kappa)
-    offsets = points.sigma_points(np.zeros(len(Q)), Q)
+    q, r = _Noises("Q", Q), _Noises("R", R)
+    moved, seen = _OfStep("f", f, q.size), _OfStep("h", h, r.size)
+    points = MerweScaledSigmaPoints(q.size, alpha, beta, kappa)
 
-    def proposal(x: np.ndarray, y: Any) -> MultivariateNormal:
-        mean = f(x)
+    def proposal(x: np.ndarray, y: Any, **step: Any) -> MultivariateNormal:
+        Q, R = q.at(**step).covariance, r.at(**step).covariance
+        offsets = points.sigma_points(np.zeros(q.size), Q)
+        mean = moved(x, step)
         sigma = mean[:, None] + offsets
-        z = np.reshape(h(sigma.reshape(-1, len(Q))), (*sigma.shape[:2], len(R)))
+        z = np.reshape(seen(sigma.reshape(-1, q.size), step), (*sigma.shape[:2], r.size))
         centre = np.einsum("s,nsk->nk", points.Wm, z)
         z = z - centre[:, None]
         S = np.einsum("s,nsi,nsj->nij", points.Wc, z, z) + R
         cross = np.einsum("s,si,nsj->nij", points.Wc, offsets, z)
         gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(cross, -1, -2)), -1, -2)
-        moved = (gain @ (np.atleast_1d(np.asarray(y, np.float64)) - centre)[..., None])[..., 0]
-        return MultivariateNormal(mean + moved, Q - gain @ S @ np.swapaxes(gain, -1, -2))
+        change = (gain @ (vector_of("the observation", y, r.size) - centre)[..., None])[..., 0]
+        return MultivariateNormal(mean + change, Q - gain @ S @ np.swapaxes(gain, -1, -2))
 
-    return proposal
+    return with_step(proposal, {**moved.parameters, **q.parameters, **seen.parameters, **r.parameters})

@@ -32,6 +32,7 @@ from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.history import log_evidence
+from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.population import Particles, flat_columns
 from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key, rows_of
@@ -104,7 +105,7 @@ class _Posterior:
 
     def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of filters that run as one batch, or one by one if batching is impossible."""
-        if self.batched:
+        if self.batched and self.observations:
             try:
                 return self._in_one_sweep(thetas, seeds)
             except NotTogether as why:
@@ -181,7 +182,7 @@ def pmmh(
     theta = np.array(start, np.float64, ndmin=2)
     root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, list(observations), log_prior, batched)
+    posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
     key = Key(seed).child("pmmh")
 
     def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -259,7 +260,7 @@ def ensemble(
     if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
         raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
     check_integer("n_iterations", n_iterations)
-    posterior = _Posterior(filter_of, list(observations), log_prior, batched)
+    posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
     rng = Key(seed).child("ensemble").generator()
 
     def log_density(thetas: np.ndarray) -> np.ndarray:

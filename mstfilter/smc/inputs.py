@@ -18,7 +18,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
@@ -129,6 +129,16 @@ def _no_input(t: int, *args: Any, **named: Any) -> Any:
         f"a function of the model has a parameter u, and step {t} has no input",
         "give the input with the observation: WithInput(y, u); name the parameter otherwise if it is none",
     )
+
+
+def same_component(one: Any, other: Any) -> bool:
+    """Whether two components are equal. Fields may be arrays, for which ``==`` of dataclasses raises an error."""
+    if one is other:
+        return True
+    try:
+        return bool(one == other)
+    except ValueError:
+        return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
 
 
 class AtStep(Bounded):

@@ -310,6 +310,10 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.minimum(index, cumulative.searchsorted(cumulative[-1]))
 
 
+#: Bit generators whose `random_raw` returns 64 random bits. MT19937 returns 32.
+_RAW_64_BITS = (np.random.PCG64, np.random.PCG64DXSM, np.random.Philox, np.random.SFC64)
+
+
 def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
     """(n,) indices drawn independently by weight. Uniform points are first distributed among equal strata of [0, 1).
 
@@ -330,9 +334,10 @@ def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> n
     below = np.empty(n_bins + 1, np.int64)
     index, begin = np.empty(n, np.int64), 0
     for k, size in enumerate(sizes):
-        points = rng.bit_generator.random_raw(size)  # of 64 bits
-        points >>= np.uint64(64 - bits)
-        points = points.view(np.int64)
+        if isinstance(rng.bit_generator, _RAW_64_BITS):
+            points = (rng.bit_generator.random_raw(size) >> np.uint64(64 - bits)).view(np.int64)
+        else:
+            points = rng.integers(0, 1 << bits, size)
         bins = (cumulative[stops[k] : stops[k + 1]] >> shift) - (limits[k] >> shift)
         counts = np.bincount(bins, minlength=n_bins)
         below[0], below[1:] = stops[k], counts[:n_bins]  # an edge at the end of the stratum lies beyond its bins

@@ -45,6 +45,7 @@ class Record:
     #: One after each observation; ``parents["previous"]`` are indices into the population before it.
     populations: tuple[Population, ...]
     observations: tuple[Any, ...]  #: None for a missing observation
+    first: int = 0  #: step of the first population
 
     def __len__(self) -> int:
         return len(self.populations)
@@ -66,7 +67,10 @@ def known_parents(population: Population, t: int) -> np.ndarray:
 
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
-    """Run a filter and store every population. Memory grows with n times the number of steps."""
+    """Run a filter and store every population. Memory grows with n times the number of steps.
+
+    If `seed` is a state, the run continues from this state, and the record begins with the next step.
+    """
     ys = tuple(check_observations(observations))
     if not ys:
         raise InputError("there are no observations to smooth over")
@@ -74,7 +78,7 @@ def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State 
     for state, _ in filter.iterate(ys, seed):
         assert state.population is not None
         populations.append(state.population)
-    return Record(tuple(populations), ys)
+    return Record(tuple(populations), ys, state.t - len(ys))
 
 
 def genealogy(record: Record) -> tuple[Population, ...]:
@@ -141,7 +145,7 @@ def backward_paths(
     for t in range(len(record) - 2, -1, -1):
         population = record.populations[t].realised()
         y, u = split_input(record.observations[t + 1])
-        move = _Move(population, path[-1].particles, transition.at_step(t + 1, u), y, t)
+        move = _Move(population, path[-1].particles, transition.at_step(record.first + t + 1, u), y, t)
         index = move.metropolis(rng, record.parents(t + 1)[index], steps) if method == "mcmc" else move.exact(rng, n)
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))

@@ -102,7 +102,7 @@ class StateSpaceModel(AtStep):
             return _of_shape("transition", new, x)
 
         def log_density(previous: Any, new: Any, **step: Any) -> np.ndarray:
-            return as_distribution(transition(previous, **step)).log_prob(new)
+            return _log_state(as_distribution(transition(previous, **step)), new)
 
         def log_likelihood(x: Any, y: Any, **step: Any) -> np.ndarray:
             return _log_likelihood(as_distribution(observation(x, **step)), y)
@@ -112,7 +112,7 @@ class StateSpaceModel(AtStep):
             first.sample,
             with_step(sample, moves),
             with_step(log_likelihood, observes),
-            partial(_log_initial, first),
+            partial(_log_state, first),
             with_step(log_density, moves),
             batched=None,
         )
@@ -141,8 +141,8 @@ def _of_shape(what: str, new: np.ndarray, old: Any) -> np.ndarray:
     return new
 
 
-def _log_initial(distribution: Distribution, x: Any) -> np.ndarray:
-    """(n,) log p(x_0). Checks the shape of the particles, which a proposal may have drawn."""
+def _log_state(distribution: Distribution, x: Any) -> np.ndarray:
+    """(n,) log density of states. Checks the shape of the particles, which a proposal may have drawn."""
     if np.shape(x)[1:] != distribution.event_shape:
         raise InputError(f"particles have shape {np.shape(x)}, expected the event shape {distribution.event_shape}")
     return distribution.log_prob(x)

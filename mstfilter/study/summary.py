@@ -180,11 +180,11 @@ def summarise(
     values = _by_seed([row for row in rows if row["pause"] >= 1], measured)
     spent = [k for k in named if k in cost]
     zero = {k: 0.0 for k in spent if not k.startswith("peak_mb")}
-    seeds: dict[Any, dict[Any, set[Any]]] = defaultdict(lambda: defaultdict(set))
+    seeds: dict[Any, dict[Any, dict[Any, None]]] = defaultdict(lambda: defaultdict(dict))
     for row in rows:
-        seeds[row["family"], row["arm"]][row["scene"]].add(row["seed"])
+        seeds[row["family"], row["arm"]][row["scene"]][row["seed"]] = None
     several = {of_arm for of_arm, scenes in seeds.items() if any(len(found) > 1 for found in scenes.values())}
-    filling = {(*of_arm, scene): min(found) for of_arm in several for scene, found in seeds[of_arm].items()}
+    filling = {(*of_arm, scene): next(iter(found)) for of_arm in several for scene, found in seeds[of_arm].items()}
     warm = [{**zero, **row} for row in rows if filling.get((row["family"], row["arm"], row["scene"])) != row["seed"]]
     values.update(_by_seed(warm, spent))
     for endpoint, slope_name in SLOPES.items():

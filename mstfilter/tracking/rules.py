@@ -287,12 +287,13 @@ class MstRule(MotionRule):
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:
         scores = np.array([c.score for c in candidates])
-        if not np.isfinite(scores).any():
+        finite = np.flatnonzero(np.isfinite(scores))
+        if not len(finite):
             return IDENTITY
         if self.select == "map":
             return candidates[int(scores.argmin())]
-        weights = np.exp(-0.5 * self.n_eff * (scores - scores.min()))
-        return candidates[int(rng.choice(len(candidates), p=weights / weights.sum()))]
+        weights = np.exp(-0.5 * self.n_eff * (scores[finite] - scores.min()))
+        return candidates[int(rng.choice(finite, p=weights / weights.sum()))]
 
     def _estimates(self, rng: np.random.Generator, track: Track) -> Iterator[_Estimate]:
         """Motions from every estimator, then the same motions refined by registration."""

@@ -156,8 +156,8 @@ class Track:
 
     def sampled(self, n: int) -> np.ndarray:
         """Flat pixels, in the first frame, of the points that `sample` returns."""
-        chosen = np.unique(np.linspace(0, len(self.segment.support) - 1, n).astype(np.int64))
-        return self.segment.support[chosen[chosen >= 0]]
+        last = len(self.segment.support) - 1
+        return self.segment.support[np.unique(np.linspace(0, last, n if last >= 0 else 0).astype(np.int64))]
 
     @property
     def colour_after(self) -> np.ndarray:

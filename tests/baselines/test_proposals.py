@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mstfilter.baselines import FirstPause, ImageComponents, OccupiedComponents, OneBlob
+from mstfilter.completion import ClipCompleter, Extrude
 from mstfilter.scene import Camera, Frame
 from mstfilter.segmentation import TreeCutProposal
 from tests.baselines.scenes import slide
@@ -73,3 +74,22 @@ def test_nothing_on_the_table_is_nothing(tmp_path):
     clip = Clip((Frame(rgb, depth, CAMERA),), GRID)
     for floor in (OneBlob(), OccupiedComponents(), ImageComponents()):
         assert floor.sample(np.random.default_rng(0), clip, 1).particles[0].n_objects == 0
+
+
+class OfClip(ClipCompleter):
+    """Completes only if it is bound to a clip."""
+
+    def at(self, clip):
+        return Extrude()
+
+    def fill(self, rng, seen):
+        raise AssertionError("not bound to a clip")
+
+
+def test_completers_of_a_clip_are_bound_by_every_floor(recording):
+    clip = recording.clips()[2]
+    for kind in (OneBlob, OccupiedComponents, ImageComponents):
+        found, expected = (
+            kind(completer=completer).sample(np.random.default_rng(0), clip, 1) for completer in (OfClip(), Extrude())
+        )
+        assert found.particles[0].key == expected.particles[0].key

@@ -208,3 +208,11 @@ def test_a_grid_may_start_below_the_table(completer, frame, below=7):
         assert not found[:, :, :below].any()
         # Readings on the border of two voxels can change sides by rounding.
         assert (np.abs(found[:, :, below:] - placed(one)) > 1e-3).mean() < 1e-2
+
+
+def test_a_visible_object_remains_with_negative_log_odds(completer, frame):
+    masks = masks_of(STACK, frame)
+    found = replace(completer, log_odds=-30.0).complete_each(
+        [np.random.default_rng(0)] * len(masks), frame, masks, GRID
+    )
+    assert all((one.probability >= 0.5).sum() == (one.points > 0).sum() > 10 for one in found)

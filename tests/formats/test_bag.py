@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from mstfilter.formats import open_recording
 from mstfilter.formats.bag import Bag, colour_image, depth_image
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.pauses import Ends
-from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, scene_messages, topic_info, write
+from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, png, scene_messages, topic_info, write
 from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, video
 from tests.formats.test_layouts import WORLD, same_frames
 
@@ -61,7 +62,10 @@ def test_pixels_of_other_encodings():
     millimetres = np.array([[0, 700], [1500, 65535]], np.uint16)
     message = make.image(0, millimetres.byteswap(), "16UC1")[1]
     message.is_bigendian = 1
-    np.testing.assert_allclose(depth_image(message, False, 0.001, "m"), [[np.nan, 0.7], [1.5, 65.535]], rtol=1e-6)
+    np.testing.assert_allclose(depth_image(message, False, 0.001, "m"), [[np.nan, 0.7], [1.5, np.nan]], rtol=1e-6)
+    for form, data in (("16UC1; compressedDepth", b"0" * 12 + png(millimetres)), ("16UC1; png", png(millimetres))):
+        packed = make.compressed(0, data, form)[1]
+        np.testing.assert_allclose(depth_image(packed, True, 0.001, "m"), [[np.nan, 0.7], [1.5, np.nan]], rtol=1e-6)
     metres = np.array([[np.nan, 0.7], [np.inf, -1.0]], np.float32)
     found = depth_image(make.image(0, metres, "32FC1")[1], False, 0.001, "m")
     np.testing.assert_allclose(found, [[np.nan, 0.7], [np.nan, np.nan]], rtol=1e-6)
@@ -90,16 +94,23 @@ def test_registered_depth_is_the_default(tmp_path):
 
 
 def test_the_lens_of_the_camera_info_is_used(tmp_path):
-    """A raw image is undistorted; for a rectified image the camera matrix is read from P."""
+    """A raw image is undistorted; for a rectified image the camera matrix is read from P.
+
+    A given camera matrix does not change the distortion.
+    """
     make = Messages(True)
-    for topic, same in ((COLOUR, False), ("/camera/color/image_rect_color", True)):
+    topics = (COLOUR, False), ("/camera/color/image_rect_color", True), ("/direct_drive/camera/image_raw", False)
+    for k, (topic, same) in enumerate(topics):
         messages = []
         for name, t, message in scene_messages(True, (0, 0), info=False):
             messages.append((topic if name == COLOUR else name, t, message))
             messages.append((topic_info(topic), t, make.info(t, d=(0.3, 0.0, 0.0, 0.0, 0.0))))
-        path = write(tmp_path / f"s{same}", "bag", messages)
-        frame = Bag(pauses=Ends(), world=WORLD).open(path).frames[0]
-        assert np.array_equal(frame.rgb, video((0,))[0][0]) == same
+        path = write(tmp_path / f"s{k}", "bag", messages)
+        for given in ((), K):
+            frame = Bag(pauses=Ends(), world=WORLD, K=given).open(path).frames[0]
+            assert np.array_equal(frame.rgb, video((0,))[0][0]) == same
+        frame = Bag(pauses=Ends(), world=WORLD, K=K, distortion=(0.0,) * 4).open(path).frames[0]
+        assert np.array_equal(frame.rgb, video((0,))[0][0])
 
 
 def with_messages(**change):
@@ -201,3 +212,21 @@ def test_without_rosbags(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="needs rosbags") as caught:
         Bag().open(path)
     assert "mstfilter[bags]" in caught.value.hints[0]
+
+
+def test_a_folder_inside_a_bag_is_skipped(tmp_path):
+    path = write(tmp_path / "s", "db3", scene_messages(False, (0, 1)))
+    (path / "notes").mkdir()
+    same_frames(Bag(pauses=Ends(), world=WORLD).open(path), (0, 1))
+
+
+def test_the_orientation_of_a_compressed_image_is_ignored():
+    """An EXIF entry would turn the colour image by 180 degrees, but not the depth image."""
+    rgb = np.zeros((40, 60, 3), np.uint8)
+    rgb[:20] = 200
+    jpeg = cv2.imencode(".jpg", rgb)[1].tobytes()
+    tag = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x03\0\0\0\0\0\0\0"
+    turned = jpeg[:2] + b"\xff\xe1" + (len(tag) + 2).to_bytes(2, "big") + tag + jpeg[2:]
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)[0, 0, 0] < 50
+    message = Messages(False).compressed(0, turned, "jpeg")[1]
+    assert colour_image(message, True, "m")[0, 0, 0] > 150

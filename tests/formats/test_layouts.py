@@ -487,3 +487,24 @@ def test_floating_point_depth_in_millimetres_is_not_blamed_on_the_scale(tmp_path
         with pytest.raises(InputError, match="has a median of 778 m") as caught:
             make()
         assert "per unit" not in caught.value.message and "multiply millimetres by 0.001" in caught.value.hints[0]
+
+
+def test_times_of_which_some_have_no_decimals(tmp_path):
+    seconds = [9.5, 10.25, 11, *range(12, 12 + len(SHIFTS) - 3)]
+    path = write_rgb_and_depth(tmp_path / "mine", lambda part, k: f"{seconds[k]:g}")
+    recording = Redwood(world=WORLD).open(path)
+    np.testing.assert_allclose(recording.times, np.array(seconds) - 9.5)
+
+
+def test_arrays_of_depth_are_read_like_other_files(tmp_path):
+    """A header that claims more than the file holds, and an archive."""
+    path = tmp_path / "depth.npy"
+    with path.open("wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (10**7, 10**6)}
+        np.lib.format.write_array_header_1_0(file, header)
+    with pytest.raises(InputError, match=r"depth.npy cannot be read: an array of shape"):
+        read_depth(path, 1.0)
+    np.savez(tmp_path / "depth.npz", a=np.ones((4, 4), np.float32))
+    (tmp_path / "depth.npz").rename(path)
+    with pytest.raises(InputError, match="expected one channel"):
+        read_depth(path, 1.0)

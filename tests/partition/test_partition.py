@@ -281,7 +281,10 @@ def test_evidence_weights_built_candidates():
     before, after = weights(update), weights(replace(update, evidence=(FewObjects(),)))
     odds = (after[1] / after[2]) / (before[1] / before[2])
     assert odds == pytest.approx(np.e)
-    assert weights(replace(update, evidence=(FewObjects(),), n_scored=1)).keys() == {max(before, key=before.get)}
+    one = replace(update, evidence=(FewObjects(),), n_scored=1)
+    assert weights(one).keys() == {max(before, key=before.get)}
+    found = one.update(np.random.default_rng(0), Population((state,)), samples, later)
+    assert found.notes["discarded_mass"] == pytest.approx(min(before.values()), abs=1e-4)
 
 
 class FewObjects(Evidence):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -184,3 +185,31 @@ def test_all_folders_of_a_component_count(tmp_path):
         (tmp_path / name / "x").write_text(name)
         seen.append(component_files(one))
     assert len({tuple(found.values()) for found in seen}) == 3
+
+
+def test_masks_below_a_link_count(recording, tmp_path):
+    masks = np.zeros(recording.frames[0].depth.shape, np.uint16)
+    masks[20:40, 20:40] = 1
+    for k in range(3):
+        write_masks(tmp_path / "masks", k, [masks])
+    first = tmp_path / "masks" / "000000"
+    first.rename(tmp_path / "elsewhere")
+    first.symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (tmp_path / "masks" / "loop").symlink_to(tmp_path / "masks", target_is_directory=True)
+    filter = build_filter(load_config("mst_rules", ["proposal=mask_folder", f"proposal.folder={tmp_path / 'masks'}"]))
+    before = component_files(filter)
+    next(path for path in (tmp_path / "elsewhere").iterdir() if path.is_file()).write_bytes(b"other")
+    assert component_files(filter) != before
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint16])
+def test_true_label_images_of_any_integer_type_are_stored(recording, tmp_path, kind):
+    """OpenCV clips other types than uint8 and uint16 to 8 bits."""
+    image = np.zeros(recording.frames[0].depth.shape, kind)
+    image[20:40, 20:40] = 300
+    config = load_config("floor_one_blob", ["n=1"])
+    folder = filter_recording(replace(recording, instance=lambda index: image), config, tmp_path / "run")
+    np.testing.assert_array_equal(folder.instance(0), image)
+    with pytest.raises(InputError, match="true label image of pause 0 has shape"):
+        filter_recording(replace(recording, instance=lambda index: image[:9]), config, tmp_path / "other")
+    assert not (tmp_path / "other").exists()

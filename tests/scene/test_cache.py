@@ -282,8 +282,32 @@ def test_a_class_of_the_user_is_known_by_its_code():
     named = CLASS.replace("FACTOR * v", "FACTOR * scaled(v)")
     texts = [f"FACTOR = {a}\ndef scaled(v):\n    return {b} * v\n{named}" for a, b in ((1, 1), (1, 2), (2, 1))]
     assert len({key(text) for text in texts}) == 3
+    for a, b in (
+        ("    padding = 1\n", "    padding = 2\n"),
+        ("    def more(self, k=1): pass\n", "    def more(self, k=2): pass\n"),
+        ("    def more(self, *, k=1): pass\n", "    def more(self, *, k=2): pass\n"),
+        ("    def more(self): return TABLE\nTABLE = [1]\n", "    def more(self): return TABLE\nTABLE = [2]\n"),
+        (
+            "    def more(self): return Inner\nclass Inner: r = 1\n",
+            "    def more(self): return Inner\nclass Inner: r = 2\n",
+        ),
+    ):
+        assert key(CLASS + a) != key(CLASS + b) == key(CLASS + b)
     values = [content_key(value) for value in astuple(Extrude())]
     assert component_key(Extrude()) == content_key("mstfilter.completion.extrude", "Extrude", "", b"", *values)
+
+
+def made(k):
+    @dataclass(frozen=True)
+    class Mine:
+        def more(self):
+            return k
+
+    return Mine()
+
+
+def test_classes_that_a_function_makes_are_known_by_its_arguments():
+    assert component_key(made(1)) != component_key(made(2)) == component_key(made(2))
 
 
 @dataclass(frozen=True)

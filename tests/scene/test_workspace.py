@@ -13,6 +13,7 @@ from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
+from mstfilter.scene.frame import depth_sigma
 from mstfilter.scene.geometry import in_columns, shares_with_depth
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
@@ -223,3 +224,37 @@ def test_depth_that_is_missing_in_the_workspace_alone_gives_a_warning():
     assert len(found) == 1 and not found[0].stop and "frame 0" in found[0].message
     robot = replace(holes, robot_mask=np.isnan(holes.depth))
     assert min(shares_with_depth(robot, grid)) > 0.9
+
+
+def room(wall, floor, half=0.4):
+    """Two boxes on a table that ends at x, y = +-`half` metres, a floor, and a wall at y = `wall`."""
+    camera = Camera.from_intrinsics(200, 200, 159.5, 119.5, 320, 240, look_at((0.0, -0.7, 1.1), (0, 0, 0)))
+    rgb, depth, _ = table_scene(camera=camera)
+    directions = camera.rays() @ camera.pose.as_matrix()[:3, :3].T
+    points = camera.unproject(depth)
+    beyond = (np.abs(points[..., :2]) > half).any(axis=-1) & (points[..., 2] < 0.005)
+    with np.errstate(divide="ignore"):
+        below = (floor - camera.position[2]) / np.where(directions[..., 2] < 0, directions[..., 2], np.nan)
+        behind = (wall - camera.position[1]) / np.where(directions[..., 1] > 0, directions[..., 1], np.nan)
+    far = np.fmin(below, behind)
+    depth = np.where(beyond, far, np.fmin(depth, behind))
+    noise = np.random.default_rng(0).normal(size=depth.shape) * depth_sigma(depth)
+    return rgb, (depth + noise).astype(np.float32), camera
+
+
+def test_a_wall_that_is_farther_is_not_part_of_the_table():
+    """A strip of the wall at the height of the table is about 2 % of the readings at z = 0."""
+    grids = []
+    for wall in (5.0, 0.9):
+        rgb, depth, camera = room(wall, -0.72)
+        grids.append(Recording.from_arrays(rgb, depth, camera.K, T_world_camera=camera.pose).grid)
+    z = camera.unproject(depth)
+    strip = (np.abs(z[..., 2]) < 0.01) & (z[..., 1] > 0.8)
+    assert strip.sum() > 0.01 * (np.abs(z[..., 2]) < 0.01).sum()
+    assert grids[1].upper[1] < 0.6 and grids[0] == grids[1]
+
+
+def test_a_floor_is_recognised_also_before_a_large_wall():
+    rgb, depth, camera = room(1.0, -0.6)
+    with pytest.raises(InputError, match="the floor is taken for the table: a second plane is 0.6"):
+        Recording.from_arrays(rgb, depth, camera.K)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from mstfilter.smc import (
     StateSpaceModel,
     Stratified,
     Systematic,
+    Trigger,
     Uniform,
     WeightResampler,
     bootstrap,
@@ -438,3 +440,53 @@ def test_a_chain_whose_first_estimate_is_lost_is_drawn_again():
 
 def fragile_never(theta):
     return replace(chain_model("scalar", theta, 3), update=Reweight(lambda x, y: np.full(len(x), -np.inf)))
+
+
+@dataclass(frozen=True)
+class SpreadOfAllRuns(Trigger):
+    """Wrong: it says that it treats runs separately, but does not."""
+
+    batched: ClassVar[bool] = True
+
+    def wants(self, population, t):
+        return np.ptp(population.log_weights) > 20.0
+
+
+@dataclass(frozen=True)
+class ScaledByAllRuns(WeightResampler):
+    """Wrong: the weights of a run depend on the largest weight of all runs."""
+
+    batched: ClassVar[bool] = True
+
+    def select(self, rng, log_weights, n):
+        weights = np.exp(log_weights - log_weights.max())
+        return Systematic().select(rng, np.log(weights + 1e-3), n)
+
+
+@dataclass(frozen=True)
+class TooFew(WeightResampler):
+    """Returns one particle of n."""
+
+    def select(self, rng, log_weights, n):
+        return Systematic().select(rng, log_weights, 1)
+
+
+YS = [0.1, 1.0, -2.0, 0.3, 0.2, 0.1]
+FAR = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("slot", "component"), [("trigger", SpreadOfAllRuns()), ("resampler", ScaledByAllRuns())], ids=str
+)
+def test_triggers_and_resamplers_that_mix_runs_are_refused(slot, component):
+    with pytest.raises(InputError, match=rf"step \d, {slot}"):
+        run_many(replace(bootstrap(FAR, 8), **{"trigger": Always(), slot: component}), YS, range(4))
+
+
+def test_a_resampler_of_another_size_is_run_one_by_one():
+    filter = replace(bootstrap(FAR, 8), resampler=TooFew(), trigger=Always())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        runs = run_many(filter, YS, range(3))
+    expected = [filter.run(YS, seed)[0].log_evidence for seed in range(3)]
+    np.testing.assert_array_equal(runs["log_evidence"][:, -1], expected)

@@ -169,3 +169,13 @@ def test_mappings_objects_and_other_distances():
         energy_distance(first, second)
     with pytest.raises(InputError, match=r"distances have shape \(4,\), expected \(4, 4\)"):
         energy_distance(first, second, lambda p: np.zeros(len(p)))
+
+
+def test_particles_without_a_value_have_no_distance():
+    first = Population(np.array([[0.0, np.nan], [1.0, 2.0]]))
+    second = Population(np.array([[50.0, 7.0], [60.0, 1.0]]))
+    for a, b in ((first, second), (Population(first.particles[:, 1]), Population(second.particles[:, 1]))):
+        with pytest.raises(InputError, match="NaN"):
+            energy_distance(a, b)
+    with pytest.raises(InputError, match="distances are NaN"):
+        energy_distance(first, second, lambda x: np.full((4, 4), np.nan))

@@ -283,3 +283,20 @@ def test_scipy_distributions(frozen, log_prob):
 def test_other_things_are_refused():
     with pytest.raises(InputError, match="expected a distribution, found a builtins.float"):
         as_distribution(3.0)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        stats.multivariate_normal([0.0, 0.0], COV),
+        stats.multivariate_t([0.0, 0.0], COV, 5),
+        stats.dirichlet([2.0, 3.0]),
+    ],
+    ids=lambda d: type(d).__name__,
+)
+def test_vectors_of_scipy_have_one_density_per_row(given):
+    ours = as_distribution(given)
+    draws = ours.sample(np.random.default_rng(0), 3)
+    assert ours.log_prob(draws[:1]).shape == (1,)
+    np.testing.assert_allclose(ours.log_prob(draws)[:1], ours.log_prob(draws[:1]))
+    assert ours.log_prob(draws[0]).shape == ()

@@ -7,9 +7,10 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mstfilter.errors import InputError, InputWarning
-from mstfilter.smc import Normal, Program, observe, sample
+from mstfilter.smc import Distribution, Normal, Program, observe, sample
 from tests.smc.faulty_programs import CORRECT, FAULTY, INHERENT
 
 
@@ -59,3 +60,65 @@ def test_few_faults_run_without_an_error():
     for filter, ys, _ in INHERENT.values():
         filter.run(ys, 0)
     assert len(FAULTY) >= 60 and len(CORRECT) >= 20 and len(INHERENT) <= 5
+
+
+class Of(Distribution):
+    """A distribution of the user from one of scipy."""
+
+    def __init__(self, draws, density=None):
+        self.draws, self.density = draws, density or draws.logpdf
+
+    mean = np.zeros(())
+
+    def sample(self, rng, size):
+        return self.draws.rvs(size=size, random_state=rng)
+
+    def log_prob(self, value):
+        return self.density(value)
+
+
+class Peaks:
+    """Two narrow peaks that are far apart."""
+
+    def rvs(self, size, random_state):
+        return random_state.normal(0, 0.01, size) + 100.0 * random_state.integers(0, 2, size)
+
+    def logpdf(self, x):
+        return np.logaddexp(stats.norm(0, 0.01).logpdf(x), stats.norm(100, 0.01).logpdf(x)) - np.log(2)
+
+
+def run_with(distribution, seed):
+    kind = type("Kind", (Of,), {})  # each class is tested once
+
+    def program(previous, y):
+        x = sample("x", kind(distribution.draws, distribution.density))
+        observe("y", Normal(np.clip(x, -3, 3), 1.0), y)
+
+    Program(program).bootstrap(20).run([0.5], seed)
+
+
+SKEWED = {
+    "gamma": stats.gamma(0.5),
+    "beta": stats.beta(0.5, 0.5),
+    "half Cauchy": stats.halfcauchy(),
+    "lognormal": stats.lognorm(2.0),
+    "Pareto": stats.pareto(1),
+    "exponential": stats.expon(),
+    "peaks": Peaks(),
+}
+
+
+@pytest.mark.parametrize("name", SKEWED)
+def test_heavy_tails_poles_and_jumps_of_a_density_are_no_fault(name):
+    for seed in range(5):
+        run_with(Of(SKEWED[name]), seed)
+
+
+@pytest.mark.parametrize(
+    "density",
+    [stats.norm(0, 2).logpdf, stats.norm(0.5).logpdf, lambda x: -x * x / 2, stats.norm().pdf],
+    ids=["scale", "shift", "not normalised", "no log"],
+)
+def test_a_density_of_other_draws_is_a_fault(density):
+    with pytest.raises(InputError, match="do not have its density"):
+        run_with(Of(stats.norm(), density), 0)

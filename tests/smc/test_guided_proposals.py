@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from mstfilter.errors import InputError
-from mstfilter.smc import bootstrap, guided, nonlinear_gaussian, ukf_proposal
+from mstfilter.smc import Normal, StateSpaceModel, bootstrap, guided, nonlinear_gaussian, ukf_proposal
 from tests.smc.models import filterpy_class
 
 Q, R = np.array([[0.4, 0.1], [0.1, 0.3]]), np.array([[0.2, 0.05], [0.05, 0.1]])
@@ -96,3 +96,23 @@ def test_what_a_gaussian_model_rejects():
     ):
         with pytest.raises(InputError, match=message):
             bootstrap(nonlinear_gaussian(f2, eye, h2, eye, [0.0, 0.0], eye), 2).run([[0.1, 0.2]] * 2)
+
+
+def test_functions_and_covariances_of_the_step():
+    """Q of step 1 and a time-varying f give the proposal of the functions of this step."""
+    Qs = np.stack([9 * np.eye(2), Q])
+    found = ukf_proposal(lambda x, t: f(x) + t, Qs, h, R)
+    expected = ukf_proposal(lambda x: f(x) + 1, Q, h, R)(PARTICLES, Y)
+    np.testing.assert_allclose(found(PARTICLES, Y, t=1).mean, expected.mean)
+    np.testing.assert_allclose(found(PARTICLES, Y, t=1).cov, expected.cov)
+    model = nonlinear_gaussian(lambda x, t: f(x) + t, Qs, h, R, np.zeros(2), np.eye(2))
+    assert np.isfinite(guided(model, found, 20).run([Y, Y], 0)[0].log_evidence)
+
+
+def test_states_of_another_shape_are_refused():
+    """numpy would broadcast states (n, 1) against means (n,)."""
+    model = StateSpaceModel.of(
+        Normal(np.zeros((1, 1)), 1.0), lambda x: Normal(0.9 * x[:, 0], 0.5), lambda x: Normal(x, 1.0)
+    )
+    with pytest.raises(InputError, match="event shape"):
+        guided(model, lambda x, y: Normal(0.5 * x + 0.3 * y, 0.7), 20).run([np.array([0.3])] * 2, 0)

@@ -20,12 +20,14 @@ from mstfilter.smc import (
     Dynamics,
     LargestWeights,
     Linear,
+    Normal,
     Population,
     Program,
     Proposal,
     Reweight,
     StateSpaceModel,
     Transition,
+    Uniform,
     auxiliary,
     bootstrap,
     conditional_path,
@@ -372,3 +374,41 @@ def test_what_chains_reject():
         ensemble(filter_of, YS, log_prior, [[0.1]], 5)
     with pytest.raises(InputError, match=r"draw returned parameters of shape \(2,\)"):
         particle_gibbs(filter_of, YS, lambda rng, theta, path: [1.0, 2.0], [0.1], 5)
+
+
+@pytest.mark.parametrize("observations", [{0: 5.0, 1: 6.0}, [np.ma.array([0.2, 999.0], mask=[False, True])], "5.6"])
+def test_observations_are_checked(observations):
+    """Iteration would filter the keys of a mapping, and the masked values."""
+
+    def filter_of(theta):
+        return bootstrap(AR1, 4)
+
+    with pytest.raises(InputError, match="observations are|masked"):
+        pmmh(filter_of, observations, lambda theta: 0.0, [0.5], [0.1], 2)
+    with pytest.raises(InputError, match="observations are|masked"):
+        ensemble(filter_of, observations, lambda theta: 0.0, [[0.5], [0.6]], 2)
+
+
+def test_without_observations_a_batched_chain_samples_the_prior():
+    def log_prior(theta):
+        return float(-0.5 * theta[0] ** 2)
+
+    chains = pmmh(lambda theta: bootstrap(AR1, 4), [], log_prior, [0.5], [0.1], 3, batched=True)
+    np.testing.assert_array_equal(chains.log_evidence, 0.0)
+
+
+def test_a_path_survives_if_all_free_particles_have_weight_zero():
+    """A uniform walk with a wide proposal and two particles: the free particle is often impossible."""
+    model = StateSpaceModel.of(Uniform(0.0, 1.0), lambda x: Uniform(x - 0.5, x + 0.5), lambda x: Normal(x, 1.0))
+    filter = guided(model, lambda x, y: Normal(x, 2.0), 2)
+    path, paths = np.array([0.5, 0.6, 0.7]), []
+    for seed in range(3000):
+        path = conditional_path(filter, [0.5, 0.5, 0.5], seed, path)
+        paths.append(path)
+    # x_0 by the exact law, on a grid: p(x_0) times the likelihoods of all paths
+    grid = np.linspace(-1, 2, 301)
+    move = (np.abs(grid[:, None] - grid) <= 0.5).astype(float)
+    like = np.exp(-0.5 * (grid - 0.5) ** 2)
+    law = ((grid >= 0) & (grid <= 1)) * like * (move @ (like * (move @ like)))
+    mean = (grid * law).sum() / law.sum()
+    assert np.mean([p[0] for p in paths]) == pytest.approx(mean, abs=0.05)

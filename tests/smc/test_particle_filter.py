@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 
 from mstfilter.errors import InputError
-from mstfilter.smc import Always, ParticleFilter, Population, Proposal, Transition, Update, bootstrap, linear_gaussian
+from mstfilter.smc import (
+    Always,
+    ParticleFilter,
+    Population,
+    Proposal,
+    Reweight,
+    Transition,
+    Update,
+    bootstrap,
+    linear_gaussian,
+)
 
 F, Q = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.2, 0.05], [0.05, 0.3]])
 H, R = np.array([[1.0, 0.0]]), np.array([[0.7]])
@@ -100,3 +110,24 @@ def test_wrong_filters_are_one_clear_error():
         ParticleFilter(initial=Numbers(), resample="sometimes")
     with pytest.raises(InputError, match="first observation is missing"):
         PAIRING.step(PAIRING.start(0), None)
+
+
+@dataclass(frozen=True)
+class Around(Proposal):
+    mean: np.ndarray
+
+    def sample(self, rng, observation, n):
+        return Population(self.mean + rng.normal(size=(n, 2)))
+
+
+def test_proposals_may_have_arrays_as_fields():
+    """A filter starts from its proposal if `initial` equals it; the comparison must not fail."""
+    a, b = np.array([0.0, 1.0]), np.array([2.0, 1.0])
+    found = {}
+    for name, initial in (("same", Around(a)), ("equal", Around(a.copy())), ("other", Around(b))):
+        proposal = initial if name == "same" else Around(a)
+        filter = ParticleFilter(
+            initial=initial, proposal=proposal, update=Reweight(lambda x, y: -(x[:, 0] ** 2)), n=10
+        )
+        found[name] = filter.run([1.0], 0)[1][0].n_candidates
+    assert found == {"same": 10, "equal": 10, "other": 20}

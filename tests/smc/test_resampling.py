@@ -335,3 +335,11 @@ def test_chopthin_changes_nothing_if_the_weights_are_nearly_equal():
     order = np.argsort(chosen.parents["ancestor"])
     np.testing.assert_array_equal(chosen.particles[order], population.particles)
     np.testing.assert_allclose(chosen.log_weights[order], population.log_weights)
+
+
+@pytest.mark.parametrize("bits", [np.random.MT19937, np.random.PCG64, np.random.Philox, np.random.SFC64])
+def test_many_draws_with_every_bit_generator(bits):
+    """MT19937 has 32 raw bits, the others 64. Chi-square at 1e-6."""
+    weights = np.array([0.1, 0.2, 0.3, 0.4])
+    index, _ = Multinomial().select(np.random.Generator(bits(0)), np.log(weights), 5000)
+    assert stats.chisquare(np.bincount(index, minlength=4), 5000 * weights).pvalue > 1e-6

@@ -67,3 +67,8 @@ def test_gaussian_similarity():
         np.testing.assert_allclose(Gaussian(2.0).matrix(particles), np.exp(-d / 8), atol=1e-9)
     with pytest.raises(InputError, match="str objects"):
         Gaussian().matrix(("a", "b"))
+
+
+def test_particles_without_a_value_share_a_bin():
+    x = np.array([[0.0, np.nan], [0.1, np.nan], [0.0, 0.5], [5.0, np.nan]])
+    assert Bins(1.0).classes(x).tolist() == [0, 0, 1, 2]

@@ -29,6 +29,7 @@ from mstfilter.smc import (
     genealogy,
     guided,
     keep,
+    linear_gaussian,
     resample_move,
 )
 from tests.smc.models import (
@@ -254,3 +255,22 @@ def test_what_cannot_be_smoothed():
         for method in METHODS:
             with pytest.raises(InputError, match=message):
                 backward_paths(rng, record, Dynamics(replace(AR1, log_transition=bad)), 5, **METHODS[method])
+
+
+def test_a_record_that_continues_a_run_has_the_transitions_of_its_steps():
+    model = linear_gaussian(
+        np.array([1.0, 0.1, 0.1, 0.1, -2.0, -2.0, -2.0, -2.0])[:, None, None],
+        [[0.5]],
+        [[1.0]],
+        [[0.5]],
+        [0.0],
+        [[1.0]],
+    )
+    filter, ys = bootstrap(model, 200), list(np.random.default_rng(0).normal(size=(8, 1)))
+    whole, part = keep(filter, ys, 0), keep(filter, ys[4:], filter.run(ys[:4], 0)[0])
+    assert (whole.first, part.first) == (0, 4)
+    expected, found = (
+        backward_paths(np.random.default_rng(1), record, Dynamics(model), 300) for record in (whole, part)
+    )
+    for a, b in zip(expected[4:], found, strict=True):
+        np.testing.assert_array_equal(a.particles, b.particles)

@@ -104,6 +104,8 @@ def test_sampling_follows_the_scores():
     p = 1 / (1 + np.exp(-0.5 * 10 * 0.2))
     drawn = sum(rule.choose(rng, (a, b)) is a for _ in range(n))
     assert abs(drawn - n * p) < 4.4 * np.sqrt(n * p * (1 - p))
+    impossible = Candidate("icp", IDENTITY.T, 0, np.inf)
+    assert MstRule(select="sample", n_eff=0.0).choose(rng, (impossible, a)) is a
 
 
 def test_candidates_with_large_shift_or_rotation_are_rejected(printed_box, monkeypatch):

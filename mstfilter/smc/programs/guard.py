@@ -292,11 +292,10 @@ _KNOWN: set[type] = set()
 def _check_density(what: str, distribution: Distribution, rng: np.random.Generator) -> None:
     """Raise InputError if the draws of a user's scalar distribution do not have its density.
 
-    Each class is checked once. For 1000 sorted draws, the integral of the density may differ from the empirical
-    distribution function by less than .12. The false-alarm rate is 1e-12 (Dvoretzky, Kiefer, Wolfowitz).
+    Each class is checked once. For 1000 sorted draws, the integral of the density from the least draw may differ from
+    the empirical distribution function by less than .12. Without errors of the integral, the false-alarm rate is
+    1e-12 (Dvoretzky, Kiefer, Wolfowitz). A part of the density that no draw reaches is not tested.
     """
-    from scipy.integrate import cumulative_trapezoid
-
     kind = type(distribution)
     if kind.__module__.startswith("mstfilter.") or kind in _KNOWN or distribution.event_shape:
         return
@@ -319,12 +318,17 @@ def _check_density(what: str, distribution: Distribution, rng: np.random.Generat
         p = density(values)
         distance, total = float(abs(counts / len(x) - p).max()), float(p.sum())
     else:
-        width = max(x[-1] - x[0], 1e-12)
-        tail = width * np.linspace(0, 1, 50)[1:]
-        x = np.concatenate([x[0] - tail[::-1], x, x[-1] + tail])
-        mass = cumulative_trapezoid(density(x), x, initial=0.0)
-        middle = (np.arange(1000) + 0.5) / 1000
-        distance, total = float(abs(mass[49:-49] - middle).max()), float(mass[-1])
+        draws_below, f = np.arange(len(x)) / len(x), density(x)
+        # The geometric mean of the ends is exact for 1 / x^2, and nearly exact for exponential functions.
+        for _ in range(20):
+            mass = np.diff(x) * np.sqrt(f[:-1] * f[1:])
+            coarse = np.argsort(mass)[-20:]
+            coarse = coarse[mass[coarse] > 0.01]
+            middle = (x[coarse] + x[coarse + 1]) / 2
+            x, f = np.insert(x, coarse + 1, middle), np.insert(f, coarse + 1, density(middle))
+            draws_below = np.insert(draws_below, coarse + 1, draws_below[coarse + 1])
+        below = np.append(0.0, np.cumsum(np.diff(x) * np.sqrt(f[:-1] * f[1:])))
+        distance, total = float(abs(below - draws_below).max()), float(below[-1])
     if not distance < 0.12:
         raise InputError(
             f"{what}: draws of {kind.__qualname__} do not have its density: they differ by {distance:.2g}, "
