@@ -2,21 +2,7 @@
 
 >>> mst = mstfilter.preset("mst", "update.completer=external", "update.completer.folder=shapes")
 
-Each pause has a subfolder, whose name is the number of the pause (`Clip.index`), from 0:
-
-* ``shapes/000001/cup/mask.png``: the mask of an object in the image of pause 1, nonzero on the object.
-* ``shapes/000001/cup/a.ply``, ``.../cup/b.npz``: shapes of the object. Each hypothesis draws one shape.
-* ``shapes/000001/cup/weights.json``: optional weights of the shapes, for example {"a.ply": 2, "b.npz": 1}.
-
-A shape is in metres, in the frame of the camera (x right, y down, z forward) or of the world. The file types are:
-
-* ``.ply``, ``.obj``, ``.stl``, ``.off``: a mesh, or a point cloud (ply without triangles), read by open3d.
-* ``.npz``: ``points`` (n, 3), or ``occupancy`` (A, B, C), the probabilities of voxels with edge ``voxel_size``.
-  ``origin`` (3,) is the corner with the smallest coordinates, and the axes are those of the frame.
-
-A mesh occupies a voxel if the voxel's centre is inside the mesh. The centre is inside if rays in at least two of
-three directions cross the mesh an odd number of times, so small holes have no effect. A point cloud occupies the
-voxels that contain a point, and the space that these voxels enclose.
+The page "Your own front end" of the documentation describes the files.
 """
 
 from __future__ import annotations

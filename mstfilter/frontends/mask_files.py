@@ -5,21 +5,7 @@
 >>> len(masks.trees), masks.weights
 (2, array([0.7, 0.3]))
 
-The files and subfolders are numbered by pause (`Clip.index`), from 0:
-
-* ``masks/000000.png``: one segmentation of the image at pause 0.
-* ``masks/000001/a.png``, ``b.npz``: alternative segmentations of the whole image at pause 1.
-* ``masks/000001/weights.json``: optional weights of the alternatives, for example {"a.png": 2, "b.npz": 1}.
-
-A file has one set of masks with the shape of the image, disjoint or nested (`mstfilter.frontends.mask_trees`):
-
-* ``.png``: label image, 8 or 16 bits, in which 0 means no mask.
-* ``.npz``: ``labels`` (H, W) integer, or ``masks`` (n, H, W) bool; optional ``scores`` (n,) of the masks, or of the
-  labels in ascending order.
-
-Scores are at least 0. Missing scores are 1. Without weights.json, the weight of an alternative is the mean score of
-the masks that no other mask contains. Weights need not sum to 1. If several objects are independently uncertain, use
-nested masks in one alternative.
+The page "Your own front end" of the documentation describes the files.
 """
 
 from __future__ import annotations

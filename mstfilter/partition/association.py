@@ -18,18 +18,10 @@ A predicted object is continued by at most one segment of its connected componen
 2. The second rule considers all segments. A segment continues the object if it has more than half of those readings
    of the object that lie in any segment.
 
-The rules have consequences:
-
-- If a predicted object is *split* and no segment has enough readings of the object, no segment continues the object.
-  The track of a split object then ends, its views are deleted, and the segments are new objects.
-- If several objects are *merged* into one segment, the segment continues all these objects.
-- A segment that continues no object is a new object.
-
 A predicted object in no conflict is *occluded*. Depth readings that belong to no segment are never counted.
 
-A predicted object is *lost* if the frame refutes the object or if no segment continues the object. A lost object may
-be elsewhere in the image. `recognised` compares the lost objects with the new objects by colours and visible area. A
-recognised object keeps its identity, but loses its earlier views, because its motion is unknown.
+A predicted object is *lost* if the frame refutes the object or if no segment continues the object. `recognised`
+compares the lost objects with the new objects. A recognised object keeps its identity, but loses its earlier views.
 """
 
 from __future__ import annotations

@@ -3,19 +3,7 @@
 >>> run = RunFolder.open("runs/demo")
 >>> run.n_pauses, run.hypotheses(0), run.info(0)
 
-=======================  =============================================================================================
-run.json                 configuration, seed, versions, recording, status
-pauses/000/rgb.png       image at the pause
-pauses/000/camera.json   camera with its pose at the pause
-pauses/000/state.npz     particles and log weights
-pauses/000/info.json     statistics of the step
-pauses/000/truth.npz     true labels, if known
-pauses/000/instance.png  true label image, if known
-pauses/000/seconds.json  wall time by component
-pauses/000/SHA256SUMS    hashes of the files of the pause without seconds.json
-metrics.csv, SHA256SUMS  table with one row per pause and hypothesis, and the hash of this table
-compare/without-past     run folders of other filters on the same recording, if requested
-=======================  =============================================================================================
+The page "Runs and reports" of the documentation lists the files.
 
 The folder of a pause has a temporary name until it is complete, so a stopped run has only complete pauses.
 `filter_recording` resumes from state.npz of the last complete pause. `mstfilter.scene.encode_hypotheses` makes the

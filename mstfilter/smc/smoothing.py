@@ -4,13 +4,8 @@
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
 >>> [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_T], t = 0 .. T
 
-Three smoothers take a `Record` and return a tuple with one population per time:
-
-- `genealogy` follows the ancestors of the last particles (Kitagawa 1996). After many resamplings, all paths have the
-  same early states (path degeneracy).
-- `fixed_lag` follows the ancestors of the particles `lag` steps later (Kitagawa and Sato 2001). It is biased if a
-  state depends on observations more than `lag` steps later.
-- `backward_paths` draws paths backwards by the density of the transition, without path degeneracy.
+`genealogy`, `fixed_lag` and `backward_paths` take a `Record` and return a tuple with one population per time. The
+page "Smoothing" of the documentation compares them.
 
 The smoothers accept any properly weighted filter, including filters with guided moves, a lookahead or rejuvenation.
 

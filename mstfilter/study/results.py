@@ -3,19 +3,7 @@
 >>> folder = StudyFolder.open("studies/first")
 >>> folder.description["reference"], len(folder.rows())
 
-================  =====================================================================================
-study.json        description, code, libraries, machine, arms with their configuration, scenes, seeds,
-                  the folder of every run
-runs/NAME/        one `RunFolder` per run; result.json: its metrics, or why it failed; forecasts.npz:
-                  numbers of its forecasts, by forecast and outcome
-runs.csv          one row per pause and run: metrics first, time and memory last
-summary.csv       one row per family, arm and metric: mean over scenes and its interval
-differences.csv   every arm minus the reference: paired differences, intervals, p values, conclusions
-summary.tex, .md  means of the primary endpoints and times, for a text in LaTeX or Markdown
-differences.tex   differences of the primary endpoints, also differences.md
-failures.csv      runs that failed, and why
-logs/             output of the workers
-================  =====================================================================================
+The page "Studies" of the documentation lists the files.
 """
 
 from __future__ import annotations
