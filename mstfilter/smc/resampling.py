@@ -282,16 +282,9 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 
 
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) indices drawn independently by weights (..., m).
-
-    The order of the indices is not random. If n < 2000, the indices are sorted; otherwise the time is O(m + n).
-    """
-    if n < 2000:
-        points = ordered_uniforms(rng, n, weights.shape[:-1])
-        return search(weights, points) if weights.ndim == 1 else np.stack(list(map(search, weights, points)))
-    if weights.ndim == 2:
-        return np.stack([_draws_by_strata(g, w, n) for g, w in zip(rng.generators(), weights, strict=True)])
-    return _draws_by_strata(rng, weights, n)
+    """(..., n) indices, sorted, drawn independently by weights (..., m)."""
+    points = ordered_uniforms(rng, n, weights.shape[:-1])
+    return search(weights, points) if weights.ndim == 1 else np.stack(list(map(search, weights, points)))
 
 
 def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = ()) -> np.ndarray:
@@ -308,70 +301,3 @@ def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
     index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
     return np.minimum(index, cumulative.searchsorted(cumulative[-1]))
-
-
-#: Bit generators whose `random_raw` returns 64 random bits. MT19937 returns 32.
-_RAW_64_BITS = (np.random.PCG64, np.random.PCG64DXSM, np.random.Philox, np.random.SFC64)
-
-
-def _draws_by_strata(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
-    """(n,) indices drawn independently by weight. Uniform points are first distributed among equal strata of [0, 1).
-
-    For 10^6 points, the function is four times as fast as a binary search. Each stratum is divided into bins. The
-    number of cumulative weights in the bins below that of a point is a lower bound of the index, which is then
-    increased if necessary.
-    """
-    # Strata have width 2^bits and up to 2^14 points, so that their tables stay in cache.
-    bits = 62 - max(n.bit_length() - 14, 0)
-    limits = [k << bits for k in range((1 << (62 - bits)) + 1)]
-    cumulative = _fixed_point(weights, limits[-1])
-    stops = cumulative.searchsorted(limits, side="right").tolist()
-    stops[-1] = int(cumulative.searchsorted(limits[-1]))
-    sizes = rng.multinomial(n, np.full(len(limits) - 1, 1 / (len(limits) - 1))).tolist()
-    # log2 of the width of a bin; the largest stratum has one to two bins for each point.
-    shift = bits - max(sizes).bit_length()
-    n_bins = 1 << (bits - shift)
-    below = np.empty(n_bins + 1, np.int64)
-    index, begin = np.empty(n, np.int64), 0
-    for k, size in enumerate(sizes):
-        if isinstance(rng.bit_generator, _RAW_64_BITS):
-            points = (rng.bit_generator.random_raw(size) >> np.uint64(64 - bits)).view(np.int64)
-        else:
-            points = rng.integers(0, 1 << bits, size)
-        bins = (cumulative[stops[k] : stops[k + 1]] >> shift) - (limits[k] >> shift)
-        counts = np.bincount(bins, minlength=n_bins)
-        below[0], below[1:] = stops[k], counts[:n_bins]  # an edge at the end of the stratum lies beyond its bins
-        np.cumsum(below, out=below)
-        found = index[begin : begin + size]
-        below.take(points >> shift, out=found, mode="clip")
-        points += limits[k]
-        _increase(found, cumulative, points)
-        begin += size
-    return index
-
-
-def _fixed_point(weights: np.ndarray, total: int) -> np.ndarray:
-    """(m,) int64 cumulative weights that end at `total`, at most 2^62.
-
-    Sums of integers are exact, and are computed four times as fast as sums of floats.
-    """
-    cumulative = np.empty(len(weights), np.int64)
-    np.multiply(weights, total / weights.sum(), out=cumulative, casting="unsafe")
-    np.cumsum(cumulative, out=cumulative)
-    np.minimum(cumulative, total, out=cumulative)
-    cumulative[cumulative.searchsorted(cumulative[-1]) :] = total  # ends at the last particle of positive weight
-    return cumulative
-
-
-def _increase(index: np.ndarray, edges: np.ndarray, points: np.ndarray) -> None:
-    """Increase lower bounds of ``searchsorted(edges, points, side="right")`` to the exact values, in place."""
-    low = np.flatnonzero(edges.take(index) <= points)
-    at, points = index.take(low), points.take(low)
-    for _ in range(6):
-        at += 1
-        index[low] = at
-        more = np.flatnonzero(edges.take(at) <= points)
-        if not len(more):
-            return
-        low, at, points = low.take(more), at.take(more), points.take(more)
-    index[low] = edges.searchsorted(points, side="right")
