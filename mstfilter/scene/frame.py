@@ -297,8 +297,11 @@ class Frame:
         key = content_key("frame", self.rgb, self.depth, self.camera.key, robot, *estimated)
         return content_key("views", key, *(view.key for view in self.views)) if self.views else key
 
-    def resized(self, camera: Camera) -> Frame:
-        """The frame in the image size of a camera, without views. Depth is taken from the nearest pixel."""
+    def resized(self, camera: Camera, centred: bool = True) -> Frame:
+        """The frame in the image size of a camera, without views.
+
+        Depth is taken from the pixel at the centre of the new pixel, or at its upper left corner if not `centred`.
+        """
         if camera is self.camera:
             return self
         import cv2
@@ -306,10 +309,10 @@ class Frame:
         size = camera.width, camera.height
         if size == (self.camera.width, self.camera.height):
             return Frame(self.rgb, self.depth, camera, self.robot_mask)
-        robot = self.robot_mask
+        robot, rule = self.robot_mask, cv2.INTER_NEAREST_EXACT if centred else cv2.INTER_NEAREST
         if robot is not None:
-            robot = cv2.resize(robot.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
-        depth = cv2.resize(self.depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+            robot = cv2.resize(robot.astype(np.uint8), size, interpolation=rule) > 0
+        depth = cv2.resize(self.depth, size, interpolation=rule)
         return Frame(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA), depth, camera, robot)
 
     @property

@@ -214,9 +214,9 @@ class BorderNetwork:
 
 
 def reduced(frame: Frame) -> Frame:
-    """The frame with `RASTER` pixels per row and a camera pose. Depth is taken from the nearest pixel."""
+    """The frame with `RASTER` pixels per row and a camera pose, reduced as in the training of the network."""
     camera = posed_camera(frame)
-    return frame.resized(camera if camera.width == RASTER else camera.scaled(RASTER / camera.width))
+    return frame.resized(camera if camera.width == RASTER else camera.scaled(RASTER / camera.width), centred=False)
 
 
 @load_once
