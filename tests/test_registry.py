@@ -255,3 +255,10 @@ def test_hints_are_shown_in_python_too():
 def test_no_preset_is_properly_weighted():
     for name in preset_names():
         assert not build_filter(load_config(name)).properly_weighted
+
+
+def test_dates_are_texts():
+    assert (
+        load_config("mst", ["proposal=mask_folder", "proposal.folder=2024-01-05"])["proposal"]["folder"]
+        == "2024-01-05"
+    )

@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Extrude
-from mstfilter.fields import NonNegativeFloat
+from mstfilter.fields import NonNegativeFloat, Share
 from mstfilter.scene import Clip, Frame, FreeSpace, Hypothesis, Projection, log_quality, scaled_area
 from mstfilter.scoring import connected_components, one_blob
 from mstfilter.segmentation import ObjectRule, TreeCutProposal, complete_segments, connected_pixels, hypothesis_of
@@ -130,7 +130,7 @@ class Floor(Proposal):
 
     completer: Completer = field(default_factory=Extrude)
     objects: ObjectRule = field(default_factory=ObjectRule)
-    threshold: float = 0.5
+    threshold: Share = 0.5
 
     properly_weighted: ClassVar[bool] = False
 

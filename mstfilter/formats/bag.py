@@ -16,6 +16,7 @@ encoding 32FC1 is in metres. Compressed depth is a PNG. In the transport ``compr
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 import weakref
 from collections import Counter
@@ -201,7 +202,7 @@ def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.
 
 
 def _metres(units: np.ndarray, depth_scale: float) -> np.ndarray:
-    """Depth in metres of an image (H, W) uint16. The values 0 and 65535 mean that the pixel has no reading."""
+    """Depth in metres of an image (H, W) uint16; NaN for the value 65535, which means that there is no reading."""
     return np.where(units < 65535, units * np.float32(depth_scale), np.float32(np.nan))
 
 
@@ -259,7 +260,7 @@ class _Stream:
     @property
     def rectified(self) -> bool:
         """Whether the images are rectified, by the convention of image_proc: ``image_rect``, ``image_rect_color``."""
-        return "rect" in self._parts[-1]
+        return any(re.search(r"(^|_)rect(_|ified|$)", part) for part in self._parts)
 
 
 @dataclass(frozen=True)

@@ -301,8 +301,7 @@ def _paired(
 ) -> tuple[list[tuple[Path, Path]], tuple[float, ...]]:
     """Pairs of files, and the times of the pairs in seconds; no times if the names are frame numbers."""
     numbers = [[_number(file) for file in files] for files in (colour, depth)]
-    decimals = any(number.as_tuple().exponent != 0 for side in numbers for number in side)
-    seconds = [[_seconds(n) or (n if decimals else None) for n in side] for side in numbers]
+    seconds = [_times(side) for side in numbers]
     if all(value is not None for side in seconds for value in side):
         stamps = [[float(value - seconds[0][0]) for value in side] for side in seconds]  # type: ignore[operator]
         chosen = pair_stamps(stamps[0], stamps[1], tolerance_s, str(path))
@@ -321,6 +320,12 @@ def _paired(
                 "an image is missing, or the two are numbered differently; rename one side to match",
             )
     return list(zip(colour, depth, strict=True)), ()
+
+
+def _times(numbers: list[Decimal]) -> list[Decimal | None]:
+    """Time stamps in seconds. If a number has decimals, numbers without decimals are seconds too."""
+    decimals = any(number.as_tuple().exponent != 0 for number in numbers)
+    return [_seconds(n) or (n if decimals and n >= 0 else None) for n in numbers]
 
 
 def _seconds(number: Decimal) -> Decimal | None:

@@ -126,7 +126,7 @@ class PartitionUpdate(Update):
         Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
         are built.
     quality_exponent : float
-        Exponent lambda of Q, A and q. If lambda is 0, R is 1 and every occluded object is kept.
+        Exponent lambda of Q, A and q. If lambda is 0, every occluded object is kept.
     n_candidates : int
         Largest number of candidates after the first pause. 0 means 20 for each predicted hypothesis.
     n_scored : int

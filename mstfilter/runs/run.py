@@ -243,11 +243,10 @@ def _hash_of(path: Path, pattern: str = "*") -> str:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
-    """All files below a folder, also below links to folders. Links that form a cycle are followed once."""
-    seen: set[str] = set()
+    """All files below a folder, also below links to folders. A link to a folder that contains it is not followed."""
     for path, folders, names in os.walk(folder, followlinks=True):
-        if (real := os.path.realpath(path)) in seen:
+        above = {os.path.realpath(parent) for parent in Path(path).parents}
+        if os.path.islink(path) and os.path.realpath(path) in above:
             folders.clear()
         else:
-            seen.add(real)
             yield from (Path(path) / name for name in names)

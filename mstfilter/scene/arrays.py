@@ -9,11 +9,14 @@ import inspect
 import pickle
 from collections.abc import Mapping
 from enum import Enum
+from functools import cached_property, partial
 from pathlib import PurePath
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, MappingProxyType
 from typing import Any
 
 import numpy as np
+
+_MANY = 1000  # entries of a container beyond which it is hashed as a whole
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -60,49 +63,70 @@ def component_key(component: object) -> bytes:
     return content_key(component)
 
 
-def _code(cls: type) -> str:
-    """The methods and class attributes of a user-defined class, as text."""
-    return _described(cls, "", set())
+def _code(cls: type) -> bytes | str:
+    """A hash of the methods and class attributes of a user-defined class; "" for a class of this package."""
+    return _described(cls, "", set()) if _own_bases(cls) else ""
 
 
-def _described(value: Any, module: str, seen: set[int]) -> str:
-    """Text of a value on which the code of a user depends. `module` is the module of the code that names the value.
+def _own_bases(cls: type) -> list[type]:
+    return [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")]
 
-    The text of a function includes its defaults, and the values that the function names. Instances of other classes,
-    and the inner parts of functions of other modules, are left out.
+
+def _described(value: Any, module: str, seen: set[int]) -> bytes:
+    """A hash of a value that the code of a user names. `module` is the module of this code ("" for any).
+
+    The hash of a function includes its defaults, the cells of its closure, and the global values that the function
+    names. Functions of other modules are known by their code alone. Containers count with their present content.
+    Instances of other classes are left out.
     """
     if isinstance(value, np.ndarray):
-        return content_key(value).hex()
-    if isinstance(value, (str, bytes, int, float, complex, np.generic, type(None))):
-        return repr(value)
-    if isinstance(value, Mapping):
-        return "".join(_described(part, module, seen) for item in value.items() for part in item)
-    if isinstance(value, (tuple, list, set, frozenset)):
-        parts = [_described(part, module, seen) for part in value]
-        return "".join(parts if isinstance(value, (tuple, list)) else sorted(parts))
-    if id(value) in seen or (module not in ("", getattr(value, "__module__", module)) and isinstance(value, type)):
-        return ""
-    if isinstance(value, type):
+        return content_key(value if value.dtype.kind in "biufcSU" else repr(value.tolist()))
+    if isinstance(value, (str, bytes, int, float, complex, np.generic, PurePath, Enum, range, type(None))):
+        return content_key(repr(value))
+    if id(value) in seen:
+        return b""
+    inner: Any = ()
+    if isinstance(value, (dict, MappingProxyType)):
+        inner = [part for item in value.items() for part in item]
+    elif isinstance(value, (tuple, list, set, frozenset)):
+        inner = value
+    elif isinstance(value, property):
+        inner = value.fget, value.fset
+    elif isinstance(value, (staticmethod, classmethod)):
+        inner = (value.__func__,)
+    elif isinstance(value, cached_property):
+        inner = (value.func,)
+    elif isinstance(value, partial):
+        inner = value.func, value.args, value.keywords
+    elif isinstance(value, FunctionType):
+        return _described_function(inspect.unwrap(value), module, seen)
+    elif isinstance(value, type) and module in ("", value.__module__):
         seen.add(id(value))
-        own = [
-            base for base in value.__mro__ if base.__module__.split(".")[0] not in ("mstfilter", "builtins", "abc")
-        ]
-        items = ((base.__module__, *item) for base in own for item in vars(base).items())
+        items = [(base.__module__, *item) for base in _own_bases(value) for item in vars(base).items()]
         chosen = [item for item in items if isinstance(item[2], FunctionType) or not item[1].startswith("__")]
-        return "".join(name + _described(part, of, seen) for of, name, part in chosen)
-    inner = getattr(value, "fget", None) or getattr(value, "func", None) or getattr(value, "__func__", value)
-    inner = inspect.unwrap(inner) if callable(inner) else inner  # methods whose results are checked
-    if not isinstance(inner, FunctionType) or id(inner) in seen:
-        return ""
-    text = _text(inner.__code__)
-    if module != inner.__module__:
-        return text
-    seen.add(id(inner))
-    closure = inspect.getclosurevars(inner).nonlocals
-    named = [inner.__globals__.get(name) for name in _names(inner.__code__)]
-    for part in (inner.__defaults__, inner.__kwdefaults__, closure, named):
-        text += _described(part, module, seen)
-    return text
+        return content_key(*(part for of, name, v in chosen for part in (name, _described(v, of, seen))))
+    if not inner:
+        return b""
+    if isinstance(value, (list, dict)):
+        seen.add(id(value))  # they may contain themselves
+    if len(inner) > _MANY:
+        with contextlib.suppress(Exception):
+            return content_key(pickle.dumps(value))
+    parts = [_described(part, module, seen) for part in inner]
+    return content_key(type(value).__name__, *(sorted(parts) if isinstance(value, (set, frozenset)) else parts))
+
+
+def _described_function(function: Any, module: str, seen: set[int]) -> bytes:
+    code = _text(function.__code__)
+    if id(function) in seen or module != function.__module__:
+        return content_key(code)
+    seen.add(id(function))
+    values = [function.__defaults__, function.__kwdefaults__]
+    values += [function.__globals__.get(name) for name in _names(function.__code__)]
+    for cell in function.__closure__ or ():
+        with contextlib.suppress(ValueError):  # a cell without a value
+            values.append(cell.cell_contents)
+    return content_key(code, *(_described(value, module, seen) for value in values))
 
 
 def _names(code: CodeType) -> list[str]:

@@ -309,7 +309,7 @@ def _other_support(first: Look) -> Iterator[Finding]:
 def _level(first: Look) -> tuple[float, float, np.ndarray] | None:
     """The plane of the most frequent height above `_TALL`, as `Look.plane` returns it."""
     heights = first.points[:, 2]
-    counts, edges = np.histogram(heights, np.arange(_TALL, max(heights.max(), _TALL) + 0.1, 0.05))
+    counts, edges = np.histogram(heights, np.arange(_TALL, np.clip(heights.max(), _TALL, 30.0) + 0.1, 0.05))
     k = counts.argmax()
     return first.plane((heights > edges[k] - 0.05) & (heights < edges[k + 1] + 0.05))
 

@@ -5,7 +5,13 @@
 >>> found = {scene: counts}                                    # counts: belief.counts, summed over pauses
 >>> leave_one_out(found)["scene-3"].log_loss(found["scene-3"]) # recalibrated, in nats
 
-The page "Scores" of the documentation explains why forecasts are recalibrated, with noise at the borders.
+**Log loss.** A proper score without recalibration rewards noise. Hypotheses that consist only of labels have no
+uncertainty of shape, and noise at the borders makes wrong forecasts less certain. Forecasts are therefore
+recalibrated by isotonic regression, fitted to other scenes. The score is the mean log loss in nats; lower is
+better. Before recalibration, the score itself adds noise at the borders if noise lowers the loss on the other
+scenes. So a method gains nothing by adding noise at the borders (docs/history.md has a study of all methods). The
+score measures how well forecasts distinguish the answers yes and no. Noise of another kind, or noise at a higher
+rate than the largest of `NOISE_RATES`, can still give a small gain.
 """
 
 from __future__ import annotations

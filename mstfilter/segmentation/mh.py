@@ -4,6 +4,11 @@ The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(
 sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The target with a
 `temperature` is for values that are log odds (`MergeLogOdds`), which need no scale.
 
+- ``mst`` uses ``MetropolisHastingsCuts(temperature=1)``, one chain with MoveNode and subtree redraws.
+- ``paper`` uses ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
+- ``authors`` uses ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20, moves="authors", restart=True,
+  include_optimal=True, redraw_repeated=True)``.
+
 >>> sample = MetropolisHastingsCuts().sample(np.random.default_rng(0), tree, w, 5)
 >>> sample.diagnostics["acceptance"], sample.diagnostics["autocorrelation_steps"]
 

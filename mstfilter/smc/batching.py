@@ -323,7 +323,7 @@ class _Sweep:
 
     def wants(self, t: int, row: int) -> bool:
         """Whether the trigger resamples one run."""
-        return self.filter.trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t)
+        return bool(self.filter.trigger.wants(Population(of_runs(self.particles, row), self.log_weights[row]), t))
 
     def selected(self, t: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Ancestors (len(rows), n) and log weights of the runs `rows`, as `WeightResampler.select` returns them."""
@@ -338,10 +338,12 @@ class _Sweep:
         if np.shape(index) != (len(rows), n):
             raise NotTogether("resampler", f"step {t}: ancestors have shape {np.shape(index)}, not {(len(rows), n)}")
         for k in self.compared(t, "resampler", len(rows)):
-            run, (alone, weights) = int(self.runs[rows[k]]), self.selected_alone(t, int(rows[k]))
+            row = int(rows[k])
+            run, (alone, weights) = int(self.runs[row]), self.selected_alone(t, row)
             self.agree(t, "resampler", run, "ancestors", index[k], alone)
-            if found is not None and weights is not None:
-                self.agree(t, "resampler", run, "log weights", found[k], weights)
+            equal = np.full(n, self.log_mean[row])
+            ours, single = (equal if one is None else one for one in (None if found is None else found[k], weights))
+            self.agree(t, "resampler", run, "log weights", ours, single)
         return index, found
 
     def selected_alone(self, t: int, row: int) -> tuple[np.ndarray, np.ndarray | None]:

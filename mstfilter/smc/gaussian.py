@@ -51,7 +51,7 @@ def nonlinear_gaussian(
     m0 = np.asarray(m0, np.float64)
     p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
     moved, seen = _OfStep("f", f, len(m0)), _OfStep("h", h, r.size)
-    moves, sees = {**moved.parameters, **q.parameters}, {**seen.parameters, **r.parameters}
+    moves, sees = _merged(moved, q), _merged(seen, r)
 
     def transition(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
         return moved(x, step) + q.at(**step).draw(rng, len(x))
@@ -118,6 +118,12 @@ class _OfStep:
         if np.shape(found) != (len(x), self.size):  # numpy might broadcast it
             raise InputError(f"{self.name} returned shape {np.shape(found)}, expected ({len(x)}, {self.size})")
         return found
+
+
+def _merged(*parts: _Noises | _OfStep) -> dict[str, bool]:
+    """The parameters ``t`` and ``u`` of several parts. A parameter is required if a part requires it."""
+    names = {name for part in parts for name in part.parameters}
+    return {name: any(part.parameters.get(name, False) for part in parts) for name in sorted(names)}
 
 
 def entry(name: str, given: Any, t: int) -> Any:
@@ -295,4 +301,4 @@ def ukf_proposal(
         change = (gain @ (vector_of("the observation", y, r.size) - centre)[..., None])[..., 0]
         return MultivariateNormal(mean + change, Q - gain @ S @ np.swapaxes(gain, -1, -2))
 
-    return with_step(proposal, {**moved.parameters, **q.parameters, **seen.parameters, **r.parameters})
+    return with_step(proposal, _merged(moved, q, seen, r))

@@ -18,7 +18,8 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
@@ -135,10 +136,17 @@ def same_component(one: Any, other: Any) -> bool:
     """Whether two components are equal. Fields may be arrays, for which ``==`` of dataclasses raises an error."""
     if one is other:
         return True
-    try:
+    with suppress(Exception):
         return bool(one == other)
-    except ValueError:
-        return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    if is_dataclass(one):
+        return all(same_component(getattr(one, f.name), getattr(other, f.name)) for f in fields(one) if f.compare)
+    if isinstance(one, Mapping):
+        return one.keys() == other.keys() and all(same_component(one[name], other[name]) for name in one)
+    return isinstance(one, (tuple, list)) and len(one) == len(other) and all(map(same_component, one, other))
 
 
 class AtStep(Bounded):

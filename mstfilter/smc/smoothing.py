@@ -140,7 +140,8 @@ def backward_paths(
     for t in range(len(record) - 2, -1, -1):
         population = record.populations[t].realised()
         y, u = split_input(record.observations[t + 1])
-        move = _Move(population, path[-1].particles, transition.at_step(record.first + t + 1, u), y, t)
+        step = record.first + t
+        move = _Move(population, path[-1].particles, transition.at_step(step + 1, u), y, step)
         index = move.metropolis(rng, record.parents(t + 1)[index], steps) if method == "mcmc" else move.exact(rng, n)
         path.append(Population(take(population.particles, index)))
     return tuple(reversed(path))

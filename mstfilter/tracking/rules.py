@@ -292,7 +292,7 @@ class MstRule(MotionRule):
             return IDENTITY
         if self.select == "map":
             return candidates[int(scores.argmin())]
-        weights = np.exp(-0.5 * self.n_eff * (scores[finite] - scores.min()))
+        weights = np.exp(-0.5 * self.n_eff * (scores[finite] - scores[finite].min()))
         return candidates[int(rng.choice(finite, p=weights / weights.sum()))]
 
     def _estimates(self, rng: np.random.Generator, track: Track) -> Iterator[_Estimate]:

@@ -508,3 +508,11 @@ def test_arrays_of_depth_are_read_like_other_files(tmp_path):
     (tmp_path / "depth.npz").rename(path)
     with pytest.raises(InputError, match="expected one channel"):
         read_depth(path, 1.0)
+
+
+def test_numbers_are_not_paired_with_seconds(tmp_path):
+    path = write_rgb_and_depth(
+        tmp_path / "mine", lambda part, k: f"{k / 30:.3f}" if part == "depth" else f"{k:06d}", n=4
+    )
+    with pytest.raises(InputError, match="does not fit depth image"):
+        Redwood(world=WORLD).open(path)

@@ -198,7 +198,12 @@ def test_masks_below_a_link_count(recording, tmp_path):
     (tmp_path / "masks" / "loop").symlink_to(tmp_path / "masks", target_is_directory=True)
     filter = build_filter(load_config("mst_rules", ["proposal=mask_folder", f"proposal.folder={tmp_path / 'masks'}"]))
     before = component_files(filter)
+    again = tmp_path / "masks" / "again"
+    again.symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    twice = component_files(filter)
     next(path for path in (tmp_path / "elsewhere").iterdir() if path.is_file()).write_bytes(b"other")
+    assert before != twice != component_files(filter)
+    again.unlink()
     assert component_files(filter) != before
 
 

@@ -282,17 +282,21 @@ def test_a_class_of_the_user_is_known_by_its_code():
     named = CLASS.replace("FACTOR * v", "FACTOR * scaled(v)")
     texts = [f"FACTOR = {a}\ndef scaled(v):\n    return {b} * v\n{named}" for a, b in ((1, 1), (1, 2), (2, 1))]
     assert len({key(text) for text in texts}) == 3
-    for a, b in (
-        ("    padding = 1\n", "    padding = 2\n"),
-        ("    def more(self, k=1): pass\n", "    def more(self, k=2): pass\n"),
-        ("    def more(self, *, k=1): pass\n", "    def more(self, *, k=2): pass\n"),
-        ("    def more(self): return TABLE\nTABLE = [1]\n", "    def more(self): return TABLE\nTABLE = [2]\n"),
-        (
-            "    def more(self): return Inner\nclass Inner: r = 1\n",
-            "    def more(self): return Inner\nclass Inner: r = 2\n",
-        ),
+    more = "    def more(self): return GIVEN\nfrom functools import partial\nimport numpy\n"
+    for template, a, b in (
+        ("    padding = {}\n", "1", "2"),
+        ("    padding = {}\n", "1, 11", "11, 1"),
+        ("    def more(self, k={}): pass\n", "1", "2"),
+        ("    def more(self, *, k={}): pass\n", "1", "2"),
+        ("    def more(self): return A + B\nA, B = {}\n", "1, 11", "11, 1"),
+        (more + "class GIVEN: r = {}\n", "1", "2"),
+        (more + "GIVEN = [{}]\nGIVEN.append(GIVEN)\n", "1", "2"),
+        (more + "GIVEN = {}\n", "list(range(5000))", "[9] * 5000"),
+        (more + "GIVEN = partial(max, {})\n", "1", "2"),
+        (more + "GIVEN = numpy.array([{}], 'M8[s]')\n", "1", "2"),
     ):
-        assert key(CLASS + a) != key(CLASS + b) == key(CLASS + b)
+        first, again, other = (key(CLASS + template.format(value)) for value in (a, a, b))
+        assert first == again != other, template
     values = [content_key(value) for value in astuple(Extrude())]
     assert component_key(Extrude()) == content_key("mstfilter.completion.extrude", "Extrude", "", b"", *values)
 

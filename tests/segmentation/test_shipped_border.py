@@ -6,8 +6,9 @@ import numpy as np
 
 from mst_training.border_data import BorderSamples, targets
 from mstfilter.resources import models_folder
+from mstfilter.scene import Camera, Frame, look_at
 from mstfilter.segmentation import BorderTree, ColourDepthBoundary
-from mstfilter.segmentation.border_network import encode_image, load_border_network, near_objects
+from mstfilter.segmentation.border_network import encode_image, load_border_network, near_objects, reduced
 from tests.experiments.scripts import EXPERIMENTS, own_modules
 from tests.segmentation.scenes import TOUCHING, frame_of
 
@@ -65,3 +66,14 @@ def test_size_and_card():
     card = (models_folder() / "border/README.md").read_text()
     for part in ("mstfilter train border", "MIT", "not used in training", "Limits"):
         assert part in card
+
+
+def test_the_network_sees_the_depth_images_of_its_training():
+    """Every second pixel, from the first one, of an image of 640 columns."""
+    depth = np.arange(480 * 640, dtype=np.float32).reshape(480, 640) / 1e6 + 0.5
+    frame = Frame(
+        np.zeros((480, 640, 3), np.uint8),
+        depth,
+        Camera.from_intrinsics(525, 525, 319.5, 239.5, 640, 480, look_at((0, -0.6, 0.5), (0, 0, 0))),
+    )
+    np.testing.assert_array_equal(reduced(frame).depth, depth[::2, ::2])

@@ -471,12 +471,35 @@ class TooFew(WeightResampler):
         return Systematic().select(rng, log_weights, 1)
 
 
+@dataclass(frozen=True)
+class HeavyIfAlone(WeightResampler):
+    """Wrong: the log weights of a run depend on whether it is alone."""
+
+    batched: ClassVar[bool] = True
+
+    def select(self, rng, log_weights, n):
+        index, _ = Systematic().select(rng, log_weights, n)
+        return index, None if log_weights.ndim == 2 else np.full(n, 3.0)
+
+
+@dataclass(frozen=True)
+class OneBool(Trigger):
+    """Right: one answer for all runs, as an array of one entry."""
+
+    batched: ClassVar[bool] = True
+
+    def wants(self, population, t):
+        return np.array([t % 2 == 0])
+
+
 YS = [0.1, 1.0, -2.0, 0.3, 0.2, 0.1]
 FAR = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 0.3))
 
 
 @pytest.mark.parametrize(
-    ("slot", "component"), [("trigger", SpreadOfAllRuns()), ("resampler", ScaledByAllRuns())], ids=str
+    ("slot", "component"),
+    [("trigger", SpreadOfAllRuns()), ("resampler", ScaledByAllRuns()), ("resampler", HeavyIfAlone())],
+    ids=str,
 )
 def test_triggers_and_resamplers_that_mix_runs_are_refused(slot, component):
     with pytest.raises(InputError, match=rf"step \d, {slot}"):
@@ -490,3 +513,11 @@ def test_a_resampler_of_another_size_is_run_one_by_one():
         runs = run_many(filter, YS, range(3))
     expected = [filter.run(YS, seed)[0].log_evidence for seed in range(3)]
     np.testing.assert_array_equal(runs["log_evidence"][:, -1], expected)
+
+
+def test_a_trigger_may_return_one_entry():
+    filter = replace(bootstrap(FAR, 8), trigger=OneBool())
+    runs = run_many(filter, YS, range(3))
+    np.testing.assert_array_equal(
+        runs["log_evidence"][:, -1], [filter.run(YS, seed)[0].log_evidence for seed in range(3)]
+    )

@@ -78,13 +78,17 @@ class Of(Distribution):
 
 
 class Peaks:
-    """Two narrow peaks that are far apart."""
+    """Narrow peaks that are far apart."""
+
+    def __init__(self, n):
+        self.centres = 100.0 * np.arange(n)
 
     def rvs(self, size, random_state):
-        return random_state.normal(0, 0.01, size) + 100.0 * random_state.integers(0, 2, size)
+        return random_state.normal(0, 0.01, size) + self.centres[random_state.integers(0, len(self.centres), size)]
 
     def logpdf(self, x):
-        return np.logaddexp(stats.norm(0, 0.01).logpdf(x), stats.norm(100, 0.01).logpdf(x)) - np.log(2)
+        each = stats.norm(self.centres[:, None], 0.01).logpdf(np.ravel(x))
+        return np.logaddexp.reduce(each, axis=0).reshape(np.shape(x)) - np.log(len(self.centres))
 
 
 def run_with(distribution, seed):
@@ -104,7 +108,11 @@ SKEWED = {
     "lognormal": stats.lognorm(2.0),
     "Pareto": stats.pareto(1),
     "exponential": stats.expon(),
-    "peaks": Peaks(),
+    "two peaks": Peaks(2),
+    "many peaks": Peaks(150),
+    "poles": stats.beta(0.1, 0.1),
+    "almost a point": stats.gamma(0.01),
+    "tiny": stats.norm(0, 1e-160),
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -31,7 +31,7 @@ from mstfilter.smc import (
     path_log_prob,
     run_many,
 )
-from mstfilter.smc.inputs import step_parameters
+from mstfilter.smc.inputs import same_component, step_parameters
 from tests.smc.models import mean_ratio
 
 YS = [0.3, -0.2, None, 1.1, 0.4]
@@ -258,3 +258,22 @@ def test_what_exact_models_reject():
         kalman_filter(*one, [0.1], B=[1.0])
     with pytest.raises(InputError, match=r"transition has shape \(2, 1, 1\)"):
         forward_backward([1.0], np.ones((2, 1, 1)), lambda y: np.zeros(1), [0])
+
+
+@dataclass(frozen=True)
+class Inner:
+    mean: object
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: object
+    hidden: object = field(default=0, compare=False)
+
+
+def test_components_with_arrays_are_compared_field_by_field():
+    a, b, c = np.array([0.0, 1.0]), np.array([0.0, 1.0]), np.array([2.0, 1.0])
+    for make in (Inner, lambda x: Outer(Inner(x)), lambda x: Outer({"m": x}), lambda x: Outer((x, [x])), lambda x: x):
+        assert same_component(make(a), make(b))
+        assert not same_component(make(a), make(c))
+    assert same_component(Outer(a, 1), Outer(b, 2)) and not same_component(Inner(a), Outer(a))
