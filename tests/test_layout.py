@@ -74,7 +74,7 @@ def source_of(module: str, name: str) -> str:
 
 def test_the_package_does_not_grow():
     """A new capability replaces code more often than it adds some. Lower a bound when code is removed."""
-    assert n_lines(FILES) <= 37_132
+    assert n_lines(FILES) <= 37_139
     assert len(FILES) <= 176
     smc = [path for path in FILES if path.is_relative_to(PACKAGE / "smc") and path.name != "__init__.py"]
     smc = [path for path in smc if not path.is_relative_to(PACKAGE / "smc" / "testing")]  # contracts

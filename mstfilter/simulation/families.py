@@ -58,6 +58,9 @@ class SceneFamily(Bounded):
     fps: Annotated[float, Bounds(at_least=0.5, at_most=60.0)] = 5.0  #: frames per second
     push_speed: Annotated[float, Bounds(at_least=0.01, at_most=0.5)] = 0.10  #: speed of the finger, m/s
     min_moved: PositiveInt = 2  #: objects that an action should move; fewer if no candidate push moves as many
+    #: Objects that an action should topple or turn by more than 75 degrees; fewer if no candidate push does. With 0,
+    #: pushes that topple objects are avoided.
+    min_toppled: NonNegativeInt = 0
     #: Displacement from which an object counts as moved, metres.
     move_threshold: Annotated[float, Bounds(at_least=0.0001, at_most=0.5)] = 0.02
     n_candidates: PositiveInt = 24  #: a push is chosen from at most 4 `n_candidates` simulated pushes
@@ -141,6 +144,8 @@ _STUDIED = SceneFamily(
     name="s1", n_objects_min=5, n_objects_max=5, n_twins=1, n_stacked=1, contact=0.8, catalogue="by seed", n_actions=4
 )
 
+_S2 = replace(_STUDIED, name="s2", n_objects_min=9, n_objects_max=9, n_twins=2, n_stacked=2, n_hidden=1, min_moved=3)
+
 _DEMO = SceneFamily(
     name="demo",
     n_objects_min=5,
@@ -166,12 +171,12 @@ SCENE_FAMILIES: dict[str, SceneFamily] = {
     ),
     "table": SceneFamily(name="table"),
     "s1": _STUDIED,
-    "s2": replace(
-        _STUDIED, name="s2", n_objects_min=9, n_objects_max=9, n_twins=2, n_stacked=2, n_hidden=1, min_moved=3
-    ),
+    "s2": _S2,
     "s3": replace(
         _STUDIED, name="s3", n_objects_min=15, n_objects_max=20, n_twins=4, n_stacked=4, n_hidden=3, min_moved=3
     ),
+    # Every push topples or turns an object, which shows sides that were hidden.
+    "topple": replace(_S2, name="topple", min_moved=1, min_toppled=1),
 }
 
 

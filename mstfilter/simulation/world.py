@@ -380,9 +380,10 @@ def draw_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily
 def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily) -> FingerPush:
     """Simulate candidate pushes and choose a push that moves objects. The world does not change.
 
-    The first candidate that moves `family.min_moved` objects and topples none is taken. If no candidate does so, the
-    candidate with the best balance of moved and toppled objects is taken. Candidates that drop an object or leave an
-    object in motion are discarded. Raises InputError if no candidate moves any object.
+    The first candidate that moves `family.min_moved` objects and topples `family.min_toppled` is taken. If the latter
+    is 0, the candidate must topple none. If no candidate does so, the candidate with the best balance of moved and
+    toppled objects is taken. Candidates that drop an object or leave an object in motion are discarded. Raises
+    InputError if no candidate moves any object.
     """
     saved = world.save()
     best: tuple[float, FingerPush] | None = None
@@ -398,9 +399,10 @@ def choose_push(rng: np.random.Generator, world: PhysicsWorld, family: SceneFami
         toppled = int((result.turned > np.deg2rad(75)).sum())
         if count == 0:
             continue
-        if count >= family.min_moved and toppled == 0:
+        wanted = family.min_toppled
+        if count >= family.min_moved and (toppled >= wanted if wanted else toppled == 0):
             return push
-        score = min(count, family.min_moved) - 0.7 * toppled
+        score = min(count, family.min_moved) + (min(toppled, wanted) if wanted else -0.7 * toppled)
         if best is None or score > best[0]:
             best = (score, push)
     if best is None:

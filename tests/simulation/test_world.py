@@ -121,3 +121,12 @@ def test_objects_that_do_not_fit_on_the_table():
             arrange_objects(rng, PhysicsWorld(objects.shapes), crowd, objects.twin_of)
     finally:
         arrangement._ATTEMPTS = kept
+
+
+def test_a_push_topples_if_the_family_wants_it():
+    turned = {}
+    for wanted in (0, 1):
+        world, _, rng = arranged(1)
+        family = replace(DEMO, min_moved=1, min_toppled=wanted)
+        turned[wanted] = play_push(world, choose_push(rng, world, family), family).turned.max()
+    assert turned[0] < np.deg2rad(75) < turned[1]
