@@ -74,7 +74,7 @@ class Completion:
         return replace(self, probability=read_only(odds / (odds + (1 - p))))
 
     def with_surface(self) -> Completion:
-        """The completion, with probability 1 for the voxels of the visible surface if no voxel reaches 0.5."""
+        """The completion, with probability 1 for voxels that contain readings if no voxel reaches 0.5."""
         p = self.probability
         return self if (p >= 0.5).any() else replace(self, probability=read_only(np.where(self.points > 0, 1, p)))
 

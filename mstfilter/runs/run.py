@@ -245,8 +245,7 @@ def _hash_of(path: Path, pattern: str = "*") -> str:
 def _files_below(folder: Path) -> Iterator[Path]:
     """All files below a folder, also below links to folders. A link to a folder that contains it is not followed."""
     for path, folders, names in os.walk(folder, followlinks=True):
-        above = {os.path.realpath(parent) for parent in Path(path).parents}
-        if os.path.islink(path) and os.path.realpath(path) in above:
+        if os.path.islink(path) and os.path.realpath(path) in map(os.path.realpath, Path(path).parents):
             folders.clear()
         else:
             yield from (Path(path) / name for name in names)

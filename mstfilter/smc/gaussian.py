@@ -286,11 +286,11 @@ def ukf_proposal(
     q, r = _Noises("Q", Q), _Noises("R", R)
     moved, seen = _OfStep("f", f, q.size), _OfStep("h", h, r.size)
     points = MerweScaledSigmaPoints(q.size, alpha, beta, kappa)
+    offsets_of = {noise: points.sigma_points(np.zeros(q.size), noise.covariance) for noise in q.entries}
 
     def proposal(x: np.ndarray, y: Any, **step: Any) -> MultivariateNormal:
-        Q, R = q.at(**step).covariance, r.at(**step).covariance
-        offsets = points.sigma_points(np.zeros(q.size), Q)
-        mean = moved(x, step)
+        noise, R = q.at(**step), r.at(**step).covariance
+        offsets, Q, mean = offsets_of[noise], noise.covariance, moved(x, step)
         sigma = mean[:, None] + offsets
         z = np.reshape(seen(sigma.reshape(-1, q.size), step), (*sigma.shape[:2], r.size))
         centre = np.einsum("s,nsk->nk", points.Wm, z)

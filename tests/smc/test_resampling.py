@@ -76,7 +76,7 @@ def hostile_weights(kind, m):
         weights = np.exp(6 * rng.standard_normal(m))
     elif kind == "one":
         weights[m // 2] = 1e6
-    elif kind == "equal":  # cumulative weights of a power of two of particles lie on the limits of strata
+    elif kind == "equal":
         weights[:] = 1.0
     return weights
 
