@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mstfilter.completion import ClipCompleter, Completer, Extrude
+from mstfilter.completion import Completer, Extrude
 from mstfilter.fields import NonNegativeFloat, Share
 from mstfilter.scene import Clip, Frame, FreeSpace, Hypothesis, Projection, log_quality, scaled_area
 from mstfilter.scoring import connected_components, one_blob
@@ -137,9 +137,7 @@ class Floor(Proposal):
     def occupied(self, rng: np.random.Generator, clip: Clip) -> np.ndarray:
         """Labels (X, Y, Z), 1 at all visible and completed voxels above the table."""
         found = self.objects.foreground(clip.after, clip.grid)
-        completer = self.completer
-        if isinstance(completer, ClipCompleter):
-            completer = completer.at(Clip((found.frame,), clip.grid, clip.index))
+        completer = self.completer.at(Clip((found.frame,), clip.grid, clip.index))
         completed = completer.complete(child(rng, "completion"), found.frame, [found.pixels], clip.grid)
         return hypothesis_of(completed, clip.grid, clip.index, self.threshold).labels
 

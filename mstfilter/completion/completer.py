@@ -152,6 +152,10 @@ class Completer(Checked, ABC):
             warn_once(self, "fill", fault, "`mstfilter check` tests the completer")
         return filled
 
+    def at(self, clip: Clip) -> Completer:
+        """The completer of the clip's last frame: the completer itself, unless it is a `ClipCompleter`."""
+        return self
+
     def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
         """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the voxel after the box."""
         # The surface may reach `depth` voxels behind the readings.

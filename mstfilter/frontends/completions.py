@@ -89,8 +89,7 @@ class ExternalCompletion(ClipCompleter, SurfaceOnly, UsesFiles):
     def at(self, clip: Clip) -> ExternalCompletion:
         """The completer with the shapes of the pause at the end of the clip."""
         found = read_shapes(self.folder, clip.index, clip.after.depth.shape)
-        other = self.other.at(clip) if isinstance(self.other, ClipCompleter) else self.other
-        return bound_to(self, _shapes=found, other=other)
+        return bound_to(self, _shapes=found, other=self.other and self.other.at(clip))
 
     def complete_each(
         self,

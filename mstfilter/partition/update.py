@@ -50,7 +50,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.special import logsumexp
 
-from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
+from mstfilter.completion import Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.fields import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from mstfilter.partition.association import Overlaps, recognised
 from mstfilter.partition.candidates import Choices, largest
@@ -302,7 +302,7 @@ class PartitionUpdate(Update):
 
         An object without readings and views keeps its predicted voxels outside free space.
         """
-        completer = self.completer.at(clip) if isinstance(self.completer, ClipCompleter) else self.completer
+        completer = self.completer.at(clip)
         views = [self._latest(*(track.views for track in one.tracks)) for one in objects]
         seen = [k for k, one in enumerate(objects) if one.readings.any() or views[k]]
         streams = [key.child(k).generator() for k in seen]

@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Literal
 import cv2
 import numpy as np
 
-from mstfilter.completion import ClipCompleter, Completer, Completion, Extrude, arbitrate, occupancy_of
+from mstfilter.completion import Completer, Completion, Extrude, arbitrate, occupancy_of
 from mstfilter.fields import Share
 from mstfilter.scene import (
     Clip,
@@ -220,7 +220,7 @@ def complete_segments(
     depend on the other segments. If the completer is stochastic, each further sample k of a segment gets a new shape,
     with the random stream ``"completion", segment, k``.
     """
-    completer = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
+    completer = completer.at(clip)
     times: Counter[int] = Counter()
     keys: list[tuple[tuple[int, ...], ...]] = []
     for segments in samples:

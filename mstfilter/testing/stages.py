@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import mstfilter.smc.testing as numbers
-from mstfilter.completion import ClipCompleter, Completer, ObservedBox, observed_box
+from mstfilter.completion import Completer, ObservedBox, observed_box
 from mstfilter.completion.completer import fault_of
 from mstfilter.crossover import Crossover, CrossoverUpdate, Structure
 from mstfilter.errors import InputError, InputWarning
@@ -203,7 +203,7 @@ def _estimated(
     completer: Completer, rng: np.random.Generator, seen: list[ObservedBox], clip: Clip, first: int = 0
 ) -> list[np.ndarray]:
     """The estimated probabilities in the boxes. Box k uses the random stream `first` + k."""
-    bound = completer.at(clip) if isinstance(completer, ClipCompleter) else completer
+    bound = completer.at(clip)
     with _quiet():
         return bound.estimate([child(rng, "box", first + k) for k in range(len(seen))], seen)
 
