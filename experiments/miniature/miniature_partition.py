@@ -118,6 +118,10 @@ class TableCompleter:
     table: np.ndarray
     log: list[tuple[np.ndarray, np.ndarray]] | None = None
 
+    def at(self, clip: RowClip) -> TableCompleter:
+        """The completer itself: the table is the same for every observation."""
+        return self
+
     def complete_each(
         self,
         rngs: Sequence[np.random.Generator],
