@@ -12,6 +12,7 @@ import tempfile
 import time
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ HERE = Path(__file__).resolve().parent
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 TURNED = {"ball", "bottle", "bowl", "can"}  # solids of revolution: the rotation about their axis is free
 FEW, NEAR, WRONG = 300, 10.0, 20.0  # pixels, mm, mm
+FAST = 25.0  # degrees from one frame to the next
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,11 @@ def error_mm(shape: Shape, points: np.ndarray, pose: np.ndarray, after: np.ndarr
     return round(1000 * float(np.linalg.norm(moved - points, axis=1).mean()), 2)
 
 
+def turned(T: np.ndarray) -> float:
+    """The angle of rotation of a motion (4, 4), in degrees."""
+    return round(float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))), 1)
+
+
 def measure(path: Path, transition: TrackingTransition) -> list[dict]:
     """One row for each object and clip of a simulated recording."""
     recording, manifest = open_recording(path), json.loads((path / "manifest.json").read_text())
@@ -94,14 +101,16 @@ def measure(path: Path, transition: TrackingTransition) -> list[dict]:
             candidates = rule.found.get(segments[k].key, ()) if k in segments else ()
 
             measured = partial(error_mm, shapes[k - 1], surfaces[k - 1], before[k], after[k])
-            cosine = np.clip((np.trace(T_true[:3, :3]) - 1) / 2, -1, 1)
+            poses = [recording.poses(frame)[k] for frame in range(first, last + 1)]
+            steps = [turned(b @ np.linalg.inv(a)) for a, b in pairwise(poses)]
             rows.append(
                 {
                     "recording": path.name,
                     "pause": t,
                     "object": k,
                     "shape": shapes[k - 1].name,
-                    "turned": round(float(np.degrees(np.arccos(cosine))), 1),
+                    "turned": turned(T_true),
+                    "turned_in_a_frame": max(steps),
                     "moved": measured(np.eye(4)),
                     "pixels": int(min(seen[0][k], seen[1][k])),
                     "error": measured(chosen[k]),
@@ -122,7 +131,7 @@ def group(row: dict) -> str:
 
 
 def table(rows: list[dict]) -> list[dict]:
-    """By class: numbers of objects, of objects within 10 mm of the truth, and with a candidate within 10 mm."""
+    """By class: numbers of objects within 10 mm of the truth, and of objects that turn fast between frames."""
     out = []
     for name in ("still", "turned < 20", "turned 20 - 60", "turned > 60", "few pixels", "hidden"):
         chosen = [row for row in rows if group(row) == name]
@@ -137,6 +146,11 @@ def table(rows: list[dict]) -> list[dict]:
                     "candidate_within_10_mm": int((np.array(best) <= NEAR).sum()),
                     "wrong_by_20_mm": int((errors > WRONG).sum()),
                     "median_mm": f"{np.median(errors):.1f}",
+                    "median_degrees_in_a_frame": f"{np.median([r['turned_in_a_frame'] for r in chosen]):.0f}",
+                    "above_25_degrees_in_a_frame": sum(r["turned_in_a_frame"] > FAST for r in chosen),
+                    "of_these_within_10_mm": sum(
+                        r["turned_in_a_frame"] > FAST and r["error"] <= NEAR for r in chosen
+                    ),
                 }
             )
     return out
@@ -146,10 +160,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("--smoke", action="store_true", help="one small scene; needs --out")
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=HERE / "results")
     parser.add_argument("--objects", type=Path, help="write a line of JSON for each object and clip")
     options = parser.parse_args()
-    if options.smoke and options.out == HERE:
+    if options.smoke and options.out == HERE / "results":
         parser.error("--smoke would overwrite the results: name another folder with --out")
     rows: list[dict] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -161,5 +175,6 @@ if __name__ == "__main__":
             print(path.name, len(rows), rows[-1]["seconds"], flush=True)
             if options.objects:
                 options.objects.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    options.out.mkdir(parents=True, exist_ok=True)
     write_csv(options.out / "results.csv", table(rows))
     print((options.out / "results.csv").read_text())

@@ -136,7 +136,7 @@ def test_reported_seeds_are_no_tuning_seeds(config, first):
     "name",
     [
         *("ablations/study", "main/paper_best", "error_budget/study", "number/study"),
-        *("completion/study", "completion/tuning"),
+        *("completion/study", "completion/tuning", "tracking/motions"),
     ],
 )
 def test_tuning_studies_use_tuning_seeds(name):
