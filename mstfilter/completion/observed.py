@@ -206,7 +206,7 @@ def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView],
     """Voxels (k, 3) of the readings of a mask, and of the surfaces of views.
 
     Readings are repeated or omitted to give the number in an image of 640 x 480 pixels, so crops do not depend on the
-    image size. The crops are centred on the latest frame, as in the training.
+    image size.
     """
     readings = mask_voxels(frame, mask, grid)
     if not views:

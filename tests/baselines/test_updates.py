@@ -35,7 +35,7 @@ def keys(population):
 
 def test_at_the_first_pause_filter_and_baselines_tie_exactly(recording):
     """The baselines exactly; `mst`, which completes in its update, up to the borders of segments."""
-    rules = run("mst_rules", recording, 3, "proposal.completer=network", pauses=1)[0]
+    rules = run("mst_rules", recording, 3, "proposal.tree=border", "proposal.completer=network", pauses=1)[0]
     for population in (run(name, recording, pauses=1)[0] for name in ("samples_only", "tracking_only", "union")):
         assert keys(population) == keys(rules)
         np.testing.assert_array_equal(population.log_weights, rules.log_weights)
