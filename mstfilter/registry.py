@@ -134,7 +134,7 @@ class Registry:
             if not allow_files:
                 raise InputError(
                     f"{where}: {name!r} names a file, which is not loaded here",
-                    "only run, study and check load files",
+                    "the commands that load files are run, study, check, convert, view and quality",
                 )
             path = name.partition(":")[0]
             if not Path(path).is_file():

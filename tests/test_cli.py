@@ -12,7 +12,8 @@ import pytest
 
 from mstfilter.cli import _warnings_as_lines, main
 from mstfilter.formats import open_recording
-from mstfilter.runs import RunFolder
+from mstfilter.presets import build_filter, load_config
+from mstfilter.runs import RunFolder, compared_configs
 from tests.conftest import REPOSITORY
 from tests.scene.test_recording import write
 
@@ -177,6 +178,17 @@ def test_runs_to_compare_are_kept_beside_the_run(recording, tmp_path, capsys):
     completers = [run.description["config"]["proposal"]["completer"]["component"] for run in compared.values()]
     assert completers == ["network", "network"]  # that of the update of `mst`, whose samples are surfaces
     assert all(run.description["config"]["transition"]["component"] == "identity" for run in compared.values())
+
+
+def test_compared_filters_of_a_proposal_without_completer_and_sampler():
+    """A component from a file has neither field; `true_masks` has a completer."""
+    path = REPOSITORY / "docs/examples/scenes/proposal.py"
+    own = compared_configs(load_config("mst", [f"proposal={path}:MyProposal"]))
+    assert list(own) == ["without past"] and own["without past"]["proposal"].keys() == {"component"}
+    masks = compared_configs(load_config("mst", ["proposal=true_masks"]))
+    assert masks["without past"]["proposal"]["completer"] == load_config("mst")["update"]["completer"]
+    for config in (*own.values(), *masks.values()):
+        build_filter(config, allow_files=True)
 
 
 def python(code, *arguments):

@@ -20,6 +20,8 @@ import pytest
 
 from mstfilter.cli import main
 from mstfilter.errors import InputError, InputWarning
+from mstfilter.files import damaged_files
+from mstfilter.formats import open_recording
 from mstfilter.reading import read_arrays
 from mstfilter.report import write_report
 from mstfilter.scene import DiskCache, read_rgb
@@ -113,6 +115,16 @@ def test_an_array_is_not_unpacked_if_it_is_too_large(tmp_path, monkeypatch, shap
     (tmp_path / "a.npz").write_bytes(hostile.bomb(shape, gigabytes=gigabytes))
     with limits(megabytes=200), pytest.raises(InputError, match="does not fit|at most 1048576 are read"):
         read_arrays(tmp_path / "a.npz", "volumes")
+
+
+def test_large_text_is_not_read_when_a_folder_is_opened(tmp_path):
+    for name in ("camera.json", "SHA256SUMS"):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(2**28)
+    with limits(megabytes=200):
+        with pytest.raises(InputError, match="at most 33554432 are read"):
+            open_recording(tmp_path)
+        assert damaged_files(tmp_path) == ["SHA256SUMS has changed"]
 
 
 @pytest.mark.parametrize("name", ["pipe", "/dev/zero", "loop", "folder"])
@@ -246,6 +258,20 @@ def test_a_cache_is_private(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
     with pytest.raises(InputError, match="belongs to another user"):
         DiskCache(folder, 10**8, "1")
+
+
+def test_a_cache_of_recordings_is_private_with_any_umask(tmp_path):
+    mask = os.umask(0o002)
+    try:
+        paths = {
+            cached_recording("demo", 0, tmp_path / "cache" / "recordings", n_actions=1, width=160, height=120)
+            for _ in range(2)
+        }
+    finally:
+        os.umask(mask)
+    assert len(paths) == 1
+    for folder in ("cache", "cache/recordings"):
+        assert (tmp_path / folder).stat().st_mode & 0o077 == 0
 
 
 @pytest.mark.parametrize("begun", [False, True])

@@ -15,8 +15,7 @@ replaces the information by I_tau, where outcomes i and j differ in d_ij cells:
 
     ``I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau)``
 
-Outcomes that differ in far fewer than tau cells count as identical. Outcomes that differ in far more cells count as
-different.
+Outcomes that differ in far fewer than tau cells count as identical, outcomes that differ in far more as different.
 I_0 is the information without noise. I_tau decreases to 0 as tau grows. Suppose that every cell is measured with an
 independent error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual
 information of hypothesis and measurement. Kolchinsky and Tracey (2017), *Estimating mixture entropy with pairwise

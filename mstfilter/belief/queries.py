@@ -14,13 +14,7 @@ the labels of a hypothesis changes no result. Probabilities of voxels also use t
 hypothesis (`Hypothesis.occupancy`). Queries about segmentations and actions use only the labels. Voxels are integer
 indices (x, y, z); `Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
 shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
-
-**Information.** Every action (look from a camera, push) has one outcome under each hypothesis. The expected
-information of an action is the mutual information of hypothesis and outcome. Without noise, the information is the
-entropy of the distribution of outcomes. The entropy is at most `partition_entropy()`, which is at most log n. Errors
-that all hypotheses share do not change the information. Without tolerance, outcomes that differ in one voxel are
-different. With a `tolerance` in voxels or pixels, outcomes with a much smaller difference count as equal
-(`mstfilter.belief.information` has the formula).
+`mstfilter.belief.information` defines the expected information of an action and its `tolerance` (voxels or pixels).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
 The resamplers of `mstfilter.smc` that compare particles use these components:
-``Clusters(similarity=WeightedCoverage())``, ``Coalesced(equivalence=SameSegmentation())``.
+``ClusterStratified(similarity=WeightedCoverage())``, ``Coalesced(equivalence=SameSegmentation())``.
 """
 
 from __future__ import annotations

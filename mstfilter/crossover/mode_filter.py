@@ -41,7 +41,7 @@ class ModeFilter(Bounded):
     """
 
     window: PositiveInt = 5
-    margin: Annotated[float, Bounds()] = 3
+    margin: Annotated[float, Bounds()] = 3.0
     isolation: NonNegativeInt = 120
     max_sweeps: PositiveInt = 100
 

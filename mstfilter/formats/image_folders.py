@@ -26,7 +26,7 @@ from mstfilter.fields import NonNegativeFloat
 from mstfilter.files import reading
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import Video, VideoFormat, object_numbers, pair_stamps, read_optional, warn_of_unread
-from mstfilter.reading import read_json, read_text
+from mstfilter.reading import MAX_TEXT, read_bytes, read_json, read_text
 from mstfilter.scene import Frame, PauseRule, Recording, table_residual
 
 
@@ -235,7 +235,7 @@ def _check_masks(path: Path, colour: Iterable[Path]) -> None:
 def is_recording(path: Path) -> bool:
     """Whether a folder is a recording folder: it has a manifest.json, or a camera.json with a workspace."""
     camera = path / "camera.json"
-    ours = camera.is_file() and '"workspace"' in camera.read_text(encoding="utf-8", errors="ignore")
+    ours = camera.is_file() and b'"workspace"' in read_bytes(camera, "a camera file", limit=MAX_TEXT)
     return ours or (path / "manifest.json").is_file()
 
 

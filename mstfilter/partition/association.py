@@ -20,8 +20,7 @@ A predicted object is continued by at most one segment of its connected componen
 
 A predicted object in no conflict is *occluded*. Depth readings that belong to no segment are never counted.
 
-A predicted object is *lost* if the frame refutes the object or if no segment continues the object. `recognised`
-compares the lost objects with the new objects. A recognised object keeps its identity, but loses its earlier views.
+A predicted object is *lost* if the frame refutes it or if no segment continues it. See `recognised`.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # weighted candidates, built on access
 
-The update replaces section IV-D of the paper. In the paper, each sample of the image and each prediction are sets of
-voxels, and all pairs are crossed. In this update, samples and predictions are partitions of the depth readings of the
+The update replaces section IV-D of the paper. Samples and predictions are partitions of the depth readings of the
 last frame. The voxels of an object are estimated again from all observations of the object.
 
 1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not
@@ -20,10 +19,8 @@ last frame. The voxels of an object are estimated again from all observations of
    most probable candidates are described. The resampler of the filter selects some candidates, and only selected
    candidates are completed.
 3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each *component* of the
-   graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. If an object is
-   split, at most one segment continues the object, and the other segments are new objects. A predicted object with
-   conflicts that no segment continues is removed. In the paper, merges are drawn at random. In this update, the
-   partition determines the merges.
+   graph, segments continue predicted objects by the rules in `mstfilter.partition.association`. In the paper, merges
+   are drawn at random. In this update, the partition determines the merges.
 4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
    probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
    the object's voxels that the frame does not observe as free. A_j is the same for all objects of prediction j.

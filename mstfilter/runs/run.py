@@ -15,6 +15,7 @@ import os
 import platform
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,16 @@ _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "
 
 
 def compared_configs(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Configurations of the filters with which a run is compared, by name. They have the completer of the run."""
+    """Configurations of the filters with which a run is compared, if the fields of the proposal permit them."""
     parts = (config.get(slot) or {} for slot in ("proposal", "update"))
     proposal, update = ({"component": part} if isinstance(part, str) else part for part in parts)
-    proposal = {**proposal, **{k: v for k, v in update.items() if k == "completer"}}
-    found = {**config, "transition": "identity", "update": "samples_only", "proposal": proposal}
-    return {"without past": found, "single frame": found | {"proposal": {**proposal, "sampler": "optimal"}}}
+    known = {f.name for f in fields(REGISTRY.find_class("proposal", proposal.get("component", ""), allow_files=True))}
+    if "completer" in known & update.keys():
+        proposal = {**proposal, "completer": update["completer"]}
+    found = {"without past": {**config, "transition": "identity", "update": "samples_only", "proposal": proposal}}
+    if "sampler" in known:
+        found["single frame"] = found["without past"] | {"proposal": {**proposal, "sampler": "optimal"}}
+    return found
 
 
 def filter_recording(

@@ -7,7 +7,8 @@ The page "Runs and reports" of the documentation lists the files.
 
 The folder of a pause has a temporary name until it is complete, so a stopped run has only complete pauses.
 `filter_recording` resumes from state.npz of the last complete pause. `mstfilter.scene.encode_hypotheses` makes the
-arrays ``particles/...`` in state.npz. The same seed gives the same bytes in all files except seconds.json.
+arrays ``particles/...`` in state.npz. The same seed gives the same bytes in all files except
+seconds.json and run.json.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ import diskcache
 import numpy as np
 
 from mstfilter.errors import InputWarning
-from mstfilter.reading import check_private, read_bytes, unpack_arrays
+from mstfilter.reading import check_private, make_private, read_bytes, unpack_arrays
 from mstfilter.scene.arrays import content_key
 
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
@@ -82,7 +82,7 @@ class DiskCache:
         self.folder = Path(folder)
         check_private(self.folder)
         try:
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            make_private(self.folder)
             if not self._can_lock():
                 return
             self._entries = diskcache.Cache(

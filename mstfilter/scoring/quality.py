@@ -8,14 +8,12 @@ segmentation. Weighted coverage is the mean of J, weighted by the sizes of regio
 Weighted coverage has three forms:
 
 ``objects`` (default)
-    Only objects are regions; label 0 is no region. ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``, where V_A is
-    the volume of all objects of A. The form is symmetric. Missing, invented, split and merged objects reduce q.
+    ``q = (side(A->B) / V_A + side(B->A) / V_B) / 2``. Only objects are regions; V_A is the volume of all of A.
 ``paper``
-    The published text taken literally (Price et al. 2021, section V). Every label is a region, including free space.
-    Both sides are divided by the size of the grid. Free space is the largest region, so the result is nearly 1.
+    The published text (Price et al. 2021, section V). Free space is a region too, and both sides are divided by the
+    size of the grid.
 ``authors``
-    The formula of the authors' program. Only objects are regions, and both sides are divided by the volume of the
-    FIRST argument. The form is not symmetric. The result is too high if the first segmentation is too small.
+    The formula of the authors' program. Only objects are regions, and both sides are divided by V_A.
 
 >>> import numpy as np
 >>> a = np.array([1, 1, 2, 2, 0]); b = np.array([1, 1, 1, 1, 0])

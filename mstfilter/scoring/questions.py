@@ -24,8 +24,7 @@ The voxel u' is u with probability 1 - e, and otherwise one of the six neighbour
 the grid). The voxel v' is defined in the same way. The number o_i,v(k) is the probability that object k fills voxel v
 according to hypothesis i. The probability comes from the occupancy, or is 1 for the label of a hypothesis without
 probabilities. The minimum in the formula is the probability that the object contains both voxels, if the object is a
-level set {v | o(v) >= U} with one uniform U. On six tuning scenes, the log loss with level sets is .004 nats lower
-than with independent voxels.
+level set {v | o(v) >= U} with one uniform U.
 """
 
 from __future__ import annotations

@@ -12,9 +12,8 @@ origin of the body axes is the middle of the bounding box. In the upright pose, 
 Sizes and masses are rounded values of the YCB set (Calli et al., "Benchmarking in manipulation research: the YCB
 object and model set", IEEE Robotics & Automation Magazine 22(3), 2015). The boxes of crackers, sugar, pudding and
 gelatin, cans of soup, tuna and coffee, mug, bowl, banana and ball are from the YCB set. The crisps can is 0.20 m high
-(0.25 m in the YCB set). Tea, biscuits, bricks, bottle, soap and angle are not in the YCB set but have similar sizes.
-Each length is scaled at random by up to 10 %. The walls of bowl and mug are 1 cm thick, thicker than real walls. A
-thinner wall could lie between the centres of 1 cm voxels and be missing in the true volume.
+(0.25 m in the YCB set). Each length is scaled at random by up to 10 %. The walls of bowl and mug are 1 cm thick, as a
+thinner wall could lie between the centres of 1 cm voxels.
 
 `label_voxels` returns the true volume: all voxels of each object, visible or not.
 

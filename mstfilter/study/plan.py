@@ -38,7 +38,7 @@ class Arm:
     name: str
     config: dict[str, Any]  #: every field of every component
     key: str  #: hash of the configuration, the code and the files of the user
-    #: Whether all components belong to mstfilter or to a file of the user, whose code is part of `key`.
+    #: Whether all components belong to mstfilter. A file of the user may import code that is not part of `key`.
     known_code: bool
     uses_truth: tuple[str, ...]  #: classes of its components that use the ground truth
     reported_only: bool = False  #: not part of the comparisons whose p values are adjusted together

@@ -107,15 +107,15 @@ def _check_candidate(one: Candidate) -> None:
 
 
 def fault_of_motions(candidates: Sequence[Candidate], track: Track) -> str | None:
-    """An error message if a candidate moves the object by more than the width of the workspace, else None."""
+    """An error message if a candidate moves the object by more than the diagonal of the workspace, else None."""
     if not len(track.segment.support):
         return None
     grid, centre = track.clip.grid, track.points.mean(axis=0)
-    width = float(np.linalg.norm(np.multiply(grid.shape, grid.voxel_size)))
+    diagonal = float(np.linalg.norm(np.multiply(grid.shape, grid.voxel_size)))
     farthest = max(rigid.displacement(one.T.as_matrix(), centre) for one in candidates)
-    if farthest <= width:
+    if farthest <= diagonal:
         return None
-    return f"moves an object too far: by {farthest:.3g} m, the workspace is {width:.3g} m wide"
+    return f"moves an object too far: by {farthest:.3g} m, the diagonal of the workspace is {diagonal:.3g} m"
 
 
 class MotionRule(Checked, ABC):
