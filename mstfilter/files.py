@@ -44,7 +44,7 @@ _TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>partial|replaced
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path`, renamed to `path` at the end of the block. Missing folders are made."""
     target = Path(path)
-    _make_folders(target.parent)
+    make_folders(target.parent)
     partial = _temporary(target, "partial")
     try:
         yield partial
@@ -63,7 +63,7 @@ def atomic_folder(path: str | Path, existing: Literal["refuse", "replace", "keep
     "replace" removes the earlier folder, and "keep" removes the new folder. An empty folder is always replaced.
     """
     target = Path(os.path.realpath(path))
-    _make_folders(target.parent)
+    make_folders(target.parent)
     partial = _temporary(target, "partial")
     partial.mkdir()
     mark = _lock(partial, os.O_RDONLY)  # `sweep` leaves the folder alone
@@ -109,7 +109,7 @@ def locked(path: str | Path) -> Iterator[None]:
     file = target.with_name(f".{target.name}.lock")
     with contextlib.ExitStack() as stack:
         with writing(f"{target} and a lock beside it", "choose another place"):
-            stack.callback(_remove_empty, _make_folders(target.parent))
+            stack.callback(_remove_empty, make_folders(target.parent))
             descriptor = _reserve(file, target)
             stack.callback(os.close, descriptor)
             stack.callback(file.unlink, missing_ok=True)
@@ -198,10 +198,11 @@ def _is_temporary(path: Path) -> bool:
     return any(map(_TEMPORARY.fullmatch, path.parts))
 
 
-def _make_folders(folder: Path) -> list[Path]:
+def make_folders(folder: Path, mode: int = 0o777) -> list[Path]:
     """Make a folder and its parents. Returns the folders that were missing, the deepest folder first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
+    for path in (*reversed(missing[1:]), folder):
+        path.mkdir(mode, exist_ok=True)
     _sync(folder, *(path.parent for path in missing))
     return missing
 

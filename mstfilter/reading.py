@@ -153,9 +153,3 @@ def check_private(folder: Path) -> None:
             f"other users may write into the cache {folder}: its mode is {status.st_mode & 0o777:o}",
             f"chmod go-w {folder}",
         )
-
-
-def make_private(folder: Path) -> None:
-    """Make a folder and its missing parents, which only the user can read. Raises OSError if this fails."""
-    for missing in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
-        missing.mkdir(mode=0o700, exist_ok=True)

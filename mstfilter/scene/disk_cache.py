@@ -25,7 +25,8 @@ import diskcache
 import numpy as np
 
 from mstfilter.errors import InputWarning
-from mstfilter.reading import check_private, make_private, read_bytes, unpack_arrays
+from mstfilter.files import make_folders
+from mstfilter.reading import check_private, read_bytes, unpack_arrays
 from mstfilter.scene.arrays import content_key
 
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).
@@ -82,7 +83,7 @@ class DiskCache:
         self.folder = Path(folder)
         check_private(self.folder)
         try:
-            make_private(self.folder)
+            make_folders(self.folder, 0o700)
             if not self._can_lock():
                 return
             self._entries = diskcache.Cache(

@@ -35,9 +35,9 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, InputWarning, check_integer
-from mstfilter.files import atomic_folder, damaged_files, sweep, write_text
+from mstfilter.files import atomic_folder, damaged_files, make_folders, sweep, write_text
 from mstfilter.formats import RecordingWriter, open_recording
-from mstfilter.reading import check_private, make_private
+from mstfilter.reading import check_private
 from mstfilter.scene import Recording
 from mstfilter.simulation.arrangement import SceneObjects, arrange_objects, draw_objects
 from mstfilter.simulation.families import GENERATOR_VERSION, SceneFamily, scene_family
@@ -255,7 +255,7 @@ def cached_recording(family: str | SceneFamily, seed: int, folder: Path | None =
 
 def _simulate_into_cache(family: SceneFamily, seed: int, target: Path) -> None:
     try:
-        make_private(target.parent)
+        make_folders(target.parent, 0o700)
         ignore = target.parent / ".gitignore"  # recordings stay out of version control
         if not ignore.exists():
             write_text(ignore, "*\n")
