@@ -29,6 +29,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, check_integer
 from mstfilter.fields import Bounds, PositiveInt
+from mstfilter.smc.first_steps import Few, compare_alone
 from mstfilter.smc.interfaces import Equivalence, Size, Transition, Trigger, Update
 from mstfilter.smc.population import Population, as_matrix, union
 
@@ -58,6 +59,13 @@ class Reweight(Update):
                 "particle"
             )
         return population.reweighted(found)
+
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        few = Few.of(after.particles)
+        compare_alone("the log likelihood", lambda x: self.log_likelihood(x, observation), few)
+        return few.differ
 
 
 @dataclass(frozen=True)
@@ -92,6 +100,11 @@ class Branching(Transition):
         if "previous" in moved.parents or len(moved) != len(index):
             return moved
         return moved.labelled({**moved.parents, "previous": index}, moved.notes)
+
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        return self.inner.examine(rng, before, observation, after)
 
 
 _HINT_SHARE = (

@@ -30,12 +30,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer, place_in_user_file
 from mstfilter.fields import NonNegativeInt, PositiveInt
 from mstfilter.lazy import progress_of
 from mstfilter.processes import together
 from mstfilter.smc.components import EssBelow
-from mstfilter.smc.inputs import AtStep, check_observations, same_component, split_input
+from mstfilter.smc.first_steps import Examined
+from mstfilter.smc.inputs import AtStep, check_observations, same_component, split_input, usual_slip
 from mstfilter.smc.interfaces import (
     Component,
     Info,
@@ -50,7 +51,7 @@ from mstfilter.smc.interfaces import (
     Trigger,
     Update,
 )
-from mstfilter.smc.population import Population, identity
+from mstfilter.smc.population import Population, digest_of, identity
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key
 
@@ -82,7 +83,9 @@ class ParticleFilter(AtStep):
     lookahead : Lookahead, optional
         Auxiliary filter: particles are selected by weight times priority. Requires ``resample="before"``.
     rejuvenation : Rejuvenation, optional
-        Resample-move filter: moves the particles at the end of a step that resampled.
+        Resample-move filter: moves the particles at the end of a step that resampled; with ``resample="after"`` at
+        the end of every step. (There the trigger has seen the particles that would be moved. If it decided about
+        the move, the evidence would be biased.)
     size : Size, optional
         Chooses the number of particles that are selected. By default, the number is always `n`.
     n : int
@@ -134,41 +137,72 @@ class ParticleFilter(AtStep):
         components = (getattr(self, slot) for slot in _SLOTS)
         return all(c.properly_weighted for c in components if isinstance(c, Component))
 
-    def start(self, seed: int | Key = 0) -> State:
-        """The state before the first observation."""
-        return State(0, None, seed if isinstance(seed, Key) else Key(seed), self.properly_weighted)
+    def start(self, seed: int | Key = 0, population: Population | None = None, t: int = 0) -> State:
+        """The state before the first observation, or a state with given particles.
+
+        Parameters
+        ----------
+        seed : int or Key
+            The random numbers of the run.
+        population : Population, optional
+            Particles after t observations, such as a stored posterior: the next step moves them and updates them by
+            observation t. Their log weights are kept, so the log evidence begins with the log of their mean weight.
+            The random streams depend on `seed` and on the particles. So they are new ones even if a run with the same
+            seed made the particles.
+        t : int
+            Number of observations before, for functions of the time.
+        """
+        key = seed if isinstance(seed, Key) else Key(seed)
+        check_integer("t", t, at_least=0)
+        if population is None:
+            if t:
+                raise InputError(
+                    f"t is {t}, and there are no particles after {t} observations", "give population=..."
+                )
+            return State(0, None, key, self.properly_weighted)
+        return State(t, population, key.child("given", digest_of(population)), self.properly_weighted)
 
     def step(self, state: State, observation: Any) -> tuple[State, Info]:
         """Process one observation. If the observation is None (missing), the proposal and the update are skipped.
 
         For an observation with an input u, pass ``WithInput(observation, u)``.
 
-        Raises InputError if a component raises InputError. The message starts with the step and the component.
+        Raises InputError if a component raises InputError. The message starts with the step and the component. The
+        functions of a model are examined at the first two steps of a run (`mstfilter.smc.first_steps`).
         """
-        step = _Step(self, state, observation)
+        return self._step(state, observation, Examined.of_run() if state.t < 2 else None)
+
+    def _step(self, state: State, observation: Any, examined: Examined | None) -> tuple[State, Info]:
+        step = _Step(self, state, observation, examined)
         past, resampled_before = step.select_before()
         predicted, proposed = step.extend(past)
         fused = step.fuse(predicted, proposed)
         chosen, resampled_after = step.select_after(fused, past)
-        if resampled_before or resampled_after:
+        if resampled_before or resampled_after or self.resample == "after":
             chosen = step.rejuvenate(chosen, past)
         return step.finish(past, fused, chosen, resampled_before, resampled_after)
 
-    def iterate(self, observations: Iterable[Any], state: State | int = 0) -> Iterator[tuple[State, Info]]:
+    def iterate(self, observations: Iterable[Any], seed: int | State = 0) -> Iterator[tuple[State, Info]]:
         """Yield the `State` and the `Info` of every step.
 
         Parameters
         ----------
         observations : iterable
             For each step an observation, a `WithInput`, or None if the observation is missing.
-        state : State or int
-            The state to continue from, or a seed.
+        seed : int or State
+            A seed, or the state to continue from.
+
+        The functions of a model are examined until three observations have been seen (`mstfilter.smc.first_steps`).
         """
         keep_freed_memory()
         check_observations(observations)
-        current = state if isinstance(state, State) else self.start(state)
+        current = seed if isinstance(seed, State) else self.start(seed)
+        examined, seen = Examined.of_run(), 0
         for observation in observations:
-            current, info = self.step(current, observation)
+            current, info = self._step(current, observation, examined)
+            if examined is not None:
+                seen += split_input(observation)[0] is not None
+                examined = None if seen == 3 else examined
             yield current, info
 
     def run(
@@ -198,15 +232,25 @@ class ParticleFilter(AtStep):
 class _Step:
     """The stages of one step. Each call of a component is wrapped by ``with self.slot(name)``."""
 
-    def __init__(self, filter: ParticleFilter, state: State, observation: Any) -> None:
+    def __init__(
+        self, filter: ParticleFilter, state: State, observation: Any, examined: Examined | None = None
+    ) -> None:
         self.observation, u = split_input(observation)
         self.filter, self.state = filter.at_step(state.t, u), state
-        self.given = filter
+        self.given, self.examined = filter, examined
         self.slot = _Slot(state.t)
 
     def rng(self, slot: str) -> np.random.Generator:
         """The random stream of a component in this step."""
         return self.state.key.child(slot, self.state.t).generator()
+
+    def examine(self, slot: str, component: Component, before: Population | None, after: Population) -> None:
+        """Let a component examine the functions of its model, if this is one of the first steps of a run."""
+        examined, missing = self.examined, self.observation is None
+        if examined is None or type(component).examine is Component.examine or not examined.wants(slot, missing):
+            return
+        rng = self.rng(slot) if component.draws else _UNUSED
+        examined.note(slot, missing, component.examine(rng, before, self.observation, after))
 
     def select_before(self) -> tuple[Population | None, bool]:
         """Select the particles x_{t-1} to move. Returns the particles and whether they were resampled."""
@@ -216,6 +260,7 @@ class _Step:
         if self.filter.lookahead is not None and self.observation is not None:
             with self.slot("lookahead"):
                 priority = _priority(self.filter.lookahead, population, self.observation)
+                self.examine("lookahead", self.filter.lookahead, population, population)
                 population = population.reweighted(priority)
         with self.slot("resampler"):
             if not self.filter.trigger.wants(population, self.state.t):
@@ -261,6 +306,7 @@ class _Step:
         with self.slot("transition"):
             moved = transition.predict(self.rng("transition"), population, self.observation)
             moved = _checked(moved, transition)
+            self.examine("transition", transition, population, moved)
             if "previous" not in moved.parents and len(moved) == len(population):
                 moved = moved.labelled({**moved.parents, **stayed}, moved.notes)
             self.slot.record(moved.notes)
@@ -274,6 +320,7 @@ class _Step:
             population = _checked(initial.sample(self.rng("initial"), self.observation, n), initial)
             if len(population) != n:
                 raise InputError(f"asked for {n} particles it returned {len(population)}")
+            self.examine("initial", initial, None, population)
             self.slot.record(population.notes)
         return population
 
@@ -300,6 +347,7 @@ class _Step:
         with self.slot("update"):
             rng = self.rng("update") if update.draws else _UNUSED
             fused = _checked(update.update(rng, predicted, proposed, self.observation), update)
+            self.examine("update", update, predicted, fused)
             self.slot.record(fused.notes)
         return fused
 
@@ -392,6 +440,13 @@ class _Slot:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - self._here.began
         if isinstance(error, InputError):
             raise type(error)(f"step {self.t}, {name}: {error.message}", *error.hints) from error
+        slip = usual_slip(error) if isinstance(error, TypeError | ValueError | AttributeError) else None
+        place = place_in_user_file(error) if slip and error is not None else None
+        if slip and place:
+            fact, *hints = slip
+            raise InputError(
+                f"step {self.t}, {name}: {fact} ({place}): {type(error).__name__}: {error}", *hints
+            ) from error
         if isinstance(error, Exception):
             error.add_note(f"in step {self.t}, {name}")
 

@@ -110,6 +110,55 @@ def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
     return named
 
 
+def check_signature(what: str, function: Any, n_arguments: int) -> None:
+    """Raise InputError unless a function can be called with `n_arguments` arguments, and ``t`` and ``u`` by name."""
+    if isinstance(function, StepFunction):
+        return
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # not a function, or one without a signature
+        return
+    try:
+        signature.bind(*[None] * n_arguments, **step_parameters(function, n_arguments))
+    except TypeError as error:
+        several = f"{n_arguments} arguments" if n_arguments > 1 else "one argument, the particles"
+        raise InputError(
+            f"{what} has the parameters {signature}, and is called with {several}: {error}",
+            "after these, a parameter t gets the index of the step and a parameter u its input, by these names only",
+            "other parameters need a default value, or functools.partial",
+        ) from None
+
+
+#: Parts of messages of numpy and Python, what the function did, and what to write instead.
+_USUAL_SLIPS = {
+    "truth value of an array": (
+        "an array that holds all particles decides (if, and, or, while)",
+        "use numpy.where, in a program also switch(name, probs, branches)",
+    ),
+    "scalar": (
+        "an array that holds all particles is used as one number (float, int, range, math, list index)",
+        "use numpy (numpy.exp, x.astype(int)) or an array as table",
+    ),
+    "read-only": (
+        "an array of particles is changed in place",
+        "write x = x + 1 for x += 1 and numpy.where for x[i] = ..., and return the result under another name",
+    ),
+    "NoneType": (
+        "None is used as a value",
+        "a missing observation is None, and previous is None at the first step of a program: test `is None`",
+    ),
+    "zero-size array": (
+        "an array without entries is reduced",
+        "a branch of switch is also called when no particle reaches it",
+    ),
+}
+
+
+def usual_slip(error: Exception) -> tuple[str, str] | None:
+    """What a function of a model did if it raised this error, and what to write instead; None if it is not known."""
+    return next((_USUAL_SLIPS[part] for part in _USUAL_SLIPS if part in str(error)), None)
+
+
 def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> Callable[..., Any]:
     """Mark a function ``(*arguments, **step)`` as accepting the given parameters by keyword."""
     return StepFunction(function, parameters) if parameters else function
@@ -165,8 +214,10 @@ class AtStep(Bounded):
             if n_arguments is None:
                 if isinstance(value, AtStep) and (type(value).at_step is not AtStep.at_step or value._of_step):
                     found[name] = None
-            elif value is not None and (parameters := step_parameters(value, n_arguments)):
-                found[name] = parameters
+            elif value is not None:
+                check_signature(f"{type(self).__name__}.{name}", value, n_arguments)
+                if parameters := step_parameters(value, n_arguments):
+                    found[name] = parameters
         return found
 
     def at_step(self, t: int, u: Any = None) -> Self:

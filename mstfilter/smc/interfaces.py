@@ -71,6 +71,17 @@ class Component(AtStep, ABC):
         """
         return False
 
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        """Examine the functions of a model at the first steps of a run (see `mstfilter.smc.first_steps`).
+
+        `before` are the particles that the component got, None at the first step, and `after` those that it returned.
+        `rng` starts where it started for the call. Raises InputError if a function mixes particles or draws from
+        another generator. Returns whether the particles differed: if not, another step is examined.
+        """
+        return True
+
 
 class Proposal(Component):
     """Draws particles given only the observation."""
@@ -298,6 +309,14 @@ class State:
     population: Population | None  #: the particles after the last observation; None before the first
     key: Key  #: names the random streams of the run
     properly_weighted: bool = True  #: whether the filters of all steps are properly weighted
+
+    def __post_init__(self) -> None:
+        if self.t == 0 and self.population is not None and not self.key.path:
+            raise InputError(
+                f"a state at t = 0 has {len(self.population)} particles: a run with seed {self.key.seed} would draw "
+                "again the random numbers that it drew for them",
+                "filter.start(seed, population) starts from given particles with new random numbers",
+            )
 
     def __repr__(self) -> str:
         evidence = "" if self.log_evidence is None else f", log evidence {self.log_evidence:.4g}"

@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from hashlib import sha256
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -361,6 +362,18 @@ class Population:
         new.__dict__["log_weights"] = lw
         new.__dict__.pop("_both", None)
         return new
+
+
+def digest_of(population: Population) -> str:
+    """A hash of weights, parents and particles that are arrays, to name random streams."""
+    arrays: dict[str, Any] = {"log weights": population.log_weights, **population.parents}
+    particles = population.particles
+    arrays |= particles if isinstance(particles, Mapping) else {"particles": particles}
+    found = sha256()
+    for name, a in sorted(arrays.items()):
+        if isinstance(a, np.ndarray) and a.dtype != object:
+            found.update(f"{name} {a.dtype.str} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
+    return found.hexdigest()
 
 
 def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:

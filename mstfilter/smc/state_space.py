@@ -17,6 +17,7 @@ resampler=...)``. The first observation updates the initial state before any pre
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, TypeVar
@@ -28,7 +29,19 @@ from mstfilter.fields import PositiveInt
 from mstfilter.smc.components import EssBelow, Reweight
 from mstfilter.smc.distributions import as_distribution, hypothetical
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import AtStep, step_parameters, with_step
+from mstfilter.smc.first_steps import (
+    DRAWS,
+    MOST,
+    REPEATED,
+    Few,
+    check_draws,
+    check_own_noise,
+    check_reach,
+    compare_alone,
+    first_difference,
+    spread_rows,
+)
+from mstfilter.smc.inputs import AtStep, check_signature, step_parameters, with_step
 from mstfilter.smc.interfaces import (
     DensityTransition,
     Distribution,
@@ -38,7 +51,7 @@ from mstfilter.smc.interfaces import (
     Resampler,
     Trigger,
 )
-from mstfilter.smc.population import Particles, Population, count_particles
+from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import Systematic
 
 _Chains = TypeVar("_Chains")  # states of Markov chains
@@ -65,6 +78,8 @@ class StateSpaceModel(AtStep):
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
     batched : bool or None
         Whether the functions treat each particle independently (see `Component.batched`).
+    sample_observation : callable, optional
+        ``(rng, particles) -> (n, ...)`` draws y_t given x_t, to make data.
     """
 
     sample_initial: Callable[[np.random.Generator, int], Any]
@@ -73,8 +88,10 @@ class StateSpaceModel(AtStep):
     log_initial: Callable[[Any], np.ndarray] | None = None
     log_transition: Callable[[Any, Any], np.ndarray] | None = None
     batched: bool | None = False
+    sample_observation: Callable[[np.random.Generator, Any], Any] | None = None
 
     step_functions: ClassVar = {
+        "sample_observation": 2,
         "sample_initial": 2,
         "sample_transition": 2,
         "log_likelihood": 2,
@@ -96,6 +113,7 @@ class StateSpaceModel(AtStep):
                 raise InputError(
                     f"{name} is {function!r}, expected a function of the particles that returns a distribution"
                 )
+            check_signature(name, function, 1)
 
         def sample(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
             new = as_distribution(transition(x, **step)).sample(rng, count_particles(x))
@@ -107,6 +125,9 @@ class StateSpaceModel(AtStep):
         def log_likelihood(x: Any, y: Any, **step: Any) -> np.ndarray:
             return _log_likelihood(as_distribution(observation(x, **step)), y)
 
+        def sample_observation(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
+            return as_distribution(observation(x, **step)).sample(rng, count_particles(x))
+
         moves, observes = step_parameters(transition, 1), step_parameters(observation, 1)
         return cls(
             first.sample,
@@ -115,6 +136,7 @@ class StateSpaceModel(AtStep):
             partial(_log_state, first),
             with_step(log_density, moves),
             batched=None,
+            sample_observation=with_step(sample_observation, observes),
         )
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
@@ -200,6 +222,30 @@ class Prior(_OfModel, Proposal):
             return np.zeros(count_particles(new))
         return self.model.density("log_initial")(new) - as_distribution(self.proposal(observation)).log_prob(new)
 
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        n, model = len(after), self.model
+        if self.proposal is None or observation is None:
+            again = model.sample_initial(rng, n)
+            different = first_difference(after.particles, again)
+            if different:
+                raise InputError(
+                    f"the initial distribution: {different} differ when it is drawn again with the same generator",
+                    *REPEATED,
+                )
+            with suppress(IndexError):  # fewer than 64 stored particles
+                many = again if n >= 16 else model.sample_initial(rng, MOST)
+                check_own_noise("the initial distribution", many, lambda: model.sample_initial(rng, max(n, MOST)))
+        else:
+            q = as_distribution(self.proposal(observation))
+            with np.errstate(all="ignore"):
+                x, own = q.sample(rng, DRAWS), model.sample_initial(rng, DRAWS)
+                gain = self.log_weight(x, observation) + model.log_likelihood(x, observation)
+                check_reach("the proposal", model.log_likelihood(own, observation), q.log_prob(own), gain)
+            compare_alone("the initial density", model.density("log_initial"), Few.of(after.particles))
+        return True
+
 
 @dataclass(frozen=True)
 class Dynamics(_OfModel, DensityTransition):
@@ -239,6 +285,38 @@ class Dynamics(_OfModel, DensityTransition):
             return np.zeros(count_particles(new))
         return self.model.density("log_transition")(previous, new) - self.log_prob(previous, new, observation)
 
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        assert before is not None
+        few, model = Few.of(before.particles), self.model
+        if self.proposal is None or observation is None:
+            new = check_draws("the transition", model.sample_transition, few, rng)
+        else:
+            new = check_draws("the proposal", lambda rng, x: self._propose(rng, x, observation), few, rng)
+            if new is not None:
+                density = partial(self.log_prob, observation=observation)
+                compare_alone("the density of the proposal", density, few, new)
+            self._check_reach(rng, before, observation)
+        if model.log_transition is not None and new is not None:
+            compare_alone("the transition density", model.log_transition, few, new)
+        return few.differ
+
+    def _check_reach(self, rng: np.random.Generator, before: Population, observation: Any) -> None:
+        model = self.model
+        rows = spread_rows(len(before), DRAWS)
+        old, lw = take(before.particles, rows), before.log_weights[rows]
+        with np.errstate(all="ignore"):
+            x, own = self._propose(rng, old, observation), model.sample_transition(rng, old)
+            gain = self.log_weight(old, x, observation) + model.log_likelihood(x, observation)
+            log_q = self.log_prob(old, own, observation)
+            check_reach("the proposal", lw + model.log_likelihood(own, observation), log_q, lw + gain)
+
+    def _propose(self, rng: np.random.Generator, old: Particles, observation: Any) -> Particles:
+        """Draws from the proposal."""
+        q = as_distribution(self.proposal(old, observation))  # type: ignore[misc]
+        return _of_shape("proposal", q.sample(rng, count_particles(old)), old)
+
 
 @dataclass(frozen=True)
 class PriorityLookahead(Lookahead):
@@ -249,6 +327,13 @@ class PriorityLookahead(Lookahead):
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
         return self.function(population.particles, observation)
+
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        few = Few.of(after.particles)
+        compare_alone("the log priority", lambda x: self.function(x, observation), few)
+        return few.differ
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,49 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.errors import InputError
 from mstfilter.smc import Distribution, Normal, Program, observe, sample
+from mstfilter.smc.testing import ModelContract, check_properties
+from mstfilter.smc.testing.models import check_density
 from tests.smc.faulty_programs import CORRECT, FAULTY, INHERENT
+
+#: Faults that the first steps of a run do not show, mostly because few particles are examined there.
+FOUND_BY_CHECK = {
+    "a_guide_with_a_maximum",
+    "the_time",
+    "a_running_maximum_of_an_object",
+    "a_running_maximum_of_a_method",
+    *(f"a_distribution_{name}" for name in ("OtherSign", "Density", "Unnormalised", "Variance")),
+}
+
+
+def failures(filter, ys):
+    """What the contract of models says about a filter."""
+    contract = type("Contract", (ModelContract,), {"observations": ys})
+    return [result.failure for result in check_properties(filter, contract) if result.failure]
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("name", FAULTY)
-def test_a_fault_is_a_named_error(name):
+@pytest.mark.parametrize("name", [name for name in FAULTY if name not in FOUND_BY_CHECK])
+def test_a_fault_is_a_named_error_of_a_run(name):
     filter, ys, expected = FAULTY[name]
     with pytest.raises(InputError) as caught:
         filter.run(ys, 0)
     text = " ".join([caught.value.message, *caught.value.hints])
     assert re.search(expected, text), text
     assert re.match(r"step \d, (initial|transition|update|lookahead)", text), text
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("name", FAULTY)
+def test_check_names_every_fault(name):
+    filter, ys, _ = FAULTY[name]
+    assert failures(filter, ys)
+
+
+@pytest.mark.parametrize("name", CORRECT)
+def test_check_finds_nothing_in_a_correct_program(name):
+    assert failures(*CORRECT[name]) == []
 
 
 @pytest.mark.parametrize("name", CORRECT)
@@ -45,15 +74,15 @@ def test_a_fault_is_found_again_when_the_program_runs_again():
             filter.run([0.5], 0)
 
 
-def test_a_guide_far_narrower_than_the_posterior_warns():
+def test_a_guide_far_narrower_than_the_posterior_is_a_fault():
     def model(previous, y):
         observe("y", Normal(sample("x", Normal(0.0, 1.0)), 0.5), y)
 
     def guide(previous, y):
         sample("x", Normal(0.8 * y, 0.01))
 
-    with pytest.warns(InputWarning, match=r"differ by -[\d.]+ nats[\s\S]*narrower"):
-        Program(model).guided(guide, 500).run([0.3], 0)
+    (fault,) = failures(Program(model).guided(guide, 500), [0.3, 0.1])
+    assert re.search(r"evidence that is \S+ nats too small: it is narrower", fault)
 
 
 def test_few_faults_run_without_an_error():
@@ -91,16 +120,6 @@ class Peaks:
         return np.logaddexp.reduce(each, axis=0).reshape(np.shape(x)) - np.log(len(self.centres))
 
 
-def run_with(distribution, seed):
-    kind = type("Kind", (Of,), {})  # each class is tested once
-
-    def program(previous, y):
-        x = sample("x", kind(distribution.draws, distribution.density))
-        observe("y", Normal(np.clip(x, -3, 3), 1.0), y)
-
-    Program(program).bootstrap(20).run([0.5], seed)
-
-
 SKEWED = {
     "gamma": stats.gamma(0.5),
     "beta": stats.beta(0.5, 0.5),
@@ -119,7 +138,7 @@ SKEWED = {
 @pytest.mark.parametrize("name", SKEWED)
 def test_heavy_tails_poles_and_jumps_of_a_density_are_no_fault(name):
     for seed in range(5):
-        run_with(Of(SKEWED[name]), seed)
+        check_density("x", Of(SKEWED[name]), np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize(
@@ -128,5 +147,5 @@ def test_heavy_tails_poles_and_jumps_of_a_density_are_no_fault(name):
     ids=["scale", "shift", "not normalised", "no log"],
 )
 def test_a_density_of_other_draws_is_a_fault(density):
-    with pytest.raises(InputError, match="do not have its density"):
-        run_with(Of(stats.norm(), density), 0)
+    with pytest.raises(AssertionError, match="do not have its density"):
+        check_density("x", Of(stats.norm(), density), np.random.default_rng(0))

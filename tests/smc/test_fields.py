@@ -77,7 +77,10 @@ def decides(previous, y):
         (lambda: Normal(0.0, -1.0), r"scale of a Normal is -1\.0, expected a positive number"),
         (lambda: Student(0.0), "df of a Student"),
         (lambda: Uniform(1.0, 1.0), r"high of a Uniform is 1\.0, expected a finite number above low"),
-        (lambda: Program(decides).bootstrap(5).run([0.1], 0), "step 0, initial: the program decides by an array"),
+        (
+            lambda: Program(decides).bootstrap(5).run([0.1], 0),
+            "step 0, initial: an array .* decides",
+        ),
         (lambda: linear_gaussian(**{**LG, "Q": [[-1.0]]}), "Q is .*positive semidefinite"),
         (lambda: linear_gaussian(**{**LG, "F": np.eye(2)}), r"F has shape \(2, 2\), expected \(1, 1\)"),
         (lambda: linear_gaussian(**{**LG, "m0": 0.0}), "m0 has shape"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import runpy
-from collections import deque
 from itertools import product
 from types import SimpleNamespace
 
@@ -222,9 +221,9 @@ def changed(x):
         (r"as one number .*after site 'k', line \d+ `.*float\(s.x\).*TypeError.*numpy", lambda s: float(s.x)),
         ("as one number .*after site 'k'.*numpy.exp", lambda s: math.exp(s.x)),
         ("as one number .*after site 'k'.*an array as table", lambda s: ["a", "b"][s.k]),
-        ("decides by an array .*after site 'k'.*use switch", lambda s: 1 if s.x > 0 else 2),
-        ("changes an array of particles in place .*after site 'k'.*x = x \\+ 1", lambda s: changed(s.x)),
-        ("the program uses None .*missing observation is None", lambda s: s.y + 1, None),
+        ("an array .* decides .*after site 'k'.*use switch", lambda s: 1 if s.x > 0 else 2),
+        ("an array of particles is changed in place .*after site 'k'.*x = x \\+ 1", lambda s: changed(s.x)),
+        ("None is used as a value .*missing observation is None", lambda s: s.y + 1, None),
         ("the program fails .*after site 'k'.*broadcast together", lambda s: s.x + np.zeros(3)),
         # parameters out of range
         (
@@ -438,7 +437,6 @@ def test_a_guide_may_draw_outside_of_branches_or_in_more():
 
 def test_values_of_particles_that_look_like_a_shared_vector():
     """One number for each particle is an observation, also if an event has as many entries as there are particles."""
-    sizes = deque()  # a list would be copied for the particles that run alone
 
     def model(previous, y):
         k = sample("k", Categorical([0.5, 0.5]))
@@ -447,10 +445,8 @@ def test_values_of_particles_that_look_like_a_shared_vector():
         observe("residual", Normal(0.0, 1.0), y - x)
         observe("one row", Normal(x[:, 0], 1.0), [y])
         observe("number", MultivariateNormal([[0.0]], [[1.0]]), y)
-        sizes.append(len(k))
 
     Program(model).bootstrap(4).run([0.3, 0.2, 0.1], 0)
-    assert list(sizes) == [4, 4, 3, 3] * 3  # every step is repeated, and two groups of particles run alone
     a, _ = Program(model).bootstrap(4).run([0.1], 0)
     p = a.population.particles
     expected = (

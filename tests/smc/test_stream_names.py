@@ -28,7 +28,7 @@ from mstfilter.smc import (
     resample_move,
     sample,
 )
-from mstfilter.smc.programs import guard as checks
+from mstfilter.smc.first_steps import unexamined
 from tests.baselines.scenes import slide
 from tests.smc.models import AR1, ar1_observations, optimal, predictive
 
@@ -82,8 +82,8 @@ def used_twice(monkeypatch, filter, observations) -> list[Key]:
 
 @pytest.mark.parametrize("name", ASSEMBLIES)
 def test_no_stream_is_used_twice(monkeypatch, name):
-    monkeypatch.setattr(checks, "_CHECKED", frozenset())  # a check of a program repeats a step with its streams
-    assert not used_twice(monkeypatch, ASSEMBLIES[name], YS)
+    with unexamined():  # an examination repeats calls with their streams
+        assert not used_twice(monkeypatch, ASSEMBLIES[name], YS)
 
 
 @pytest.mark.parametrize("name", ["mst", "paper", "authors"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -14,12 +13,12 @@ import numpy as np
 
 from mstfilter.errors import InputError
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inputs import usual_slip
 from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.population import Particles, Population
-from mstfilter.smc.programs.guard import Schedule
+from mstfilter.smc.programs.examination import examine_program
 from mstfilter.smc.programs.handlers import GivenHandler, GuideHandler, ReplayHandler, SampleHandler, SiteHandler
 from mstfilter.smc.programs.sites import ProgramRun, active_run, recorded
-from mstfilter.smc.streams import RunGenerators
 
 Model = Callable[..., Any]
 _HERE = str(Path(__file__).parent)
@@ -63,28 +62,11 @@ class _ProgramStep(Component):
     batched: ClassVar[bool | None] = None
     step_functions: ClassVar = {"model": 2, "guide": 2}
 
-    @cached_property
-    def schedule(self) -> Schedule:
-        """The `Schedule` that determines which steps are checked."""
-        return Schedule.of(self.model, self.guide)
-
     def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
         """The population after a step."""
         model, guide = self.model, None if observation is None else self.guide
         previous = None if past is None else past.particles
-        # A batch compares some of its runs with single runs, which are guarded.
-        in_batch = isinstance(rng, RunGenerators)
-        guard = None if in_batch else self.schedule.guard(rng, past, observation, model, guide)
-
-        def step() -> tuple[Particles, np.ndarray]:
-            return program_step(rng, model, guide, previous, observation, n)
-
-        try:
-            particles, gain = step() if guard is None else guard.checked(_run_once, step)
-        except Exception:
-            if guard is not None:
-                self.schedule.clear()  # the next run is checked again
-            raise
+        particles, gain = program_step(rng, model, guide, previous, observation, n)
         try:
             return Population(particles, gain) if past is None else past.moved(particles).reweighted(gain)
         except InputError:
@@ -92,6 +74,12 @@ class _ProgramStep(Component):
                 with recorded():  # a recorded run names the site
                     run_program(model, GivenHandler(particles), previous, observation, n)
             raise
+
+    def examine(
+        self, rng: np.random.Generator, before: Population | None, observation: Any, after: Population
+    ) -> bool:
+        guide = None if observation is None else self.guide
+        return examine_program(run_once, rng, self.model, guide, before, observation, after)
 
 
 @dataclass(frozen=True)
@@ -133,14 +121,14 @@ def run_program(
     gain : (n,) float64
         Change of the log weights.
     """
-    run = _run_once(model, handler, previous, observation, n)
+    run = run_once(model, handler, previous, observation, n)
     particles = {**run.values, **run.returned}
     if not particles:
         raise InputError("the program sampled nothing and returned nothing: a particle would be empty")
     return particles, run.gain
 
 
-def _run_once(
+def run_once(
     function: Model, handler: SiteHandler, previous: Particles | None, observation: Any, n: int
 ) -> ProgramRun:
     """Run the function of a program once."""
@@ -162,31 +150,6 @@ def _run_once(
     return run
 
 
-#: Parts of messages of numpy and Python, what the program did, and what to write instead.
-_RAW_ERRORS = {
-    "truth value of an array": (
-        "the program decides by an array that holds all particles (if, and, or, while)",
-        "use switch(name, probs, branches) or numpy.where",
-    ),
-    "scalar": (
-        "the program uses an array that holds all particles as one number (float, int, range, math, list index)",
-        "use numpy (numpy.exp, x.astype(int)) or an array as table",
-    ),
-    "read-only": (
-        "the program changes an array of particles in place",
-        "write x = x + 1 for x += 1 and numpy.where for x[i] = ..., and return the result under another name",
-    ),
-    "NoneType": (
-        "the program uses None",
-        "previous is None at the first step, and a missing observation is None: test `is None`",
-    ),
-    "zero-size array": (
-        "the program reduces an array without entries",
-        "a branch of switch is also called when no particle reaches it",
-    ),
-}
-
-
 def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
     """The error of a program with the line that raised it and a hint. Errors of other libraries are unchanged."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_HERE)]
@@ -205,7 +168,7 @@ def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
             f"previous has no {error.args[0]!r} ({place})",
             f"it has {sorted(previous)}, the sites and returned values of the step before",
         )
-    fact, *hints = next((_RAW_ERRORS[part] for part in _RAW_ERRORS if part in str(error)), ("the program fails",))
+    fact, *hints = usual_slip(error) or ("the program fails",)
     return InputError(f"{fact} ({place}): {type(error).__name__}: {error}".replace("\n", " "), *hints)
 
 

@@ -39,6 +39,9 @@ class SiteHandler(ABC):
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         """Values (size, ...) of a site, and the change of the log weights (None: no change)."""
 
+    def missing(self, name: str, distribution: Any, size: int) -> None:  # noqa: B027 (optional)
+        """Called for an observation whose value is None."""
+
     def finish(self, values: dict[str, np.ndarray]) -> None:  # noqa: B027 (optional)
         """Called at the end of a run of the program, with the values of all sites."""
 
@@ -51,6 +54,17 @@ class SampleHandler(SiteHandler):
 
     def value(self, site: Site) -> tuple[np.ndarray, np.ndarray | None]:
         return site.distribution.sample(self.rng, site.size), None
+
+
+class SimulateHandler(SampleHandler):
+    """Draws the value of every site, and of every observation that is missing, to make data."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        super().__init__(rng)
+        self.observed: dict[str, np.ndarray] = {}
+
+    def missing(self, name: str, distribution: Any, size: int) -> None:
+        self.observed[name] = distribution.sample(self.rng, size)
 
 
 class GuideHandler(SiteHandler):

@@ -169,7 +169,9 @@ class ProgramRun:
         self._last, self.inside = ("observation", name, self._where), True
         if not self.handler.observes:
             raise InputError("a guide does not observe, the model weights the particles", "remove it from the guide")
-        if value is not None:
+        if value is None:
+            self.handler.missing(name, as_distribution(distribution), self._size)
+        else:
             distribution = as_distribution(distribution)
             found: tuple[int, ...] = () if isinstance(value, float) else np.shape(value)
             self._check_event(distribution, found)

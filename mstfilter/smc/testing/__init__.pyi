@@ -4,6 +4,7 @@ from mstfilter.smc.testing.contract import (
     Contract as Contract,
     check_properties as check_properties,
 )
+from mstfilter.smc.testing.models import ModelContract as ModelContract
 from mstfilter.smc.testing.moves import (
     DensityTransitionContract as DensityTransitionContract,
     ProposalContract as ProposalContract,
