@@ -13,6 +13,7 @@ from mstfilter.smc import (
     Branching,
     Dynamics,
     Normal,
+    Program,
     Reweight,
     StateSpaceModel,
     Transition,
@@ -279,3 +280,61 @@ def test_components_with_arrays_are_compared_field_by_field():
         assert same_component(make(a), make(b))
         assert not same_component(make(a), make(c))
     assert same_component(Outer(a, 1), Outer(b, 2)) and not same_component(Inner(a), Outer(a))
+
+
+def in_place(rng, x):
+    x += rng.normal(size=len(x))
+    return x
+
+
+def decides(rng, x):
+    return x + 1 if x > 0 else x
+
+
+@pytest.mark.parametrize(
+    ("make", "message", "hint"),
+    [
+        (
+            lambda: StateSpaceModel.of(Normal(), lambda t, x: Normal(x, t), lambda x: Normal(x, 1.0)),
+            r"transition has the parameters \(t, x\), and is called with one argument.*'x'",
+            "a parameter t gets the index of the step",
+        ),
+        (
+            lambda: StateSpaceModel.of(Normal(), lambda x, time: Normal(x, time), lambda x: Normal(x, 1.0)),
+            r"transition has the parameters \(x, time\).*'time'",
+            "by these names only",
+        ),
+        (
+            lambda: StateSpaceModel.of(Normal(), lambda x: Normal(x, 1.0), lambda: Normal(0.0, 1.0)),
+            r"observation has the parameters \(\).*too many",
+            "",
+        ),
+        (
+            lambda: moved_by(lambda x: x),
+            r"StateSpaceModel.sample_transition has the parameters \(x\), and is called with 2 arguments",
+            "",
+        ),
+        (lambda: moved_by(in_place), r"step 1, transition: .*changed in place .*test_inputs.py, line", "x = x + 1"),
+        (lambda: moved_by(decides), r"step 1, transition: an array .* decides .*test_inputs.py", "numpy.where"),
+        (
+            lambda: Program(lambda y: None).bootstrap(3).run([0.1]),
+            r"ProgramInitial.model has the parameters \(y\), and is called with 2 arguments",
+            "",
+        ),
+    ],
+)
+def test_what_a_function_of_the_user_gets_is_said(make, message, hint):
+    with pytest.raises(InputError, match=message) as error:
+        make()
+    assert any(hint in one for one in error.value.hints)
+
+
+def moved_by(move):
+    model = StateSpaceModel(lambda rng, n: rng.normal(size=n), move, lambda x, y: -((x - y) ** 2))
+    return bootstrap(model, 20).run([0.1, 0.2])
+
+
+def test_an_unknown_error_of_a_function_keeps_its_type_and_gets_its_place():
+    with pytest.raises(ZeroDivisionError) as error:
+        moved_by(lambda rng, x: x / 0 if len(x) < 0 else 1 // 0)
+    assert "in step 1, transition" in error.value.__notes__

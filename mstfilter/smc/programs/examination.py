@@ -82,7 +82,7 @@ def examine_program(
     for whole in runs:
         for group in _groups(whole, thorough) if whole.n > 1 else ():
             try:
-                _check_alone(run, fresh, previous, observation, whole, group)
+                _check_alone(run, fresh, previous, observation, whole, group, thorough)
             except InputError:
                 _check_repeated(runs, step)
                 raise
@@ -152,7 +152,13 @@ def _group(run: ProgramRun, part: np.ndarray) -> np.ndarray:
 
 
 def _check_alone(
-    run: Run, fresh: dict[int, Any], previous: Any, observation: Any, whole: ProgramRun, rows: np.ndarray
+    run: Run,
+    fresh: dict[int, Any],
+    previous: Any,
+    observation: Any,
+    whole: ProgramRun,
+    rows: np.ndarray,
+    thorough: bool,
 ) -> None:
     """Compare some particles of a run with the same particles in a run of only these particles."""
     function = copied(fresh.get(id(whole.function), whole.function))
@@ -171,7 +177,7 @@ def _check_alone(
         raise InputError(message, *hints, *ALONE) from error
     alone = {(c.what, c.k): c for c in few.calls or ()}
     for call in whole.calls or ():
-        _compare(call, alone.pop((call.what, call.k), None), rows)
+        _compare(call, alone.pop((call.what, call.k), None), rows, thorough)
     for call in alone.values():
         if call.size:
             raise InputError(f"{call.what} is reached by particle {rows[0]} alone only", *ALONE)
@@ -179,8 +185,11 @@ def _check_alone(
         _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
 
 
-def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
-    """Raise InputError unless the particles `rows` have the same log densities among all particles and alone."""
+def _compare(call: Call, alone: Call | None, rows: np.ndarray, thorough: bool) -> None:
+    """Raise InputError unless the particles `rows` have the same log densities among all particles and alone.
+
+    If `thorough`, also at the value of another particle.
+    """
     position = call.positions(rows)
     here, there = np.flatnonzero(position >= 0), range(0) if alone is None else alone.reached
     among = call.densities(call.value)
@@ -193,7 +202,7 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray) -> None:
         return
     k = position[here]
     pairs = [(among, alone.densities(alone.value))]
-    if call.distribution is not None:
+    if call.distribution is not None and thorough:
         other = call.value[k[0] - 1]  # the value of another particle
         values = [np.full(c.value.shape, other, c.value.dtype) for c in (call, alone)]
         pairs.append((call.densities(values[0]), alone.densities(values[1])))
