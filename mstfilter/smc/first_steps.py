@@ -31,6 +31,7 @@ import numpy as np
 
 from mstfilter.errors import InputError, describe_error as reason
 from mstfilter.smc.population import Particles, count_particles, take
+from mstfilter.smc.streams import child
 
 #: Particles that stand for all in an examination, and draws that show whether a proposal reaches the posterior.
 MOST, DRAWS = 64, 200
@@ -212,13 +213,10 @@ def check_draws(what: str, draw: Draw, few: Few, rng: np.random.Generator) -> Pa
     rows = np.arange(MOST) % len(few)
     company = few.particles if len(few) == MOST else take(few.particles, rows)
     mixed = take(few.particles, np.where(_KEPT, rows, int(first_column(few.particles, len(few)).argmin())))
-    start = rng.bit_generator.state
-    before = _drawn(what, draw, rng, company)
-    rng.bit_generator.state = start
-    after = _drawn(what, draw, rng, mixed)
+    before = _drawn(what, draw, child(rng, "examine"), company)  # a stream that also spawns the same children
+    after = _drawn(what, draw, child(rng, "examine"), mixed)
     if first_difference(before, after, _KEPT):
-        rng.bit_generator.state = start
-        different = first_difference(before, _drawn(what, draw, rng, company))
+        different = first_difference(before, _drawn(what, draw, child(rng, "examine"), company))
         if different:
             raise InputError(f"{what}: {different} differ when it is repeated with the same generator", *REPEATED)
         _check_law(what, draw, few, rng)
@@ -260,25 +258,25 @@ def check_own_noise(what: str, drawn: Any, draw_again: Callable[[], Any], copies
 
 
 def _check_law(what: str, draw: Draw, few: Few, rng: np.random.Generator) -> None:
-    """Raise InputError if copies of a particle move differently among small than among large particles."""
+    """Raise InputError if copies of a particle move differently among copies, small and large particles."""
     from scipy.stats import ks_2samp
 
-    column, m = first_column(few.particles, len(few)), 2000
-    middle = int(few.pair[0]) if len(few.pair) else 0
-    copies = np.arange(m) % 2 == 1
-    copies[-1] = False
-    found = []
-    for other in (middle, int(np.argmin(column)), int(np.argmax(column))):
-        company = take(few.particles, np.where(copies, middle, other))
-        found.append(list(_columns(_drawn(what, draw, rng, company), copies)))
-    for among in found[1:]:
-        for a, b in zip(found[0], among, strict=True):
-            if ks_2samp(a, b, method="asymp").pvalue < _P_LAW:
-                raise InputError(
-                    f"{what}: a particle moves differently among others (mean {np.mean(a):.4g} and "
-                    f"{np.mean(b):.4g}, sd {np.std(a):.4g} and {np.std(b):.4g})",
-                    *ALONE,
-                )
+    column, m = first_column(few.particles, len(few)), 4000
+    least, most = int(column.argmin()), int(column.argmax())
+    copies = np.arange(m) % 8 == 1
+    for one in {int(few.pair[0]), most}:
+        found = []
+        for other in (one, least, most):
+            company = take(few.particles, np.where(copies, one, other))
+            found.append([*_columns(_drawn(what, draw, rng, company), copies)])
+        for among in found[1:]:
+            for a, b in zip(found[0], among, strict=True):
+                if ks_2samp(a, b, method="asymp").pvalue < _P_LAW:
+                    raise InputError(
+                        f"{what}: a particle moves differently among others (mean {np.mean(a):.4g} and "
+                        f"{np.mean(b):.4g}, sd {np.std(a):.4g} and {np.std(b):.4g})",
+                        *ALONE,
+                    )
 
 
 def _numeric(particles: Any) -> bool:

@@ -63,6 +63,9 @@ def nonlinear_gaussian(
     def log_transition(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
         return q.at(**step).log_prob(new - moved(old, step))
 
+    def sample_observation(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
+        return seen(x, step) + r.at(**step).draw(rng, len(x))
+
     return StateSpaceModel(
         lambda rng, n: m0 + p.draw(rng, n),
         with_step(transition, moves),
@@ -70,6 +73,7 @@ def nonlinear_gaussian(
         None if p.singular else lambda x: p.log_prob(x - m0),
         None if any(noise.singular for noise in q.entries) else with_step(log_transition, moves),
         batched=True,
+        sample_observation=with_step(sample_observation, sees),
     )
 
 

@@ -320,7 +320,7 @@ def test_check_compares_draws_with_densities(name):
 def test_check_finds_noise_that_depends_on_the_place():
     contract = type("Contract", (ModelContract,), {"observations": YS})
     model = by_functions(lambda rng, x: x + np.linspace(0.5, 1.5, len(x)) * rng.normal(size=len(x)))
-    assert any("at place" in (r.failure or "") for r in check_properties(model, contract))
+    assert any("differently at place" in (r.failure or "") for r in check_properties(model, contract))
 
 
 def test_inputs_reach_the_examination():

@@ -26,6 +26,7 @@ from mstfilter.smc.first_steps import DRAWS, MOST, Few, check_own_noise, check_r
 from mstfilter.smc.population import Population, take
 from mstfilter.smc.programs.handlers import GivenHandler, GuideHandler, ReplayHandler, SampleHandler
 from mstfilter.smc.programs.sites import Call, ProgramRun, recorded
+from mstfilter.smc.streams import child
 
 #: Differences that count as rounding: single-precision networks give other digits for other numbers of rows.
 _LOG_DENSITY, _VALUE = 1e-3, 1e-5
@@ -61,11 +62,9 @@ def examine_program(
     few = Few.of(after.particles, n if thorough else MOST)
     rows = few.rows
     previous = None if past is None else take(past.particles, rows)
-    start = rng.bit_generator.state
 
     def step() -> list[ProgramRun]:
-        rng.bit_generator.state = start
-        return _runs(run, rng, model, guide, previous, observation, len(rows))
+        return _runs(run, child(rng, "examine"), model, guide, previous, observation, len(rows))
 
     try:
         runs = step()

@@ -147,18 +147,37 @@ class ModelContract(ExactContract):
                 compare_alone("the transition density", model.log_transition, few, take(after.particles, few.rows))
 
     @statistical
-    def test_place_is_irrelevant(self) -> None:
-        """A particle moves with the same law at every place in the array."""
+    def test_copies_move_independently(self) -> None:
+        """Copies of a particle move independently, and with the same law at every place in the array."""
         filter, before, y, *_ = self._step(2)
         transition: Any = filter.transition
         if before is None or transition is None or not _is_numeric(before.particles):
             raise SkipTest("the particles are objects, whose moves are not compared")
-        row, n = np.array([len(before) // 2]), 20_000
-        copies = Population(take(before.particles, np.repeat(row, n)))
-        moved = _matrix(transition.predict(seeded(6), copies, y).particles)
+        n = 20_000
+        copies = Population(take(before.particles, np.full(n, len(before) // 2)))
+        moved, again = (_matrix(transition.predict(seeded(k), copies, y).particles) for k in (6, 7))
+        random = np.ptp(moved, axis=0) > 0
+        assert not (random & (moved == again).all(axis=0)).any(), (
+            "copies of a particle get the same random numbers from every generator: draw from the one that is given"
+        )
         for part in np.array_split(np.arange(n), 4):
             rest = np.setdiff1d(np.arange(n), part)
             check_same_law(moved[part], moved[rest], 4, f"copies of a particle move differently at place {part[0]}")
+        self.check_independent(moved)
+        if isinstance(transition, ProgramTransition):
+            return  # the densities of its sites have been compared
+        among = before.take(np.arange(0, len(before), 10))
+        row = len(among) // 2
+        two = among.take(np.array([row, row]))
+        pairs = [
+            (transition.predict(child(seeded(8), k), two, y), transition.predict(child(seeded(9), k), among, y))
+            for k in range(1000)
+        ]
+        a, b = (
+            np.concatenate([_matrix(population.particles)[rows] for population in side])
+            for side, rows in zip(zip(*pairs, strict=True), ([0], [row]), strict=True)
+        )
+        check_same_law(a, b, 1, "a particle moves differently with a copy and among others")
 
     def _step(self, t: int) -> Any:
         """Step t, or the last one if there are fewer."""
@@ -260,32 +279,30 @@ def _check_integral(w: np.ndarray, fault: str) -> None:
 
 
 def simulated(filter: ParticleFilter, n_steps: int, seed: int = 0) -> list[Any]:
-    """Observations drawn from the model of a filter."""
-    initial: Any = filter.initial
+    """Observations drawn from the model of a filter: those of the first of two particles."""
     rng, previous, ys = seeded(seed), None, []
     hint = "give observations: mstfilter check ./model.py:model --observations ./model.py:ys"
     for t in range(n_steps):
         at = filter.at_step(t, None)
         component: Any = at.initial if previous is None else at.transition
-        if isinstance(initial, ProgramInitial):
+        if isinstance(component, ProgramInitial | ProgramTransition):
             handler = SimulateHandler(rng)
             try:
-                run = run_once(component.model, handler, previous, None, 1)
+                run = run_once(component.model, handler, previous, None, 2)
             except Exception as error:
                 raise InputError(f"the program cannot be simulated: {error}", hint) from error
             if len(handler.observed) != 1:
-                raise InputError(
-                    f"the program observes {sorted(handler.observed) or 'nothing'} if it is simulated", hint
-                )
+                names = sorted(handler.observed) or "nothing"
+                raise InputError(f"the program observes {names} if it is simulated, expected one name", hint)
             previous = {**run.values, **run.returned}
-            ((y,),) = handler.observed.values()
+            (y, *_) = next(iter(handler.observed.values()))
         else:
             model = component.model
             if model.sample_observation is None:
                 raise InputError("the model cannot be simulated: it has no sample_observation", hint)
-            previous = model.sample_initial(rng, 1) if t == 0 else model.sample_transition(rng, previous)
+            previous = model.sample_initial(rng, 2) if t == 0 else model.sample_transition(rng, previous)
             y = np.asarray(model.sample_observation(rng, previous))[0]
-        ys.append(float(y) if np.ndim(y) == 0 and np.asarray(y).dtype.kind == "f" else y)
+        ys.append(y.item() if np.ndim(y) == 0 else y)
     return ys
 
 
