@@ -122,7 +122,7 @@ from mstfilter.smc.state_space import (
     guided as guided,
     resample_move as resample_move,
 )
-from mstfilter.smc.streams import Key as Key, RunGenerators as RunGenerators, child as child, key_of as key_of
+from mstfilter.smc.streams import Key as Key, child as child, key_of as key_of
 from mstfilter.smc.wrapped_resampling import (
     Coalesced as Coalesced,
     KeepWeights as KeepWeights,

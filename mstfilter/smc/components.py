@@ -38,14 +38,13 @@ from mstfilter.smc.population import Population, as_matrix, union
 class Reweight(Update):
     """Adds ``log_likelihood(particles, observation)`` (n,) to the log weights, as in the bootstrap filter.
 
-    Proposed particles, if any, are appended to the predicted particles. `batched` states whether the function treats
-    each particle independently (see `Component.batched`).
+    Proposed particles, if any, are appended to the predicted particles.
     """
 
     log_likelihood: Callable[[Any, Any], np.ndarray]
-    batched: bool | None = False
 
     draws: ClassVar[bool] = False
+    alone: ClassVar[bool] = True
     step_functions: ClassVar = {"log_likelihood": 2}
 
     def update(
@@ -118,7 +117,6 @@ class EssBelow(Trigger):
     """Resample if the effective sample size is below a `share`, in (0, 1], of the number of particles."""
 
     share: Annotated[float, Bounds(above=0, at_most=1, hint=_HINT_SHARE)] = 0.5
-    batched: ClassVar[bool] = True
 
     def wants(self, population: Population, t: int) -> bool:
         return population.ess < self.share * population.log_weights.shape[-1]
@@ -127,8 +125,6 @@ class EssBelow(Trigger):
 @dataclass(frozen=True)
 class Always(Trigger):
     """Resample at every step."""
-
-    batched: ClassVar[bool] = True
 
     def wants(self, population: Population, t: int) -> bool:
         return True
@@ -139,7 +135,6 @@ class Every(Trigger):
     """Resample at every `k`-th step, from step 0."""
 
     k: PositiveInt = 2
-    batched: ClassVar[bool] = True
 
     def wants(self, population: Population, t: int) -> bool:
         return t % self.k == 0
@@ -148,8 +143,6 @@ class Every(Trigger):
 @dataclass(frozen=True)
 class Never(Trigger):
     """Resample only if there are more particles than the filter keeps."""
-
-    batched: ClassVar[bool] = True
 
     def wants(self, population: Population, t: int) -> bool:
         return False

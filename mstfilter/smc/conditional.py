@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer
-from mstfilter.smc.batching import difference
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.inputs import check_observations, same_component, split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, program_step, run_program
@@ -72,7 +71,7 @@ def conditional_path(
         if now.update is not None and y is not None:
             update_rng = key.child("step", t, "update").generator() if now.update.draws else rng
             moved, past = past, now.update.update(update_rng, past, None, y)
-            if difference(past.particles, moved.particles) is not None:  # the given particle would be updated again
+            if not same_component(past.particles, moved.particles):  # the given particle would be updated again
                 raise InputError(
                     f"step {t}: the update changes the particles, and conditional SMC needs one that only weights",
                     "use a model of the whole state in place of a Rao-Blackwellised filter",

@@ -189,7 +189,6 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
         with_step(weigh, step_parameters(log_likelihood, 1)),
         lambda x: log_start[x],
         lambda old, new: log_moves[old, new],
-        batched=None,
     )
 
 

@@ -72,7 +72,6 @@ def nonlinear_gaussian(
         with_step(log_likelihood, sees),
         None if p.singular else lambda x: p.log_prob(x - m0),
         None if any(noise.singular for noise in q.entries) else with_step(log_transition, moves),
-        batched=True,
         sample_observation=with_step(sample_observation, sees),
     )
 

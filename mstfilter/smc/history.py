@@ -68,8 +68,6 @@ class History(Mapping[str, np.ndarray]):
     state: State | None = None  #: the last state of a single run
     #: Seed or (arm, seed) -> why the run ended early: all weights became zero.
     lost: Mapping[Any, str] = field(default_factory=dict)
-    #: Arm -> why `run_many` made its runs one by one; the arm of a single filter is "filter".
-    single: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values_:

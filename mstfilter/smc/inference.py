@@ -23,19 +23,21 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from mstfilter.errors import InputError, LostRunError, check_integer
-from mstfilter.smc.batching import NotTogether, RunFilters, run_together
 from mstfilter.smc.conditional import conditional_path
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.history import log_evidence
-from mstfilter.smc.inputs import check_observations
-from mstfilter.smc.population import Particles, flat_columns
+from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.population import Particles, flat_columns, union
 from mstfilter.smc.state_space import metropolis
-from mstfilter.smc.streams import Key, rows_of
+from mstfilter.smc.streams import Key
+from mstfilter.smc.sweep import can_sweep, sweep
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 
@@ -90,7 +92,7 @@ class _Posterior:
     observations: list[Any]
     log_prior: Callable[[np.ndarray], float]
     batched: bool = False
-    n_sweeps: int = 0
+    n_runs: int = 0  #: so far: the model is examined once
 
     def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
         """Mapping with the given ``theta`` (R, d), ``log_density`` (R,) and ``log_evidence`` (R,)."""
@@ -106,14 +108,14 @@ class _Posterior:
     def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
         """Log evidences of filters that run as one batch, or one by one if batching is impossible."""
         if self.batched and self.observations:
-            try:
+            if can_sweep(self._filter(thetas[0])):
                 return self._in_one_sweep(thetas, seeds)
-            except NotTogether as why:
-                self.batched = False
-                warnings.warn(f"the filters are run one by one: {why.slot}: {why.reason}", stacklevel=5)
+            self.batched = False
+            warnings.warn("the filters are run one by one: a component looks at several particles", stacklevel=5)
         found = np.full(len(thetas), -np.inf)
         for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
-            with suppress(LostRunError):
+            with suppress(LostRunError), unexamined(self.n_runs > 0):
+                self.n_runs += 1
                 state, _ = self._filter(theta).run(self.observations, seed)
                 found[r] = state.log_evidence
         return found
@@ -125,21 +127,39 @@ class _Posterior:
         return filter
 
     def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
-        """Log evidences of a batch of filters. The components hold one parameter vector per particle.
-
-        Batches 0, 1, 2, 4, 8, ... are compared with single runs.
-        """
+        """Log evidences of filters in one sweep. The components hold one parameter vector for each particle."""
         first = self._filter(thetas[0])
+        if not self.n_runs:
+            self._examine(first, thetas)
+        self.n_runs += len(thetas)
 
         @lru_cache(maxsize=4)
         def made(runs: tuple[int, ...]) -> ParticleFilter:
-            return self.filter_of(np.repeat(thetas[list(runs)], first.n, axis=0).T.view(rows_of(first.n)))
+            return self.filter_of(np.repeat(thetas[list(runs)], first.n, axis=0).T)
 
-        filters = RunFilters(lambda run: self.filter_of(thetas[run]), lambda runs: made(tuple(runs.tolist())))
-        check = not self.n_sweeps & (self.n_sweeps - 1)
-        self.n_sweeps += 1
-        runs = run_together(filters, self.observations, seeds, {"z": log_evidence}, check=check, rounding=True)
+        key = Key(int(seeds[0])).child("sweep", *map(int, seeds[1:3]))
+        runs = sweep(
+            first, self.observations, len(thetas), key, {"z": log_evidence}, lambda runs: made(tuple(runs.tolist()))
+        )
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
+
+    def _examine(self, first: ParticleFilter, thetas: np.ndarray) -> None:
+        """Examine the model, and compare the likelihood of many parameter vectors with that of one."""
+        with suppress(LostRunError):
+            list(islice(first.iterate(self.observations, 0), 3))
+        y, u = split_input(self.observations[0])
+        singles: list[Any] = [self.filter_of(theta).at_step(0, u) for theta in thetas[:2]]
+        if y is None or len(singles) < 2 or first.update is None:
+            return
+        both: Any = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T).at_step(0, u)
+        drawn = [one.initial.sample(Key(k).generator(), y, first.n) for k, one in enumerate(singles)]
+        alone = [one.update.update(Key(0).generator(), x, None, y) for one, x in zip(singles, drawn, strict=True)]
+        found = both.update.update(Key(0).generator(), union(*drawn), None, y).log_weights
+        if not np.allclose(found, np.concatenate([x.log_weights for x in alone]), rtol=1e-6, atol=1e-6):
+            raise InputError(
+                "the likelihood with one parameter vector for each particle is not that of single filters",
+                "with batched=True, filter_of gets parameters of shape (d, R n): use them like particles",
+            )
 
 
 def pmmh(
@@ -171,8 +191,8 @@ def pmmh(
     batched : bool
         Whether ``filter_of`` also accepts parameters (d, m), one column for each of the m particles of all chains.
         The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
-        ``theta[0][..., None]``. Some estimates are compared with single runs (see `mstfilter.smc.batching`). If they
-        differ, a warning is issued and the filters run one by one.
+        ``theta[0][..., None]``. If a component looks at several particles, the filters run one by one, with a
+        warning.
 
     Raises
     ------

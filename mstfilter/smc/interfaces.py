@@ -24,7 +24,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class Component(AtStep, ABC):
     """A component that takes part in a step.
 
     At step t with input u, the filter uses ``component.at_step(t, u)`` (see `mstfilter.smc.inputs`). Class attributes
-    can override `properly_weighted`, `draws` and `batched`, as in ``properly_weighted = False``.
+    can override `properly_weighted`, `draws` and `alone`, as in ``properly_weighted = False``.
     """
 
     def __init_subclass__(cls, **named: Any) -> None:
@@ -63,11 +63,10 @@ class Component(AtStep, ABC):
         return True
 
     @property
-    def batched(self) -> bool | None:
-        """Whether the component treats each particle independently, so that it can process several runs together.
+    def alone(self) -> bool:
+        """Whether the component processes each particle as if it were alone, and returns as many particles.
 
-        With None, `run_many` compares a batch with single runs, and makes the runs one by one if the results differ
-        (see `mstfilter.smc.batching`). With False, `run_many` makes the runs one by one.
+        The particles of many runs can then be processed in one call (`mstfilter.smc.sweep`).
         """
         return False
 
@@ -178,9 +177,6 @@ class WeightResampler(Resampler):
 
 class Trigger(Bounded, ABC):
     """Decides whether a step resamples."""
-
-    #: Whether `wants` also takes the populations of R runs together, with `ess` (R,), and returns (R,) or one bool.
-    batched: ClassVar[bool] = False
 
     @abstractmethod
     def wants(self, population: Population, t: int) -> bool:

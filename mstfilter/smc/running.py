@@ -9,31 +9,35 @@
 >>> runs["log_evidence"].shape                         # (arm, seed, time)
 (2, 20, 50)
 
-Every run equals ``filter.run(observations, seed)`` bit for bit, for any number of workers and any other filters. Runs
-are processed together as arrays if possible (see `mstfilter.smc.batching`). Run k of every filter has the same seed
-and random streams, so differences between filters have less noise.
+Runs of filters whose components process each particle alone, as those of all models do, are made in sweeps, as arrays
+(see `mstfilter.smc.sweep`): independent runs with the law of single ones. With ``together=False``, or if a component
+looks at several particles, run k equals ``filter.run(observations, seeds[k])`` bit for bit. Nothing depends on the
+number of workers. All filters get the same seeds and streams, so differences between filters have less noise.
 """
 
 from __future__ import annotations
 
 import re
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import product
+from hashlib import sha256
+from itertools import islice, product
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, InputWarning, LostRunError, check_integer, naming
+from mstfilter.errors import InputError, LostRunError, check_integer, naming
 from mstfilter.lazy import progress_of
 from mstfilter.processes import environment
-from mstfilter.smc.batching import Collected, NotTogether, RunFilters, check_together, run_together
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.history import Collector, History, check_one_shape, collect, log_evidence
 from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Info, State
+from mstfilter.smc.streams import Key
+from mstfilter.smc.sweep import Collected, can_sweep, sweep
 
 
 def run_many(
@@ -42,6 +46,7 @@ def run_many(
     seeds: Iterable[int] = range(10),
     *,
     workers: int = 1,
+    together: bool = True,
     progress: bool | Callable[[int, int | None], None] = False,
     **collectors: Collector,
 ) -> History:
@@ -58,6 +63,8 @@ def run_many(
     workers : int
         Number of processes. With 1, all runs are made in the calling process. Otherwise joblib's loky starts workers,
         which get the filters by cloudpickle. If a worker dies, InputError names the runs that may have caused it.
+    together : bool
+        Whether runs are made in sweeps where possible. Otherwise each one is the single run with its seed.
     progress : bool or callable
         True shows a progress bar. A function is called as ``progress(done, total)`` whenever runs finish.
     **collectors
@@ -68,13 +75,7 @@ def run_many(
     History
         Arrays (arm, seed, time, ...), or (seed, time, ...) for a single filter. Axis "arm" has one entry per filter.
         A run ends if all weights are zero (`LostRunError`). From this step on, the log evidence is -inf, and other
-        results are NaN. `History.lost` gives the reason for each such run. `History.single` states why runs were
-        made one by one.
-
-    Warns
-    -----
-    InputWarning
-        If runs were made one by one because a component that states ``batched=True`` cannot process them together.
+        results are NaN. `History.lost` gives the reason for each such run.
     """
     arms = dict(filters) if isinstance(filters, Mapping) else {_ALONE: filters}
     if not arms:
@@ -85,35 +86,21 @@ def run_many(
         raise InputError("there are no seeds")
     if len(set(seeds)) < len(seeds):
         raise InputError(f"a seed occurs twice in {seeds}", "every run has a seed of its own")
-    job = _Job(arms, list(check_observations(observations)), seeds, collectors)
+    job = _Job(arms, list(check_observations(observations)), seeds, collectors, together)
     found: dict[_Task, Collected] = {}
-    single: dict[str, str] = {}
     with progress_of(progress, "runs") as advance:
-        for part in _finished(job, job.chunks(workers), workers):
-            found.update(part.runs)
-            single.update(part.single)
+        for runs in _finished(job, job.chunks(), workers):
+            found.update(runs)
             advance(len(found), len(arms) * len(job.seeds))
-    for arm, why in single.items():
-        component = getattr(arms[arm], why.partition(":")[0], None)
-        if getattr(component, "batched", None) is True:
-            warnings.warn(InputWarning(f"the runs of {arm!r} are made one by one: {why}"), stacklevel=2)
-    return job.history(found, single, isinstance(filters, Mapping))
+    return job.history(found, isinstance(filters, Mapping))
 
 
-_MOST_ROWS = 100_000  # particles of runs that are processed together; more are not faster
+_MOST_ROWS = 100_000  # particles of a sweep; more are not faster
 _ALONE = "filter"  # the arm of a single filter
 
 
 _Task = tuple[str, int]  # an arm and a seed
 _Chunk = tuple[str, list[int]]  # an arm and some seeds
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Some finished runs, and why they were not processed together, if so."""
-
-    runs: dict[_Task, Collected]
-    single: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -124,42 +111,36 @@ class _Job:
     ys: list[Any]
     seeds: list[int]
     collectors: dict[str, Collector]
+    together: bool
 
     def where(self, arm: str, seed: int | None = None) -> str:
         """Name of the filter and seed for error messages. A single filter has no name."""
         return ", ".join([f"arm {arm!r}"] * (arm != _ALONE) + [f"seed {seed}"] * (seed is not None))
 
-    def chunks(self, workers: int) -> list[_Chunk]:
-        """Divide the runs into chunks for workers. A chunk has several seeds if runs can be processed together."""
+    def sweeps(self, arm: str) -> bool:
+        """Whether the runs of a filter are made in sweeps."""
+        return self.together and can_sweep(self.arms[arm])
+
+    def chunks(self) -> list[_Chunk]:
+        """Divide the runs into sweeps and single runs, whatever the number of workers."""
         chunks = []
         for arm, filter in self.arms.items():
-            share = -(-len(self.seeds) // (4 * workers if workers > 1 else 1))
-            size = max(1, min(share, _MOST_ROWS // filter.n))
-            try:
-                check_together(filter)
-            except NotTogether:
-                size = 1
+            size = max(1, _MOST_ROWS // filter.n) if self.sweeps(arm) else 1
             chunks += [(arm, self.seeds[k : k + size]) for k in range(0, len(self.seeds), size)]
         return chunks
 
-    def run(self, arm: str, seeds: list[int]) -> _Part:
-        """Make the runs of a filter with some seeds."""
-        runs, why = self.made(arm, seeds)
-        found = {(arm, seed): run for seed, run in zip(seeds, runs, strict=True)}
-        return _Part(found, {arm: why} if why else {})
-
-    def made(self, arm: str, seeds: list[int]) -> tuple[list[Collected], str]:
-        """Runs of a filter, and why they cannot be processed together ("" if they can)."""
-        filter, why = self.arms[arm], ""
-        try:
-            check_together(filter)
-            if len(seeds) > 1:
-                same = RunFilters(lambda run: filter, lambda runs: filter)
-                with naming(self.where(arm)):
-                    return run_together(same, self.ys, seeds, self.collectors), ""
-        except NotTogether as error:
-            why = f"{error.slot}: {error.reason}"
-        return [self.single(arm, seed) for seed in seeds], why
+    def run(self, arm: str, seeds: list[int]) -> dict[_Task, Collected]:
+        """Make the runs of a filter with some seeds. The model is examined once."""
+        filter = self.arms[arm]
+        if not self.sweeps(arm):
+            with unexamined(seeds[0] != self.seeds[0]):
+                return {(arm, seed): self.single(arm, seed) for seed in seeds}
+        with naming(self.where(arm)):
+            with suppress(LostRunError):
+                list(islice(filter.iterate(self.ys, seeds[0]), 3))
+            key = Key(seeds[0]).child("sweep", sha256(repr(seeds).encode()).hexdigest())
+            runs = sweep(filter, self.ys, len(seeds), key, self.collectors)
+        return {(arm, seed): run for seed, run in zip(seeds, runs, strict=True)}
 
     def single(self, arm: str, seed: int) -> Collected:
         """One run, up to the step at which all weights are zero."""
@@ -168,7 +149,7 @@ class _Job:
             steps = _until_lost(self.arms[arm].iterate(self.ys, seed), lost)
             return Collected(dict(collect(steps, **self.collectors)), "".join(lost))
 
-    def history(self, found: Mapping[_Task, Collected], single: Mapping[str, str], has_arms: bool) -> History:
+    def history(self, found: Mapping[_Task, Collected], has_arms: bool) -> History:
         """The results of all runs. The axis "arm" has an entry for each filter; it is absent for a single filter."""
         sizes = {"arm": len(self.arms), "seed": len(self.seeds), "time": len(self.ys)}
         coords = {"arm": list(self.arms), "seed": np.asarray(self.seeds), "time": np.arange(sizes["time"])}
@@ -179,7 +160,7 @@ class _Job:
             rows = self.joined(name, [run.rows[name] for run in runs], sizes["time"])
             values[name] = rows.reshape(*(sizes[dim] for dim in dims), *rows.shape[2:])
         lost = {task if has_arms else task[1]: found[task].lost for task in found if found[task].lost}
-        return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost, single=dict(single))
+        return History(values, dims, {dim: coords[dim] for dim in dims}, lost=lost)
 
     def joined(self, name: str, rows: list[np.ndarray], n_steps: int) -> np.ndarray:
         """Values (run, time, ...) of a collector; -inf or NaN after all weights of a run became zero."""
@@ -204,7 +185,7 @@ def _until_lost(steps: Iterable[tuple[State, Info]], lost: list[str]) -> Iterabl
 
 
 # --- processes ----------------------------------------------------------------------------------------------------
-def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
+def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[dict[_Task, Collected]]:
     """Results of chunks of runs, in the order in which the chunks finish.
 
     Workers are new processes and not forks, because a fork of a process with threads can deadlock.
@@ -219,9 +200,9 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
     try:
         with environment(), parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
             parallel = Parallel(batch_size=1, return_as="generator_unordered")
-            for part in parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks):
-                left = [task for task in left if task not in part.runs]
-                yield part
+            for runs in parallel(delayed(_in_worker)(job, *chunk) for chunk in chunks):
+                left = [task for task in left if task not in runs]
+                yield runs
     except TerminatedWorkerError as error:
         code = re.search(r"exit codes of the workers are {(.*?)}", str(error))
         how = f" ({code[1]})" if code else ""
@@ -234,7 +215,7 @@ def _finished(job: _Job, chunks: list[_Chunk], workers: int) -> Iterator[_Part]:
         ) from None
 
 
-def _in_worker(job: _Job, arm: str, seeds: list[int]) -> _Part:
+def _in_worker(job: _Job, arm: str, seeds: list[int]) -> dict[_Task, Collected]:
     """Make the runs of a chunk, with one thread in libraries that ignore the environment variables."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)

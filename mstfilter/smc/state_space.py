@@ -61,8 +61,9 @@ _Chains = TypeVar("_Chains")  # states of Markov chains
 class StateSpaceModel(AtStep):
     """A hidden Markov model on any state space.
 
-    The functions may have further parameters: ``t`` gets the index of the step, and ``u`` gets its input (see
-    `mstfilter.smc.inputs`).
+    The functions process each particle as if it were alone; a filter examines this at the first steps
+    (`mstfilter.smc.first_steps`). They may have further parameters: ``t`` gets the index of the step, and ``u`` gets
+    its input (see `mstfilter.smc.inputs`).
 
     Parameters
     ----------
@@ -76,8 +77,6 @@ class StateSpaceModel(AtStep):
         ``(particles) -> (n,)`` log p(x_0), for guided filters and moves.
     log_transition : callable, optional
         ``(previous, new) -> (n,)`` log f(x_t | x_{t-1}) of paired rows, for guided filters and moves.
-    batched : bool or None
-        Whether the functions treat each particle independently (see `Component.batched`).
     sample_observation : callable, optional
         ``(rng, particles) -> (n, ...)`` draws y_t given x_t, to make data.
     """
@@ -87,7 +86,6 @@ class StateSpaceModel(AtStep):
     log_likelihood: Callable[[Any, Any], np.ndarray]
     log_initial: Callable[[Any], np.ndarray] | None = None
     log_transition: Callable[[Any, Any], np.ndarray] | None = None
-    batched: bool | None = False
     sample_observation: Callable[[np.random.Generator, Any], Any] | None = None
 
     step_functions: ClassVar = {
@@ -135,7 +133,6 @@ class StateSpaceModel(AtStep):
             with_step(log_likelihood, observes),
             partial(_log_state, first),
             with_step(log_density, moves),
-            batched=None,
             sample_observation=with_step(sample_observation, observes),
         )
 
@@ -181,20 +178,8 @@ def _log_likelihood(distribution: Distribution, y: Any) -> np.ndarray:
     return distribution.log_prob(y)
 
 
-class _OfModel(AtStep):
-    """A component that draws from a model or from a proposal."""
-
-    model: StateSpaceModel
-    proposal: Callable[..., Any] | None
-
-    @property
-    def batched(self) -> bool | None:
-        """The field `batched` of the model. With a proposal, True becomes None, so `run_many` tests the proposal."""
-        return None if self.model.batched and self.proposal is not None else self.model.batched
-
-
 @dataclass(frozen=True)
-class Prior(_OfModel, Proposal):
+class Prior(Proposal):
     """Draws the first particles from p(x_0), or from a proposal q(x_0 | y_0) with weights p(x_0) / q.
 
     Parameters
@@ -207,6 +192,7 @@ class Prior(_OfModel, Proposal):
 
     model: StateSpaceModel
     proposal: Callable[..., Any] | None = None
+    alone: ClassVar[bool] = True
     step_functions: ClassVar = {"model": None, "proposal": 1}
 
     def sample(self, rng: np.random.Generator, observation: Any, n: int) -> Population:
@@ -248,7 +234,7 @@ class Prior(_OfModel, Proposal):
 
 
 @dataclass(frozen=True)
-class Dynamics(_OfModel, DensityTransition):
+class Dynamics(DensityTransition):
     """Moves particles by f(x_t | x_{t-1}), or by a proposal q(x_t | x_{t-1}, y_t) with weights f / q.
 
     Parameters
@@ -262,6 +248,7 @@ class Dynamics(_OfModel, DensityTransition):
 
     model: StateSpaceModel
     proposal: Callable[..., Any] | None = None
+    alone: ClassVar[bool] = True
     step_functions: ClassVar = {"model": None, "proposal": 2}
 
     def predict(self, rng: np.random.Generator, population: Population, observation: Any) -> Population:
@@ -323,6 +310,7 @@ class PriorityLookahead(Lookahead):
     """Log priority given by a function ``(particles, y) -> (n,)`` of x_{t-1} and y_t."""
 
     function: Callable[..., np.ndarray]
+    alone: ClassVar[bool] = True
     step_functions: ClassVar = {"function": 2}
 
     def log_priority(self, population: Population, observation: Any) -> np.ndarray:
@@ -456,7 +444,7 @@ def bootstrap(
     return ParticleFilter(
         initial=Prior(model),
         transition=Dynamics(model),
-        update=Reweight(model.log_likelihood, model.batched),
+        update=Reweight(model.log_likelihood),
         resampler=resampler,
         trigger=trigger,
         n=n,

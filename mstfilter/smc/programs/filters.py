@@ -59,7 +59,7 @@ class _ProgramStep(Component):
     model: Model
     guide: Model | None = None
 
-    batched: ClassVar[bool | None] = None
+    alone: ClassVar[bool] = True
     step_functions: ClassVar = {"model": 2, "guide": 2}
 
     def _advance(self, rng: np.random.Generator, past: Population | None, observation: Any, n: int) -> Population:
