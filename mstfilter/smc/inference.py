@@ -139,7 +139,7 @@ class _Posterior:
 
         key = Key(int(seeds[0])).child("sweep", *map(int, seeds[1:3]))
         runs = sweep(
-            first, self.observations, len(thetas), key, {"z": log_evidence}, lambda runs: made(tuple(runs.tolist()))
+            first, self.observations, seeds, key, {"z": log_evidence}, lambda runs: made(tuple(runs.tolist()))
         )
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
 

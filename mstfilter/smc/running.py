@@ -139,7 +139,7 @@ class _Job:
             with suppress(LostRunError):
                 list(islice(filter.iterate(self.ys, seeds[0]), 3))
             key = Key(seeds[0]).child("sweep", sha256(repr(seeds).encode()).hexdigest())
-            runs = sweep(filter, self.ys, len(seeds), key, self.collectors)
+            runs = sweep(filter, self.ys, seeds, key, self.collectors)
         return {(arm, seed): run for seed, run in zip(seeds, runs, strict=True)}
 
     def single(self, arm: str, seed: int) -> Collected:

@@ -6,7 +6,7 @@ with 20,000 particles instead of 200 calls with 100: a thirtieth of the time.
 
 >>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, log_evidence
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
->>> runs = sweep(bootstrap(model, 100), [0.3, -0.2], 5, Key(0), {"log_evidence": log_evidence})
+>>> runs = sweep(bootstrap(model, 100), [0.3, -0.2], [1, 2, 3, 4, 5], Key(0), {"log_evidence": log_evidence})
 >>> [run.rows["log_evidence"].shape for run in runs]
 [(2,), (2,), (2,), (2,), (2,)]
 
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import LostRunError
+from mstfilter.errors import LostRunError, naming
 from mstfilter.smc.components import Always, EssBelow, Never
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence, resampled, stacked
@@ -52,18 +52,18 @@ def can_sweep(filter: ParticleFilter) -> bool:
 def sweep(
     filter: ParticleFilter,
     observations: list[Any],
-    n_runs: int,
+    seeds: list[int],
     key: Key,
     collectors: Mapping[str, Collector],
     filter_of: Callable[[np.ndarray], ParticleFilter] | None = None,
 ) -> list[Collected]:
-    """Results of `n_runs` independent runs.
+    """Results of independent runs, which have the names `seeds` and draw from the streams of `key`.
 
     If the runs have different parameters, ``filter_of(runs)`` returns the filter for the particles of the given runs,
     n rows for each in this order; `filter` is then that of any run.
     """
     keep_freed_memory()
-    return _Sweep(filter, filter_of or (lambda runs: filter), n_runs, key, collectors).run(observations)
+    return _Sweep(filter, filter_of or (lambda runs: filter), seeds, key, collectors).run(observations)
 
 
 class _Sweep:
@@ -73,11 +73,12 @@ class _Sweep:
         self,
         filter: ParticleFilter,
         filter_of: Callable[[np.ndarray], ParticleFilter],
-        n_runs: int,
+        seeds: list[int],
         key: Key,
         collectors: Mapping[str, Collector],
     ) -> None:
         self.filter, self.filter_of, self.key, self.collectors = filter, filter_of, key, collectors
+        self.seeds, n_runs = seeds, len(seeds)
         self.runs = np.arange(n_runs)  # those that are not lost
         self.population: Population | None = None
         self.ess = self.log_mean = np.zeros(n_runs)
@@ -93,9 +94,9 @@ class _Sweep:
             if len(self.runs):
                 self.step(t, *split_input(observation))
         tables = {name: self.table(name) for name in self.collectors}
-        ends = np.bincount(
-            np.concatenate([runs for runs, _ in self.found] or [[]]).astype(int), minlength=self.n_runs
-        )
+        ends = np.zeros(self.n_runs, int)
+        for runs, _ in self.found:
+            ends[runs] += 1
         return [
             Collected({name: table[: ends[r], r] for name, table in tables.items()}, self.lost.get(r, ""))
             for r in range(self.n_runs)
@@ -105,7 +106,8 @@ class _Sweep:
         """Values (T, R, ...) of a collector. Those of a run are undefined after all its weights are zero."""
         check_one_shape(name, [found[name].shape[1:] for _, found in self.found])
         values = [found[name] for _, found in self.found]
-        shape, kind = (values[0].shape[1:], np.result_type(*values)) if values else ((), np.dtype(float))
+        shape = values[0].shape[1:] if values else ()
+        kind = np.result_type(*values) if values else np.dtype(float)
         table = np.zeros((len(values), self.n_runs, *shape), kind)
         for t, (runs, _) in enumerate(self.found):
             table[t, runs] = values[t]
@@ -216,7 +218,7 @@ class _Sweep:
             return independent_draws_of_runs(rng, weights), None
         index, found = [], []
         for k, row in enumerate(rows.tolist()):
-            stream = self.key.child("resampler", t, "run", int(self.runs[row])).generator()
+            stream = self.key.child("resampler", t, int(self.runs[row])).generator()
             one = Population(take(population.particles, np.arange(row * n, row * n + n)), lw[k])
             selected = resampler.resample(stream, one, n)
             index.append(selected.parents["ancestor"])
@@ -235,7 +237,7 @@ class _Sweep:
         values = {
             name: found[collector]
             if collector in found
-            else stacked(name, [np.asarray(collector(*s)) for s in steps])
+            else stacked(name, [self.collected(collector, row, step) for row, step in enumerate(steps)])
             for name, collector in self.collectors.items()
         }
         self.found.append((self.runs, values))
@@ -252,10 +254,14 @@ class _Sweep:
             parents["ancestor"] = own
         particles = take(self.population.particles, np.arange(rows.start, rows.stop))
         population = Population(particles, self.population.log_weights[rows], parents)
-        key = self.key.child("run", int(self.runs[row]))
-        return State(t + 1, population, key, self.filter.properly_weighted), Info(
-            t, n, n, float(fused_ess[row]), bool(moved[row])
-        )
+        key = Key(self.seeds[self.runs[row]]).child("sweep")
+        info = Info(t, n, n, float(fused_ess[row]), bool(moved[row]))
+        return State(t + 1, population, key, self.filter.properly_weighted), info
+
+    def collected(self, collector: Collector, row: int, step: tuple[State, Info]) -> np.ndarray:
+        """The value of a collector for one run."""
+        with naming(f"seed {self.seeds[self.runs[row]]}"):
+            return np.asarray(collector(*step))
 
 
 def summaries(log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

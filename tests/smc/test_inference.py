@@ -18,6 +18,7 @@ from mstfilter.smc import (
     Categorical,
     ConditionallyLinear,
     Dynamics,
+    Kld,
     LargestWeights,
     Linear,
     Normal,
@@ -270,7 +271,6 @@ def filter_of(theta, n=30):
         lambda x, y: -0.5 * ((y - x) / TAU) ** 2 - np.log(TAU * np.sqrt(2 * np.pi)),
         lambda x: stats.norm(0, SD0).logpdf(x),
         lambda old, new: -0.5 * ((new - rho * old) / SIGMA) ** 2,
-        batched=True,
     )
     return bootstrap(model, n)
 
@@ -366,8 +366,8 @@ def test_what_chains_reject():
     for scale in (0.0, [0.1, 0.2], [[-1.0]]):
         with pytest.raises(InputError, match="scale is"):
             pmmh(filter_of, YS, log_prior, [0.1], scale, 5)
-    with pytest.warns(UserWarning, match="one by one: initial: it is not batched"):
-        pmmh(lambda theta: bootstrap(replace(AR1, batched=False), 5), YS, log_prior, [0.1], 0.5, 5, batched=True)
+    with pytest.warns(UserWarning, match="one by one: a component looks at several particles"):
+        pmmh(lambda theta: replace(bootstrap(AR1, 5), size=Kld(n_min=2, n_max=9)), YS, log_prior, [0.1], 0.5, 5, batched=True)
     with pytest.raises(InputError, match="not properly weighted"):
         pmmh(lambda theta: bootstrap(AR1, 5, LargestWeights()), YS, log_prior, [0.1], 0.5, 5)
     with pytest.raises(InputError, match=r"start has shape \(1, 1\)"):
