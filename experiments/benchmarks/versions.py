@@ -87,13 +87,11 @@ MARKOV = smc.StateSpaceModel(
     lambda rng, n: rng.integers(0, 3, n),
     lambda rng, x: (x + (rng.random(x.shape) < 0.2)) % 3,
     lambda x, y: -0.5 * (y - x) ** 2,
-    batched=True,
 )
 AR1 = smc.StateSpaceModel(
     lambda rng, n: rng.standard_normal(n),
     lambda rng, x: 0.9 * x + 0.6 * rng.standard_normal(x.shape),
     lambda x, y: -0.5 * ((y - x) / 0.4) ** 2,
-    batched=True,
 )
 LINEAR = smc.linear_gaussian([[0.9]], [[0.36]], [[1.0]], [[0.16]], [0.0], [[1.0]])
 OF = smc.StateSpaceModel.of(smc.Normal(0.0, 1.4), lambda x: smc.Normal(0.9 * x, 0.6), lambda x: smc.Normal(x, 0.4))

@@ -64,7 +64,6 @@ def filter_of(theta: np.ndarray, n: int) -> ParticleFilter:
         lambda rng, x: rho * x + sigma * rng.standard_normal(x.shape),
         lambda x, y: -0.5 * ((y - x) / TAU) ** 2,
         log_transition=lambda old, new: -0.5 * ((new - rho * old) / sigma) ** 2,
-        batched=True,
     )
     return bootstrap(model, n)
 
