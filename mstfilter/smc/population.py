@@ -124,6 +124,15 @@ def take(particles: Particles, indices: np.ndarray) -> Particles:
     return tuple(particles[int(i)] for i in indices)
 
 
+def _all_same(particles: Particles) -> bool:
+    """Whether all particles are one object, or equal rows of arrays."""
+    if isinstance(particles, np.ndarray):
+        return bool((particles == particles[0]).all())
+    if isinstance(particles, Mapping):
+        return all(_all_same(a) for a in particles.values())
+    return all(particle is particles[0] for particle in particles)
+
+
 def as_matrix(particles: Any) -> np.ndarray:
     """(n, d) float64 rows of particles that are an array or a mapping of arrays; InputError for objects."""
     if isinstance(particles, np.ndarray) and particles.dtype != object:
@@ -282,11 +291,22 @@ class Population:
 
     @property
     def best(self) -> Any:
-        """The particle of largest weight; the first particle if several have the largest weight."""
-        index = int(np.argmax(self.log_weights))
-        if isinstance(self.particles, Mapping):
-            return {name: a[index] for name, a in self.particles.items()}
-        return self.particles[index]
+        """The particle of largest weight.
+
+        Raises InputError if different particles share the largest weight, as after resampling, because any of them
+        would be a random draw. Particles are the same if they are one object, or have equal values in all arrays.
+        """
+        heaviest = np.flatnonzero(self.log_weights == self.log_weights.max())
+        tied = take(self.particles, heaviest)
+        if not _all_same(tied):
+            raise InputError(
+                f"{len(heaviest)} of {len(self)} particles share the largest weight, so none of them is the best",
+                "of scenes, mstfilter.Belief(population).estimate() is the best single answer",
+                "of numbers, use the weighted mean: np.average(particles, axis=0, weights=population.weights)",
+            )
+        if isinstance(tied, Mapping):
+            return {name: a[0] for name, a in tied.items()}
+        return tied[0]
 
     @classmethod
     def unchecked(cls, particles: Particles, log_weights: np.ndarray) -> Population:
