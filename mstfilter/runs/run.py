@@ -180,6 +180,7 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
                 "choose another folder, or remove this one (on the command line: --replace)",
             )
     folder.repair()
+    folder.check_origin()
     folder.set_status("running")
     return folder
 

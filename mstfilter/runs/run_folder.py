@@ -177,14 +177,34 @@ class RunFolder:
 
         Raises InputError if a file is missing or damaged, or if files of a pause are inconsistent.
         """
-        if self.n_pauses > len(self.description["recording"]["pauses"]):
-            raise InputError(f"{self.path}: there are more pauses than run.json lists")
+        self.check_origin()
         before = 0
         for t in range(self.n_pauses):
             before = self._check_pause(t, before)
         for other in self.compared().values():
             other.check()
         return self
+
+    def check_origin(self) -> None:
+        """Raise InputError if there are more pauses than run.json lists, or a pause is of another run.
+
+        The state of pause t has made t + 1 steps with the seed in run.json.
+        """
+        description = self.description
+        if self.n_pauses > len(description["recording"]["pauses"]):
+            raise InputError(
+                f"{self.path}: there are more pauses than run.json lists", "remove the folders of the last pauses"
+            )
+        for t in range(self.n_pauses):
+            state = self.state(t)
+            found, expected = (state.t - 1, state.key.seed), (t, description["seed"])
+            if found != expected:
+                raise InputError(
+                    f"{self.pause(t)} is of another run or pause: its state is of pause {found[0]} with seed "
+                    f"{found[1]}, expected pause {t} with seed {expected[1]}",
+                    f"put the right folder there, or remove the folders of pause {t} and all later pauses; the same "
+                    "call or command computes them again",
+                )
 
     def _check_pause(self, t: int, n_before: int) -> int:
         """Check the files of pause `t` after a pause with `n_before` hypotheses. Returns the number of hypotheses."""

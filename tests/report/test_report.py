@@ -183,7 +183,7 @@ def test_only_the_heaviest_of_many_hypotheses_have_cards(tmp_path):
         labels[k % 15, 3:6, :2] = 1
         labels[15 - k % 15, 9:12, : 1 + k // 15] = 2
         many.append(replace(first, labels=labels, objects=type(first).from_labels(labels, first.grid).objects))
-    state = State(1, Population(tuple(many)), Key(0), False)
+    state = State(1, Population(tuple(many)), Key(7), False)
     save_state(run.pause(0) / "state.npz", state, HypothesisCodec())
     info = run.info(0)
     info |= {"weights": [1 / 20] * 20, "n": 20, "quality": {f: [0.5] * 20 for f in info["quality"]}}

@@ -105,6 +105,28 @@ def test_a_folder_of_another_run_is_refused(recording, finished, tmp_path):
         filter_recording(recording, load_config("mst"), tmp_path / "other", seed=3)
 
 
+@pytest.mark.parametrize(("source", "target"), [(0, 1), (1, 0), (2, 2)])
+def test_pauses_of_another_run_or_pause_are_refused(recording, finished, tmp_path, source, target):
+    """A pause of a run with another seed, and another pause of this run. Without it, the run is resumed."""
+    shutil.copytree(finished.path, tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    shutil.rmtree(run.pause(target))
+    if source == target:
+        other = filter_recording(recording, load_config("mst", ["n=3", "n_proposed=2"]), tmp_path / "other", seed=4)
+        shutil.copytree(other.pause(source), run.pause(target))
+    else:
+        shutil.copytree(finished.pause(source), run.pause(target))
+    message = f"{target:03d} is of another run or pause: its state is of pause {source} with seed "
+    for reads in (lambda: filter_recording(recording, load_config("mst"), run.path, seed=2), run.check):
+        with pytest.raises(InputError, match=message) as raised:
+            reads()
+        assert f"remove the folders of pause {target} and all later pauses" in raised.value.hints[0]
+    for t in range(target, 3):
+        shutil.rmtree(run.pause(t))
+    filter_recording(recording, load_config("mst"), run.path, seed=2)
+    assert content(run.path) == content(finished.path)
+
+
 def test_broken_input_and_useless_settings_make_no_folder(recording, tmp_path):
     broken = tmp_path / "broken"
     shutil.copytree(recording.path, broken)
