@@ -73,7 +73,7 @@ class VoxelGrid:
         shape = tuple(int(n) for n in self.shape)
         if shape[0] * shape[1] * shape[2] > MAX_VOXELS:
             raise InputError(
-                f"a grid of {shape[0]} x {shape[1]} x {shape[2]} voxels of {self.voxel_size:g} m is too large",
+                f"a grid of {shape[0]} x {shape[1]} x {shape[2]} voxels of {float(size):g} m is too large",
                 "workspace and voxel size are in metres",
             )
         object.__setattr__(self, "origin", frozen(origin))
@@ -84,14 +84,17 @@ class VoxelGrid:
     def from_bounds(cls, lower: np.ndarray, upper: np.ndarray, voxel_size: float) -> VoxelGrid:
         """The grid that covers a box given by two corners in metres."""
         lower, upper, size = _numbers(lower), _numbers(upper), _numbers(voxel_size)
-        shapes = lower.shape == upper.shape == (3,) and size.ndim == 0
-        if not (shapes and (lower < upper).all() and np.isfinite(upper - lower).all() and 0 < size < np.inf):
+        if size.ndim or not 0 < size < np.inf:
+            raise InputError(f"voxel size is {voxel_size!r}, expected one number of metres > 0", "voxels are cubes")
+        shapes = lower.shape == upper.shape == (3,)
+        if not (shapes and (lower < upper).all() and np.isfinite(upper - lower).all()):
             raise InputError(
                 f"workspace from {lower.tolist()} to {upper.tolist()} in voxels of {voxel_size} m has no voxel",
                 "min must be below max in all three axes, in metres",
             )
-        shape = np.maximum(1, np.ceil((upper - lower) / size - 1e-6)).astype(int)
-        return cls(lower, float(size), tuple(shape))
+        with np.errstate(over="ignore"):
+            shape = np.maximum(1, np.ceil((upper - lower) / size - 1e-6))
+        return cls(lower, float(size), tuple(shape.tolist()))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, VoxelGrid) and self.key == other.key

@@ -318,15 +318,24 @@ class Population:
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
         """Select particles with their parents, and with their log weights unless `log_weights` are given.
 
-        Raises InputError if the indices are not integers from 0 to n - 1.
+        Raises InputError if the indices are not integers from 0 to n - 1, if there are none, or if all selected
+        particles have weight 0.
         """
         indices = _within(_integers("indices", indices), len(self))
-        return Population(
-            take(self.particles, indices),
-            self.log_weights[indices] if log_weights is None else log_weights,
-            {name: index[indices] for name, index in self.parents.items()},
-            self.notes,
-        )
+        if not len(indices):
+            raise InputError("no particle is selected", "name at least one index")
+        try:
+            return Population(
+                take(self.particles, indices),
+                self.log_weights[indices] if log_weights is None else log_weights,
+                {name: index[indices] for name, index in self.parents.items()},
+                self.notes,
+            )
+        except LostRunError:
+            raise InputError(
+                f"all {len(indices)} selected particles have weight 0",
+                "select among those of positive weight: np.flatnonzero(population.weights)",
+            ) from None
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
         """Select particles as `take` does, set ``parents["ancestor"]``, and add the given values to `notes`."""

@@ -211,6 +211,19 @@ def test_encoding_is_lossless_and_reproducible():
     assert {name: a.tobytes() for name, a in again.items()} == {name: a.tobytes() for name, a in arrays.items()}
 
 
+def test_a_voxel_size_is_one_number():
+    arrays = encode_hypotheses([Hypothesis.from_labels(np.zeros(GRID.shape, np.uint16), GRID)])
+    for wrong in ([0.01, 0.01, 0.01], [0.01], np.nan, "x"):
+        with pytest.raises(InputError, match="voxel size is "):
+            VoxelGrid((0, 0, 0), wrong, (1, 1, 1))
+        with pytest.raises(InputError, match="voxel size is .*, expected one number"):
+            VoxelGrid.from_bounds((0, 0, 0), (1, 1, 1), wrong)
+        with pytest.raises(InputError, match="voxel size is "):
+            decode_hypotheses(arrays | {"voxel_size": np.array(wrong)})
+    with pytest.raises(InputError, match="grid"):
+        VoxelGrid.from_bounds((0, 0, 0), (1e300, 1, 1), 1e-300)
+
+
 def test_objects_of_one_id_are_refused():
     labels = np.zeros((2, 2, 2), np.uint16)
     labels[0], labels[1] = 1, 2
