@@ -3,7 +3,7 @@
 >>> import mstfilter
 >>> recording = mstfilter.Recording.from_arrays(rgb, depth, K)     # depth in metres
 >>> state, infos = mstfilter.preset("mst").run(recording.clips(), seed=0)
->>> state.population.best.volumes()
+>>> mstfilter.Belief(state.population).estimate().volumes()
 
 `mstfilter.presets` has assembled filters, `mstfilter.smc` has the particle filter, and `mstfilter.scene` has cameras,
 recordings and hypotheses.

@@ -201,11 +201,13 @@ def place_in_user_file(error: BaseException) -> str | None:
 
 
 def exhausted(error: BaseException) -> InputError | None:
-    """The message for the user if memory or disk space ran out; None for other errors."""
+    """The message for the user if memory, disk space or the size of a file ran out; None for other errors."""
     if isinstance(error, MemoryError) or "allocate" in str(error):  # cv2 and torch have no class for it
         return InputError("out of memory", "use fewer workers, fewer particles or larger voxels")
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return InputError(f"no space left: {error}", "free disk space and repeat the command")
+    if isinstance(error, OSError) and error.errno == errno.EFBIG:
+        return InputError(f"a file exceeds the largest size: {error}", "`ulimit -f` shows the limit of the shell")
     return None
 
 

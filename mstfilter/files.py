@@ -183,7 +183,8 @@ def other_files(folder: Path, own: re.Pattern[str]) -> list[str]:
 
 def _is_abandoned(path: Path, older_than_s: float) -> bool:
     with contextlib.suppress(OSError):  # another process may remove it
-        if time.time() - path.lstat().st_mtime >= older_than_s and (descriptor := _lock(path, os.O_RDONLY)):
+        # A date in the future is of another clock, and not recent.
+        if abs(time.time() - path.lstat().st_mtime) >= older_than_s and (descriptor := _lock(path, os.O_RDONLY)):
             os.close(descriptor)
             return True
     return False

@@ -424,6 +424,15 @@ def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
     return cls.__new__(cls, *arguments)
 
 
+def _paired(value: Any, found: Any) -> Iterator[tuple[Any, Any]]:
+    """Each plain value with the value that it was converted to."""
+    if isinstance(value, (list, tuple)) and isinstance(found, (list, tuple)):
+        for inner in zip(value, found, strict=False):
+            yield from _paired(*inner)
+    else:
+        yield value, found
+
+
 def _plain(hint: Any, value: Any, where: str) -> Any:
     """A plain value, checked against a field's annotation. A ``tuple[X, ...]`` also accepts a single X."""
     from pydantic import TypeAdapter, ValidationError
@@ -431,6 +440,9 @@ def _plain(hint: Any, value: Any, where: str) -> Any:
     if typing.get_args(hint)[1:] == (...,) and isinstance(value, (bool, int, float, str)):
         value = [value]
     try:
-        return TypeAdapter(hint).validate_python(value)
+        found = TypeAdapter(hint).validate_python(value)
+        if any(isinstance(v, bool) and type(f) in (int, float) for v, f in _paired(value, found)):
+            raise InputError(f"{where} is {value!r}, expected a number")  # pydantic reads true as 1
+        return found
     except ValidationError as error:
         raise InputError(f"{where} is {value!r}: {error.errors()[0]['msg'].lower()}") from error

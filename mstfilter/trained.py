@@ -21,12 +21,13 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, check_integer, reason
 from mstfilter.files import atomic_path, write_text
 from mstfilter.reading import MAX_WEIGHTS, read_bytes, read_toml
 from mstfilter.resources import models_folder
 
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.toml"
+_MOST_FEATURES = 2**16  # of a layer
 _HINT = "train it with: mstfilter train completion or border --out FOLDER; others are written by write_model"
 
 
@@ -90,7 +91,7 @@ def load_once(load: _Load) -> _Load:
     @functools.wraps(load)
     def found(name: str, *others: Any) -> Any:
         files = [Path(name)] if Path(name).is_file() else sorted(_folder(name).glob("*"))
-        stats = [(str(file), file.stat()) for file in files]
+        stats = [(str(file), file.stat()) for file in files if file.is_file()]  # a link to itself is no file
         return of_version(tuple((file, stat.st_mtime_ns, stat.st_size) for file, stat in stats), name, *others)
 
     found.cache_clear = of_version.cache_clear  # type: ignore[attr-defined]
@@ -134,6 +135,12 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     return TrainedModel(folder, description, tensors, hashlib.sha256(text + data).hexdigest()[:16])
 
 
+def layer_size(network: Mapping[str, Any], name: str, at_least: int = 1) -> int:
+    """A size in the table ``network`` of a description. Raises InputError unless it is a possible integer."""
+    check_integer(f"network.{name}", network[name], at_least=at_least, at_most=_MOST_FEATURES)
+    return int(network[name])
+
+
 def calibrated_network(
     model: TrainedModel, channels: Sequence[str], build: Callable[[Mapping[str, Any]], Any]
 ) -> tuple[Any, float, float]:
@@ -145,15 +152,21 @@ def calibrated_network(
     import torch
 
     network = model.description.get("network", {})
+    where = f"{model.folder / DESCRIPTION}"
     try:
         if list(network["channels"]) != list(channels):
-            raise InputError(f"{model.folder}: channels {network['channels']}, this version has {list(channels)}")
-        net = build(network)
+            raise InputError(f"{where}: channels {network['channels']}, this version has {list(channels)}")
+        with torch.device("meta"):  # sizes without memory
+            planned = build(network)
         calibration = model.description["calibration"]
         scale, shift = float(calibration["scale"]), float(calibration["shift"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{model.folder}: {DESCRIPTION} has no valid {error}", "train the model again") from None
-    model.check_tensors({name: tuple(t.shape) for name, t in net.state_dict().items()})
+    except InputError as error:
+        raise InputError(f"{where}: {error.message.removeprefix(f'{where}: ')}", "train the model again") from None
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        fact = f"{where} describes no network: {reason(error).splitlines()[0]}"
+        raise InputError(fact, "train the model again") from None
+    model.check_tensors({name: tuple(t.shape) for name, t in planned.state_dict().items()})
+    net = build(network)
     net.load_state_dict({name: torch.from_numpy(t) for name, t in model.tensors.items()})
     return net.eval(), scale, shift
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mstfilter.cli import _warnings_as_lines, main
+from mstfilter.errors import InputError
 from mstfilter.formats import open_recording
 from mstfilter.presets import build_filter, load_config
 from mstfilter.runs import RunFolder, compared_configs
@@ -117,6 +118,25 @@ def test_wrong_arguments(tmp_path, monkeypatch, capsys, arguments, message):
     assert err.startswith("error: ")
     assert message in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_has_ten_hints_at_most(monkeypatch, capsys):
+    def fail(*_):
+        raise InputError("it broke", *map(str, range(2000)))
+
+    monkeypatch.setattr("mstfilter.cli._execute", fail)
+    lines = call("run", "x", capsys=capsys)[2].splitlines()
+    assert lines == ["error: it broke", *(f"hint: {k}" for k in range(10)), "hint: 1990 more hints are not shown"]
+
+
+def test_a_file_larger_than_the_shell_allows_is_one_clear_error(two_pauses, tmp_path):
+    """The limit of ulimit -f in a process of its own; no folder is left, and the run can be repeated."""
+    code = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048)); "
+    code += "from mstfilter.cli import main; main(sys.argv[1:])"
+    command = [sys.executable, "-c", code, "run", two_pauses, "--out", tmp_path / "run", "--preset", "floor_one_blob"]
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 1 and "error: a file exceeds the largest size" in done.stderr, done.stderr
+    assert "ulimit -f" in done.stderr and not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

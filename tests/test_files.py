@@ -145,6 +145,17 @@ def test_what_killed_processes_leave_is_removed(tmp_path):
         assert set(names(tmp_path)) == {foreign, "d", "e", alive.name}  # an earlier folder has its name back
 
 
+def test_a_date_in_the_future_keeps_nothing(tmp_path):
+    """As after a correction of the clock."""
+    for name in (".a.01234567.partial", ".b.01234567.partial"):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time.time() + 1e7,) * 2)
+    sweep(tmp_path, "a")
+    assert names(tmp_path) == [".b.01234567.partial"]
+    sweep(tmp_path, older_than_s=86400)
+    assert names(tmp_path) == []
+
+
 def test_the_cache_is_swept(tmp_path):
     litter = tmp_path / ".s1-3-00.01234567.partial"
     litter.mkdir()

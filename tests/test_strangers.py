@@ -89,7 +89,7 @@ def test_spoiled_inputs_are_read_or_refused(examples, tmp_path, name):
         ("pauses/000/info.json", {"weights": "x", "parents": {"previous": [7] * 6}, "quality": {}}),
         ("pauses/000/info.json", {"weights": [0.5]}),
         ("pauses/001/camera.json", {"K": [[1]], "T_world_camera": None, "width": "x", "height": 3}),
-        ("pauses/001/seconds.json", {"transition": "x"}),
+        ("run.json", {"status": "asleep"}),
     ],
 )
 def test_a_run_folder_is_checked_before_a_report_is_drawn(examples, tmp_path, file, spoiled, monkeypatch):

@@ -78,6 +78,35 @@ def test_wrong_descriptions(folder):
         open_model(str(folder))
 
 
+@pytest.mark.parametrize("size", [-1, 0, 10**9, 2**70, 1.5, True, "x", 4096])
+@pytest.mark.parametrize("name", ["completion", "border"])
+def test_sizes_that_no_network_has(tmp_path, name, size):
+    """No memory is used for a network whose tensors are not those of the file."""
+    pytest.importorskip("torch")
+    from mstfilter.completion.unet import load_network
+    from mstfilter.segmentation.border_network import load_border_network
+
+    model = open_model(name)
+    network = {**model.description["network"], "width": size}
+    write_model(tmp_path / "mine", {**model.description, "network": network}, model.tensors)
+    message = "the architecture has" if size == 4096 else r"model.toml: network.width is .*, expected an integer"
+    with pytest.raises(InputError, match=message):
+        (load_network if name == "completion" else load_border_network)(str(tmp_path / "mine"))
+
+
+def test_links_to_themselves_are_no_files(tmp_path):
+    pytest.importorskip("torch")
+    model = open_model("completion")
+    write_model(tmp_path / "mine", model.description, model.tensors)
+    (tmp_path / "mine" / "loop").symlink_to("loop")
+    assert NetworkCompleter(weights=str(tmp_path / "mine")).weights_key  # another file of the folder
+    for name in (WEIGHTS, DESCRIPTION):
+        (tmp_path / "mine" / name).unlink()
+        (tmp_path / "mine" / name).symlink_to(name)
+        with pytest.raises(InputError, match=f"there is no {name} in the folder"):
+            _ = NetworkCompleter(weights=str(tmp_path / "mine")).network
+
+
 def test_a_network_that_is_written_again_is_read_again(tmp_path):
     pytest.importorskip("torch")
     model = open_model("completion")

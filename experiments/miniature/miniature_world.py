@@ -115,6 +115,11 @@ class Observation:
     action: int = -1
 
     @property
+    def index(self) -> int:
+        """The pause at which proposed objects are born: 0, because nothing here depends on their identity."""
+        return 0
+
+    @property
     def after(self) -> Observation:
         """This observation, under the name of the last frame of a `Clip`."""
         return self

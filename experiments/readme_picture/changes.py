@@ -18,6 +18,7 @@ import numpy as np
 from make import SMALL, window
 
 import mstfilter
+from mstfilter.belief import Belief
 from mstfilter.completion import Extrude
 from mstfilter.report import match_objects, overlay, viewpoint, voxel_picture
 from mstfilter.scene import Clip, Hypothesis, project
@@ -143,7 +144,7 @@ def fusion(scene: Scene, before: Population) -> Rows:
     """The same samples and predictions, combined by the updates of both methods."""
     predicted = MST.transition.predict(rng(1), before, scene.clip)
     proposed = replace(MST.proposal, completer=MST.update.completer).sample(rng(2), scene.clip, 5)
-    shown = {"a prediction": predicted.best, "a sample": proposed.best}
+    shown = {"a prediction": predicted.particles[0], "a sample": proposed.particles[0]}
     for name, method in {"paper": PAPER, "mst": MST}.items():
         made = method.update.update(rng(3), predicted, proposed, scene.clip)
         chosen = Systematic().resample(rng(4), made, 1).best
@@ -152,7 +153,7 @@ def fusion(scene: Scene, before: Population) -> Rows:
 
 
 def result(scene: Scene, last: Mapping[str, Hypothesis]) -> Rows:
-    """The most probable hypotheses of both methods at the last pause."""
+    """The estimates of both methods at the last pause."""
     true = scene.truth[-1]
     seen = np.bincount(project(true, scene.frame.camera).ravel(), minlength=true.labels.max() + 1)
     for name, h in last.items():
@@ -180,7 +181,7 @@ def main(family: str, seed: int, out: Path, smoke: bool) -> None:
             "tracking": tracking(second),
             "shapes": shapes(first),
             "fusion": fusion(second, states["mst"][0].population),
-            "result": result(final, {name: s[-1].population.best for name, s in states.items()}),
+            "result": result(final, {name: Belief(s[-1].population).estimate() for name, s in states.items()}),
         }
     for name, rows in pictures.items():
         save(rows, out / f"changes-{name}.png")

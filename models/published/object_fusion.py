@@ -114,12 +114,12 @@ class ObjectFusion(Update):
         for label, volume in volumes.items():
             mask, others = shown == label, (shown > 0) & (shown != label)
             volumes[label] = volume.integrate(frame, grid, np.eye(4), mask, others)
-        records = {r.label: r for r in old.objects}
+        records, taken = {r.label: r for r in old.objects}, {r.id for r in old.objects}
         for k in match.new:
             assert sample is not None
             label = max(volumes, default=0) + 1
             volumes[label] = ObjectVolume.of(sample.mask(k), grid, _TRUNCATION, 1.0)
-            records[label] = ObjectRecord.born(k, clip.index, sample.record(k).completion_key)
+            records[label] = ObjectRecord.born(k, clip.index, sample.record(k).completion_key, taken=taken)
         fused = self._assemble(volumes, records, grid)
         note = {"matched": len(match.masks) - len(match.new), "new": len(match.new), "images": n_images}
         return fused, note | {"forgotten": known + len(match.new) - fused.n_objects}

@@ -20,6 +20,8 @@ _WITHOUT_TYPER = """Usage: mstfilter list [KIND]
 
 Without typer, only `list`, --help and --version are available. For all commands: pip install mstfilter"""
 
+_MOST_HINTS = 10  # of one error or warning
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line. Invalid input is reported as one ``error:`` line and exit code 2."""
@@ -98,7 +100,8 @@ def _warnings_as_lines() -> Iterator[None]:
 
 
 def _print(kind: str, message: str, *hints: str) -> None:
-    for line in (f"{kind}: {message}", *(f"hint: {hint}" for hint in hints)):
+    more = [f"{len(hints) - _MOST_HINTS} more hints are not shown"] if len(hints) > _MOST_HINTS else []
+    for line in (f"{kind}: {message}", *(f"hint: {hint}" for hint in (*hints[:_MOST_HINTS], *more))):
         print(line, file=sys.stderr)
 
 

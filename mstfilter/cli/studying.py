@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,8 @@ from mstfilter.cli.root import app
 from mstfilter.errors import InputError
 from mstfilter.files import check_output
 from mstfilter.report.progress import study_bars
+
+_MOST_FAILURES = 10  # different errors, and hints of each
 
 
 @app.command()
@@ -49,13 +52,23 @@ def study(
     print(f"study       {folder}")
     print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
     _print_tables(result.folder)
-    for name, outcome in result.failed:
-        print(f"failed      {name}: {outcome.error}")
-        for hint in outcome.hints:
-            print(f"hint: {hint}", file=sys.stderr)
+    _print_failures(result.failed)
     if result.failed:
         print(f"hint: the same command repeats the runs that failed; see {folder / 'failures.csv'}", file=sys.stderr)
         raise typer.Exit(1)
+
+
+def _print_failures(failed: Sequence[tuple[str, Any]]) -> None:
+    """Print the first different errors of failed runs, each with its hints once."""
+    same: dict[Any, list[str]] = {}
+    for name, outcome in failed:
+        same.setdefault((outcome.error, tuple(outcome.hints)), []).append(name)
+    for (error, hints), (first, *others) in list(same.items())[:_MOST_FAILURES]:
+        print(f"failed      {first}{f' and {len(others)} more' if others else ''}: {error}")
+        for hint in hints[:_MOST_FAILURES]:
+            print(f"hint: {hint}", file=sys.stderr)
+    if unseen := sum(map(len, list(same.values())[_MOST_FAILURES:])):
+        print(f"failed      {unseen} more runs, with other errors")
 
 
 def _print_tables(folder: Any) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -28,9 +29,10 @@ from mstfilter.completion.crops import BATCH, CHANNELS, EDGE, LARGER, Architectu
 from mstfilter.completion.observed import ObservedBox, encode_box
 from mstfilter.errors import InputError, describe_error, missing_library
 from mstfilter.reading import MAX_WEIGHTS, read_bytes
-from mstfilter.trained import calibrated_network, load_once, one_thread, open_model
+from mstfilter.trained import calibrated_network, layer_size, load_once, one_thread, open_model
 
 ARCHITECTURE = "completion-unet"
+_LONGEST_S = 600.0  # of a call of a network in ONNX
 
 
 def to_channels(x: Tensor) -> Tensor:
@@ -158,7 +160,9 @@ def load_network(name: str, architecture: Architecture | None = None) -> Trained
         net, scale, shift = calibrated_network(
             model,
             CHANNELS,
-            lambda values: CompletionNet(len(CHANNELS), int(values["width"]), int(values["n_globals"])),
+            lambda values: CompletionNet(
+                len(CHANNELS), layer_size(values, "width"), layer_size(values, "n_globals", 0)
+            ),
         )
         return TrainedNetwork(net, model.key, scale, shift)
     if name.endswith(".onnx"):
@@ -229,6 +233,18 @@ def _open_onnx(path: Path) -> TrainedNetwork:
         )
 
     def forward(x: Tensor) -> Tensor:
-        return torch.from_numpy(session.run(None, {inputs[0].name: x.numpy()})[0])
+        run = onnxruntime.RunOptions()
+        run.log_severity_level = 4
+        timer = threading.Timer(_LONGEST_S, setattr, (run, "terminate", True))
+        timer.daemon = True
+        timer.start()
+        try:
+            return torch.from_numpy(session.run(None, {inputs[0].name: x.numpy()}, run)[0])
+        except Exception as error:
+            if run.terminate:
+                raise InputError(f"it has not ended after {_LONGEST_S:g} s, as in an endless loop") from error
+            raise
+        finally:
+            timer.cancel()
 
     return TrainedNetwork(forward, hashlib.sha256(data).hexdigest()[:16])

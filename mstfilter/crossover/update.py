@@ -60,6 +60,7 @@ from mstfilter.scene import (
     as_labels,
     check_grid,
     check_grids,
+    free_id,
     log_quality,
 )
 from mstfilter.smc import Candidates, Population, Update, child, key_of, union
@@ -90,7 +91,8 @@ class Crossover(Bounded):
         """A hypothesis from the objects of both parents.
 
         If one parent has no objects, the result is the other parent. Merged objects get the identity of the largest
-        predicted object. An object keeps its motion history if its voxels are exactly the predicted voxels.
+        predicted object. A proposed object whose id is also the id of a predicted object gets another id. An object
+        keeps its motion history if its voxels are exactly the predicted voxels.
         """
         check_grid("the proposed hypothesis", proposed, predicted.grid)
         if not predicted.objects:
@@ -153,9 +155,11 @@ class CrossoverUpdate(Update):
         log_weights = predicted.log_weights + self.quality_exponent * log_quality(quality)
         notes = {"quality": quality.tolist()}
         prediction = Population(refined, log_weights, predicted.parents, notes)
-        return prediction if proposed is None else self._crossed(rng, prediction, proposed)
+        return prediction if proposed is None else self._crossed(rng, prediction, proposed, observation)
 
-    def _crossed(self, rng: np.random.Generator, predicted: Population, proposed: Population) -> Population:
+    def _crossed(
+        self, rng: np.random.Generator, predicted: Population, proposed: Population, clip: Clip
+    ) -> Population:
         """Candidates of all pairs of a sample and a prediction that `free_space` has changed."""
         check_grids("predicted", predicted.particles, predicted.particles[0].grid)
         check_grids("proposed", proposed.particles, predicted.particles[0].grid)
@@ -165,7 +169,7 @@ class CrossoverUpdate(Update):
         def build(candidate: int) -> Hypothesis:
             stream = key.child("candidate", candidate).generator()
             sample, prediction = proposed.particles[i[candidate]], predicted.particles[j[candidate]]
-            return self.crossover.cross(stream, sample, prediction)
+            return self.crossover.cross(stream, sample.born_at(clip.index), prediction)
 
         sides = (("previous", predicted, j), ("proposed", proposed, i))
         parents = {name: side.parents.get(name, np.full(len(side), -1))[k] for name, side, k in sides}
@@ -237,7 +241,13 @@ class _Child:
         heads = self._heads()
         record_of = [{record.label: record for record in parent.objects} for parent in parents]
         kinds = zip(self.graph.side[heads].tolist(), self.graph.label[heads].tolist(), strict=True)
-        records = [replace(record_of[side][label], label=k) for k, (side, label) in enumerate(kinds, start=1)]
+        taken = {record.id for record in parents[PREDICTED].objects}
+        records = []
+        for k, (side, label) in enumerate(kinds, start=1):
+            record = record_of[side][label]
+            identity = record.id if side == PREDICTED else free_id(record.id, taken)
+            taken.add(identity)
+            records.append(replace(record, label=k, id=identity))
         unchanged = self._unchanged(heads).tolist()
         return tuple(r if same else r.changed() for r, same in zip(records, unchanged, strict=True))
 

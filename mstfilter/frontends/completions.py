@@ -17,7 +17,7 @@ import numpy as np
 
 from mstfilter.completion import ClipCompleter, Completer, Completion, SurfaceOnly, observed_box
 from mstfilter.completion.observed import frame_points
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, naming
 from mstfilter.fields import bound_to
 from mstfilter.files import reading
 from mstfilter.frontends.mask_files import read_label_image, read_weights
@@ -230,7 +230,8 @@ def _resample(path: Path, arrays: dict[str, np.ndarray], T: np.ndarray, grid: Vo
     values = values.astype(np.float32)
     if not np.isfinite(values).all() or values.min() < 0 or values.max() > 1:
         raise InputError(f"{path}: occupancy is not between 0 and 1")
-    own = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), values.shape)
+    with naming(str(path)):
+        own = VoxelGrid(arrays["origin"], arrays["voxel_size"], values.shape)  # type: ignore[arg-type]
     centres = (grid.centres().reshape(-1, 3) - T[:3, 3]) @ T[:3, :3]
     index = own.index_of(centres)
     inside = own.contains(index)

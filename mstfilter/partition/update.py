@@ -38,7 +38,7 @@ only objects that some frame has shown.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import islice, zip_longest
@@ -285,8 +285,9 @@ class PartitionUpdate(Update):
         objects = [one._replace(tracks=tracks.get(k, one.tracks)) for k, one in enumerate(objects)]
         labels = arbitrate(completions, clip.grid, self.threshold)
         present = set(np.unique(labels[labels > 0]).tolist())
+        known = {record.id for record in lost}.union(record.id for one in objects for record in one.tracks)
         records = [
-            self._record(label, *one, clip.index)
+            self._record(label, *one, clip.index, known)
             for label, one in enumerate(zip(objects, completions, strict=True), start=1)
             if label in present
         ]
@@ -309,11 +310,16 @@ class PartitionUpdate(Update):
         completed |= {k: one.remains for k, one in enumerate(objects) if k not in completed and one.remains}
         return [completed[k] for k in range(len(objects))]
 
-    def _record(self, label: int, one: SceneObject, completion: Completion, birth: int) -> ObjectRecord:
-        """The `ObjectRecord` of the first predicted object that an object continues, or a new `ObjectRecord`."""
+    def _record(
+        self, label: int, one: SceneObject, completion: Completion, birth: int, known: Collection[int]
+    ) -> ObjectRecord:
+        """The `ObjectRecord` of the first predicted object that an object continues, or a new `ObjectRecord`.
+
+        A new object gets none of the ids `known`, which predicted objects have.
+        """
         key, views = completion.key, self._latest(completion.views)
         if not one.tracks:
-            return ObjectRecord.born(label, birth, key, views)
+            return ObjectRecord.born(label, birth, key, views, known)
         return replace(one.tracks[0].changed(), label=label, completion_key=key, views=views)
 
     def _latest(self, *histories: tuple[ObjectView, ...]) -> tuple[ObjectView, ...]:

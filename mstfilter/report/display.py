@@ -25,7 +25,7 @@ from mstfilter.report.identities import match_objects, weigh_distinct
 from mstfilter.report.page import short_text
 from mstfilter.report.pictures import Colour, colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
 from mstfilter.scene import Clip, Frame, Hypothesis, Recording
-from mstfilter.smc import Candidates, Infos, Population, State, as_matrix
+from mstfilter.smc import Infos, Population, State, as_matrix
 
 _MOST_PICTURES = 6
 
@@ -77,7 +77,7 @@ def plot_recording(recording: Recording) -> Drawing:
 def plot_population(population: Population) -> Drawing:
     """The six most probable hypotheses; for numeric particles, weighted histograms of the first six coordinates."""
     population = population.realised()
-    if isinstance(population.best, Hypothesis):
+    if _are_hypotheses(population):
         return _plot_hypotheses(population)
     named = population.particles if isinstance(population.particles, Mapping) else {"x": population.particles}
     columns = {}
@@ -95,6 +95,11 @@ def plot_population(population: Population) -> Drawing:
     axes[0].set_ylabel("weight")
     figure.suptitle(f"{len(population)} particles, ESS {population.ess:.1f}", fontsize=10)
     return figure
+
+
+def _are_hypotheses(population: Population) -> bool:
+    """Whether the particles are hypotheses; `Candidates` are not built."""
+    return isinstance(population.particles, tuple) and isinstance(population.particles[0], Hypothesis)
 
 
 def _plot_hypotheses(population: Population) -> Drawing:
@@ -181,7 +186,7 @@ def _(value: Hypothesis) -> list[_Picture]:
 
 @_pictures.register
 def _(value: Population) -> list[_Picture]:
-    if isinstance(value.particles, Candidates) or not isinstance(value.best, Hypothesis):
+    if not _are_hypotheses(value):
         return []
     return [(data_uri(png_bytes(picture)), text, 150) for picture, text in _voxel_pictures(value)]
 

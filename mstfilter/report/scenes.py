@@ -1,7 +1,7 @@
 """Content of the pauses of a run or a recording, for the report and for pages with rotatable scenes.
 
 >>> scenes = scenes_of_run(RunFolder.open("runs/demo"))
->>> view = scenes[-1].views[0]                        # the most probable hypothesis of the last pause
+>>> view = scenes[-1].views[0]                        # the estimate of the last pause
 >>> view.name, view.weight, view.overlay(scenes[-1].camera, 1, 2)
 
 Each hypothesis has a name, weight, quality and the colours of its objects (`mstfilter.report.identities`).
@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mstfilter.belief import Belief
 from mstfilter.report.identities import TRUTH, Identities, assign_identities, names_of, weigh_distinct
 from mstfilter.report.pictures import Colour, colour, data_uri, overlay_layer, png_bytes, voxel_picture
 from mstfilter.runs import RunFolder
@@ -71,7 +72,7 @@ class ShownPause:
 
 
 def scenes_of_run(run: RunFolder) -> list[ShownPause]:
-    """The pauses of a run, each with at most twelve distinct hypotheses, the most probable first, and the truth."""
+    """The pauses of a run, each with at most twelve distinct hypotheses, the estimate first, and the truth."""
     identities, scenes = assign_identities(run), []
     view_of: dict[int, int] = {}
     for t in range(run.n_pauses):
@@ -84,13 +85,20 @@ def scenes_of_run(run: RunFolder) -> list[ShownPause]:
 
 
 def scene_of_run(run: RunFolder, t: int, identities: Identities, n_views: int = _MOST_VIEWS) -> ShownPause:
-    """A pause of a run with at most `n_views` distinct hypotheses, the most probable first, and the truth."""
-    info, hypotheses, truth = run.info(t), run.hypotheses(t), run.truth(t)
+    """A pause of a run with at most `n_views` distinct hypotheses and the truth.
+
+    The estimate (`Belief.estimate`) is the first hypothesis, and the others are sorted by weight.
+    """
+    info, hypotheses, truth, population = run.info(t), run.hypotheses(t), run.truth(t), run.state(t).population
+    assert population is not None
+    estimate = Belief(population).estimate().key
     views, groups = [], weigh_distinct(hypotheses, info["weights"])
-    for members, weight in groups[:n_views]:
+    groups.sort(key=lambda group: hypotheses[group[0][0]].key != estimate)
+    for place, (members, weight) in enumerate(groups[:n_views]):
         k = members[0]
         quality = None if info["quality"] is None else info["quality"]["objects"][k]
-        text = f"weight {weight:.2f}" + ("" if quality is None else f", quality {quality:.2f}")
+        text = "estimate, " * (place == 0 and len(groups) > 1) + f"weight {weight:.2f}"
+        text += "" if quality is None else f", quality {quality:.2f}"
         shown = names_of(members), text, hypotheses[k], identities.of(t, k), weight
         views.append(ShownHypothesis(*shown, quality=quality, members=members))
     if truth is not None:

@@ -161,8 +161,8 @@ def _over_time(records: Sequence[Mapping[str, Any]], endpoint: str) -> dict[str,
     values: dict[str, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in records:
         of_row = row.get("qualities") if endpoint == "quality" else [row.get(endpoint)]
-        if of_row and of_row[0] is not None:
-            values[row["family"]][row["arm"]][row["pause"]] += of_row
+        if known := [value for value in of_row or () if value is not None]:
+            values[row["family"]][row["arm"]][row["pause"]] += known
     return values
 
 

@@ -61,8 +61,11 @@ def show_hypothesis(hypothesis: Hypothesis, title: str = "") -> ScenePage:
 
 
 def run_page(run: RunFolder | str | Path, *, photos: bool = True, head: bool = True) -> ScenePage:
-    """All pauses of a run as a page. `photos` adds the images to the voxels, and `head` adds the title."""
-    run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check()
+    """All pauses of a run as a page. `photos` adds the images to the voxels, and `head` adds the title.
+
+    Raises InputError if the folder is damaged or no pause is complete.
+    """
+    run = (run if isinstance(run, RunFolder) else RunFolder.open(run)).check_begun()
     description = run.description
     title = str(description["recording"]["name"])
     return _page(scenes_of_run(run), title, str(description["description"]), photos=photos, head=head)

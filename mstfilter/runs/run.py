@@ -8,6 +8,7 @@ configuration, seed and recording. A resumed run and an uninterrupted run have t
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -131,7 +132,8 @@ def filter_recording(
                     advance(clip.index + 1, len(clips))
             except BaseException as error:
                 if folder is not None:
-                    folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+                    with contextlib.suppress(InputError, OSError):  # `error` is the cause
+                        folder.set_status("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
                 raise
         assert folder is not None
         folder.write_metrics()
@@ -180,6 +182,7 @@ def _existing_folder(path: Path, description: dict[str, Any], replace: bool) -> 
                 "choose another folder, or remove this one (on the command line: --replace)",
             )
     folder.repair()
+    folder.check_origin()
     folder.set_status("running")
     return folder
 

@@ -56,6 +56,7 @@ from mstfilter.scoring import FORMS, PauseEstimate, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 
 _FORMAT = 2
+_RESUME = "repeat the command that made the run, to resume it"
 _PAUSE_FILES = rf"(rgb\.png|instance\.png|camera\.json|state\.npz|truth\.npz|info\.json|seconds\.json|{SUMS})"
 _TABLES = rf"(run\.json|metrics\.csv|(report|view)\.html|result\.json|forecasts\.npz|{SUMS})"
 RUN_FILES = re.compile(rf"(compare/[^/]+/)?(pauses/\d+/{_PAUSE_FILES}|{_TABLES})")  #: paths in a run folder
@@ -98,8 +99,9 @@ class _RunFile(BaseModel):
     """The parts of run.json that readers use."""
 
     format: Literal[2]
-    status: str
+    status: Literal["running", "interrupted", "failed", "done"]
     seed: int
+    description: str = ""
     config: dict[str, Any]
     uses_truth: list[str]
     files: dict[str, str]
@@ -166,8 +168,8 @@ class RunFolder:
 
     @property
     def description(self) -> dict[str, Any]:
-        """The content of run.json."""
-        return self._read(self.path / "run.json", _RunFile)
+        """The content of run.json. A missing description of the configuration is empty."""
+        return {"description": "", **self._read(self.path / "run.json", _RunFile)}
 
     def _read(self, path: Path, model: type[BaseModel]) -> dict[str, Any]:
         return read_model(path, model, "a run folder", "a run folder is made by `mstfilter run`")[1]
@@ -177,14 +179,40 @@ class RunFolder:
 
         Raises InputError if a file is missing or damaged, or if files of a pause are inconsistent.
         """
-        if self.n_pauses > len(self.description["recording"]["pauses"]):
-            raise InputError(f"{self.path}: there are more pauses than run.json lists")
+        self.check_origin()
         before = 0
         for t in range(self.n_pauses):
             before = self._check_pause(t, before)
         for other in self.compared().values():
             other.check()
         return self
+
+    def check_origin(self) -> None:
+        """Raise InputError if there are more pauses than run.json lists, or a pause is of another run.
+
+        The state of pause t has made t + 1 steps with the seed in run.json.
+        """
+        description = self.description
+        if self.n_pauses > len(description["recording"]["pauses"]):
+            raise InputError(
+                f"{self.path}: there are more pauses than run.json lists", "remove the folders of the last pauses"
+            )
+        for t in range(self.n_pauses):
+            state = self.state(t)
+            found, expected = (state.t - 1, state.key.seed), (t, description["seed"])
+            if found != expected:
+                raise InputError(
+                    f"{self.pause(t)} is of another run or pause: its state is of pause {found[0]} with seed "
+                    f"{found[1]}, expected pause {t} with seed {expected[1]}",
+                    f"put the right folder there, or remove the folders of pause {t} and all later pauses; the same "
+                    "call or command computes them again",
+                )
+
+    def check_begun(self) -> RunFolder:
+        """Raise InputError if no pause is complete; otherwise the same as `check`."""
+        if self.n_pauses == 0:
+            raise InputError(f"{self.path}: the run has no complete pause yet", _RESUME)
+        return self.check()
 
     def _check_pause(self, t: int, n_before: int) -> int:
         """Check the files of pause `t` after a pause with `n_before` hypotheses. Returns the number of hypotheses."""
@@ -242,9 +270,11 @@ class RunFolder:
     ) -> None:
         """Write the results of a step, and the true labels, questions and true label image of the pause, if known.
 
-        `questions` are the pairs of voxels for the log loss. An interrupted call writes nothing.
+        `questions` are the pairs of voxels for the log loss. An interrupted call writes nothing. Raises InputError if
+        the run folder was removed meanwhile.
         """
         assert state.population is not None
+        self._check_kept()
         camera, hypotheses = clip.after.camera, tuple(state.population.particles)
         if instance is not None:
             what, shape = f"true label image of pause {info.t}", clip.after.depth.shape
@@ -271,6 +301,13 @@ class RunFolder:
             write_json(folder / "info.json", record)
             write_sums(folder)
             write_json(folder / "seconds.json", info.seconds)
+
+    def _check_kept(self) -> None:
+        """Raise InputError if another process has removed the folder of a run that is being written."""
+        if not (self.path / "run.json").is_file():
+            raise InputError(
+                f"run folder {self.path} was removed while the run was written", "repeat the command to run it again"
+            )
 
     def check_replaceable(self) -> None:
         """Raise InputError if the folder contains files that are not part of a run."""
@@ -300,8 +337,14 @@ class RunFolder:
         return self._read(self.pause(t) / "info.json", _InfoFile)
 
     def seconds(self, t: int) -> dict[str, float]:
-        """Wall time of the step by component, in seconds."""
-        return self._read(self.pause(t) / "seconds.json", RootModel[dict[str, float]])
+        """Wall time of the step by component, in seconds. Empty if the file is missing or damaged.
+
+        The times are no part of the result, and SHA256SUMS does not list them.
+        """
+        try:
+            return self._read(self.pause(t) / "seconds.json", RootModel[dict[str, float]])
+        except InputError:
+            return {}
 
     def instance(self, t: int) -> np.ndarray | None:
         """True label image (H, W) at a pause, with 255 for the robot; None if unknown."""
@@ -358,9 +401,7 @@ class RunFolder:
 
     def estimates(self) -> list[PauseEstimate]:
         """The weighted hypotheses of all pauses, for `mstfilter.scoring.score_pauses`."""
-        run, found = self.check(), []
-        if run.n_pauses == 0:
-            raise InputError(f"{self.path}: the run has no complete pause yet")
+        run, found = self.check_begun(), []
         for t, frame in zip(range(run.n_pauses), run.description["recording"]["pauses"], strict=False):
             hypotheses, weights = run.hypotheses(t), np.asarray(run.info(t)["weights"], dtype=float)
             found.append(PauseEstimate(hypotheses, weights, frame, hypotheses[0].grid))
@@ -368,6 +409,7 @@ class RunFolder:
 
     def write_metrics(self) -> None:
         """Write metrics.csv, with one row per pause and hypothesis."""
+        self._check_kept()
         rows = []
         for t in range(self.n_pauses):
             info = self.info(t)

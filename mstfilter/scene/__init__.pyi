@@ -92,5 +92,6 @@ from mstfilter.scene.voxels import (
     Seen as Seen,
     VoxelGrid as VoxelGrid,
     as_labels as as_labels,
+    free_id as free_id,
     occupied_box as occupied_box,
 )

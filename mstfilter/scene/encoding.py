@@ -103,7 +103,7 @@ class _Reader:
 def decode_hypotheses(arrays: Mapping[str, np.ndarray]) -> tuple[Hypothesis, ...]:
     """Convert the arrays of `encode_hypotheses` back to hypotheses."""
     labels = arrays["labels"]
-    grid = VoxelGrid(arrays["origin"], float(arrays["voxel_size"]), labels.shape[1:])
+    grid = VoxelGrid(arrays["origin"], arrays["voxel_size"], labels.shape[1:])  # type: ignore[arg-type]
     records: list[list[ObjectRecord]] = [[] for _ in labels]
     begin, views = 0, _decode_views(arrays)
     probabilities = _Reader(arrays["source_probability"]) if "source_probability" in arrays else None

@@ -14,7 +14,8 @@ axis of the world points up, and the table is at z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from functools import cached_property
@@ -31,6 +32,7 @@ from mstfilter.scene.occupancy import Occupancy
 
 MAX_LABEL = 65535
 MAX_VOXELS = 2**28
+_IDS = MAX_LABEL + 1  # ids of the objects that are first proposed at one pause
 _NO_MOTION = RigidTransform.identity()  # shared: making it takes longer than the rest of a record
 
 
@@ -71,7 +73,7 @@ class VoxelGrid:
         shape = tuple(int(n) for n in self.shape)
         if shape[0] * shape[1] * shape[2] > MAX_VOXELS:
             raise InputError(
-                f"a grid of {shape[0]} x {shape[1]} x {shape[2]} voxels of {self.voxel_size:g} m is too large",
+                f"a grid of {shape[0]} x {shape[1]} x {shape[2]} voxels of {float(size):g} m is too large",
                 "workspace and voxel size are in metres",
             )
         object.__setattr__(self, "origin", frozen(origin))
@@ -82,14 +84,17 @@ class VoxelGrid:
     def from_bounds(cls, lower: np.ndarray, upper: np.ndarray, voxel_size: float) -> VoxelGrid:
         """The grid that covers a box given by two corners in metres."""
         lower, upper, size = _numbers(lower), _numbers(upper), _numbers(voxel_size)
-        shapes = lower.shape == upper.shape == (3,) and size.ndim == 0
-        if not (shapes and (lower < upper).all() and np.isfinite(upper - lower).all() and 0 < size < np.inf):
+        if size.ndim or not 0 < size < np.inf:
+            raise InputError(f"voxel size is {voxel_size!r}, expected one number of metres > 0", "voxels are cubes")
+        shapes = lower.shape == upper.shape == (3,)
+        if not (shapes and (lower < upper).all() and np.isfinite(upper - lower).all()):
             raise InputError(
                 f"workspace from {lower.tolist()} to {upper.tolist()} in voxels of {voxel_size} m has no voxel",
                 "min must be below max in all three axes, in metres",
             )
-        shape = np.maximum(1, np.ceil((upper - lower) / size - 1e-6)).astype(int)
-        return cls(lower, float(size), tuple(shape))
+        with np.errstate(over="ignore"):
+            shape = np.maximum(1, np.ceil((upper - lower) / size - 1e-6))
+        return cls(lower, float(size), tuple(shape.tolist()))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, VoxelGrid) and self.key == other.key
@@ -228,7 +233,7 @@ class ObjectRecord:
     """Data of one object in a hypothesis: label, identity, motion and views."""
 
     label: int  #: value of the object in the label grid, 1 .. 65535
-    id: int  #: identity of the object over time, within one lineage of hypotheses
+    id: int  #: identity of the object over time, within one lineage of hypotheses; different in each object
     birth: int = 0  #: index of the pause at which the object was first proposed
     #: Occupancy of the object after its last change other than a rigid motion. None: its current voxels.
     source: Crop | None = None
@@ -245,10 +250,19 @@ class ObjectRecord:
 
     @classmethod
     def born(
-        cls, label: int, birth: int, completion_key: str | None = None, views: tuple[ObjectView, ...] = ()
+        cls,
+        label: int,
+        birth: int,
+        completion_key: str | None = None,
+        views: tuple[ObjectView, ...] = (),
+        taken: Collection[int] = (),
     ) -> ObjectRecord:
-        """The `ObjectRecord` of a new object. Each pair of `birth` and `label` gives a different `id`."""
-        return cls(label, birth * (MAX_LABEL + 1) + label, birth, completion_key=completion_key, views=views)
+        """The `ObjectRecord` of a new object.
+
+        Each pair of `birth` and `label` gives a different `id`, which is not one of the ids `taken`.
+        """
+        identity = free_id(birth * _IDS + label, taken)
+        return cls(label, identity, birth, completion_key=completion_key, views=views)
 
     def moved(self, T: RigidTransform, source: Crop) -> ObjectRecord:
         """The `ObjectRecord` after a rigid motion T. `source` has the voxels before the first motion."""
@@ -259,6 +273,13 @@ class ObjectRecord:
     def changed(self) -> ObjectRecord:
         """The `ObjectRecord` after a change of the voxels that is not a rigid motion."""
         return replace(self, source=None, motion=_NO_MOTION)
+
+
+def free_id(identity: int, taken: Collection[int]) -> int:
+    """The id of an object, changed if it is one of the ids `taken`. New objects keep different ids."""
+    while identity in taken:
+        identity += _IDS
+    return identity
 
 
 def as_labels(labels: np.ndarray, where: str = "label grid") -> np.ndarray:
@@ -297,7 +318,8 @@ class Hypothesis:
     grid : VoxelGrid
         Positions of the voxels.
     objects : tuple of ObjectRecord
-        One `ObjectRecord` for each label, in ascending order of labels. `Hypothesis.from_labels` makes the records.
+        One `ObjectRecord` for each label, in ascending order of labels, with different ids. `Hypothesis.from_labels`
+        makes the records.
     occupancy : Occupancy, optional
         Occupancy probability of each voxel. By default, all probabilities are 0 or 1.
     """
@@ -314,6 +336,14 @@ class Hypothesis:
         numbers = [o.label for o in self.objects]
         if any(b <= a for a, b in pairwise(numbers)):
             raise InputError(f"object records are not in ascending order of labels: {numbers}")
+        ids = Counter(o.id for o in self.objects)
+        if len(ids) < len(self.objects):
+            shared = ids.most_common(1)[0][0]
+            of_id = [o.label for o in self.objects if o.id == shared]
+            raise InputError(
+                f"objects with the labels {of_id} have one id, {shared}",
+                "ObjectRecord.born(label, birth, taken=ids) gives a new object an id that no other object has",
+            )
         if numbers != list(self.volumes()):
             no_record = sorted(set(self.volumes()) - set(numbers))
             no_voxel = sorted(set(numbers) - set(self.volumes()))
@@ -334,11 +364,21 @@ class Hypothesis:
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
-        """A hypothesis from a label grid (X, Y, Z). Every object gets a new `ObjectRecord`."""
+        """A hypothesis from a label grid (X, Y, Z). Every object gets a new `ObjectRecord`.
+
+        `birth` is the index of the pause.
+        """
         labels = labels_on(grid, labels)
         present = np.flatnonzero(np.bincount(labels.ravel()))
         records = tuple(ObjectRecord.born(int(k), birth) for k in present if k > 0)
         return cls(labels, grid, records)
+
+    def born_at(self, birth: int) -> Hypothesis:
+        """The hypothesis with all objects first proposed at the pause `birth`, with the ids of this pause."""
+        if all(record.birth == birth for record in self.objects):
+            return self
+        records = (replace(r, birth=birth, id=birth * _IDS + r.label) for r in self.objects)
+        return replace(self, objects=tuple(records))
 
     def with_labels(self, labels: np.ndarray) -> Hypothesis:
         """A hypothesis with the same objects and a new label grid.

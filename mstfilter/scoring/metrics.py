@@ -7,10 +7,11 @@ Unless stated otherwise, a metric is the unweighted mean over the hypotheses, an
 
 ``quality``: weighted coverage in the form ``objects``. Missed, invented, split and merged objects reduce the quality.
 ``quality_paper``, ``quality_authors``: the other forms (see `scoring.quality`). ``quality_top``,
-``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean, and maximum.
-Maxima are comparable only for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least
-expected loss (`least_loss`). ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the true
-objects that are visible at this pause, that were visible only at earlier pauses, and that never were visible
+``quality_weighted``, ``quality_best``: quality of the hypothesis of largest weight, weighted mean, and maximum. If
+several have the largest weight, ``quality_top`` is of the first of them, a random draw. Maxima are comparable only
+for equal numbers of hypotheses. ``quality_estimate``: quality of the hypothesis of least expected loss
+(`least_loss`), the best single answer. ``quality_visible``, ``quality_hidden``, ``quality_unseen``: coverage of the
+true objects that are visible at this pause, that were visible only at earlier pauses, and that never were visible
 (`mstfilter.scoring.object_status`). ``quality_one_blob``, ``quality_components``: trivial baselines, with the
 occupied voxels as one object or as their connected components. ``occupancy``: intersection over union of the occupied
 voxels. ``volume_missed``, ``volume_invented``: volume that is occupied only in the truth, and only in the hypothesis,

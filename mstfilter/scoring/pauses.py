@@ -5,11 +5,12 @@
 
 `score_pauses` makes one row for each pause and form of weighted coverage (`mstfilter.scoring.quality`). A row has the
 mean quality of the hypotheses, the weighted mean and the maximum. It also has the quality of the hypothesis of
-largest weight and of the hypothesis of least expected loss. A row also has the values of two trivial baselines: the
-occupied voxels as one object, and as connected components. If the ground truth has instance images but no volumes,
-hypotheses are rendered and compared in the image. Pixels of the robot (label 255) are ignored. For a recording with
-volumes, rows also have the scores of the forecasts: Brier score, log loss, log loss of the base rate and calibration
-error (`score_belief`). The scores of the forecasts are the same for all forms of weighted coverage.
+largest weight (of equal weights, the first: a random draw) and of the hypothesis of least expected loss. A row also
+has the values of two trivial baselines: the occupied voxels as one object, and as connected components. If the
+ground truth has instance images but no volumes, hypotheses are rendered and compared in the image. Pixels of the
+robot (label 255) are ignored. For a recording with volumes, rows also have the scores of the forecasts: Brier score,
+log loss, log loss of the base rate and calibration error (`score_belief`). The scores of the forecasts are the same
+for all forms of weighted coverage.
 
 `measure_pause` computes all metrics of a pause, for the tables of a study.
 """

@@ -28,7 +28,7 @@ from torch.nn import functional
 from mstfilter.scene import BASELINE, TABLE_TOLERANCE, Camera, Frame, posed_camera
 from mstfilter.segmentation.boundary import SENSOR_FOCAL, filled_disparity
 from mstfilter.segmentation.regions import SeenBorders
-from mstfilter.trained import TrainedModel, calibrated_network, load_once, one_thread, open_model
+from mstfilter.trained import TrainedModel, calibrated_network, layer_size, load_once, one_thread, open_model
 
 BORDER_ARCHITECTURE = "border-unet"
 PAIR_TENSORS = "pairs."  #: prefix of the names of the tensors of a pair network in a border model
@@ -189,7 +189,7 @@ class BorderNetwork:
 
     def __init__(self, model: TrainedModel) -> None:
         self.net, self.scale, self.shift = calibrated_network(
-            model.split(PAIR_TENSORS)[0], IMAGE_CHANNELS, lambda values: BorderNet(int(values["width"]))
+            model.split(PAIR_TENSORS)[0], IMAGE_CHANNELS, lambda values: BorderNet(layer_size(values, "width"))
         )
         evidence = model.description.get("evidence", {})
         #: Weights of the features of the tree `border`; empty if they were not fitted.

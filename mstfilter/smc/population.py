@@ -125,6 +125,15 @@ def take(particles: Particles, indices: np.ndarray) -> Particles:
     return tuple(particles[int(i)] for i in indices)
 
 
+def _all_same(particles: Particles) -> bool:
+    """Whether all particles are one object, or equal rows of arrays."""
+    if isinstance(particles, np.ndarray):
+        return bool((particles == particles[0]).all())
+    if isinstance(particles, Mapping):
+        return all(_all_same(a) for a in particles.values())
+    return all(particle is particles[0] for particle in particles)
+
+
 def as_matrix(particles: Any) -> np.ndarray:
     """(n, d) float64 rows of particles that are an array or a mapping of arrays; InputError for objects."""
     if isinstance(particles, np.ndarray) and particles.dtype != object:
@@ -283,11 +292,22 @@ class Population:
 
     @property
     def best(self) -> Any:
-        """The particle of largest weight; the first particle if several have the largest weight."""
-        index = int(np.argmax(self.log_weights))
-        if isinstance(self.particles, Mapping):
-            return {name: a[index] for name, a in self.particles.items()}
-        return self.particles[index]
+        """The particle of largest weight.
+
+        Raises InputError if different particles share the largest weight, as after resampling, because any of them
+        would be a random draw. Particles are the same if they are one object, or have equal values in all arrays.
+        """
+        heaviest = np.flatnonzero(self.log_weights == self.log_weights.max())
+        tied = take(self.particles, heaviest)
+        if not _all_same(tied):
+            raise InputError(
+                f"{len(heaviest)} of {len(self)} particles share the largest weight, so none of them is the best",
+                "of scenes, mstfilter.Belief(population).estimate() is the best single answer",
+                "of numbers, use the weighted mean: np.average(particles, axis=0, weights=population.weights)",
+            )
+        if isinstance(tied, Mapping):
+            return {name: a[0] for name, a in tied.items()}
+        return tied[0]
 
     @classmethod
     def unchecked(cls, particles: Particles, log_weights: np.ndarray) -> Population:
@@ -299,15 +319,24 @@ class Population:
     def take(self, indices: np.ndarray, log_weights: np.ndarray | None = None) -> Population:
         """Select particles with their parents, and with their log weights unless `log_weights` are given.
 
-        Raises InputError if the indices are not integers from 0 to n - 1.
+        Raises InputError if the indices are not integers from 0 to n - 1, if there are none, or if all selected
+        particles have weight 0.
         """
         indices = _within(_integers("indices", indices), len(self))
-        return Population(
-            take(self.particles, indices),
-            self.log_weights[indices] if log_weights is None else log_weights,
-            {name: index[indices] for name, index in self.parents.items()},
-            self.notes,
-        )
+        if not len(indices):
+            raise InputError("no particle is selected", "name at least one index")
+        try:
+            return Population(
+                take(self.particles, indices),
+                self.log_weights[indices] if log_weights is None else log_weights,
+                {name: index[indices] for name, index in self.parents.items()},
+                self.notes,
+            )
+        except LostRunError:
+            raise InputError(
+                f"all {len(indices)} selected particles have weight 0",
+                "select among those of positive weight: np.flatnonzero(population.weights)",
+            ) from None
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
         """Select particles as `take` does, set ``parents["ancestor"]``, and add the given values to `notes`."""

@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from mstfilter.errors import InputError, naming
 from mstfilter.presets import load_config
 from mstfilter.reading import read_toml
+
+_MOST_SEEDS = 100_000  # of one entry
+_MOST_ARMS = 10_000  # of one entry
 
 
 def _seeds(value: Any) -> Any:
@@ -35,7 +39,10 @@ def _seeds(value: Any) -> Any:
             raise ValueError(f"{value!r} is not of the form 0-4, 7")
         if dash and int(last) < int(first):
             raise ValueError(f"{part.strip()!r} ends before it starts")
-        found.extend(range(int(first), int(last if dash else first) + 1))
+        seeds = range(int(first), int(last if dash else first) + 1)
+        if seeds.stop - seeds.start + len(found) > _MOST_SEEDS:
+            raise ValueError(f"{value!r} are more than {_MOST_SEEDS} seeds")
+        found.extend(seeds)
     return tuple(found)
 
 
@@ -173,6 +180,11 @@ def _expand(entry: ArmEntry, folder: Path, overrides: Sequence[str]) -> Iterator
     grids = [split_grid(text) for text in (*entry.set, *overrides)]
     if not presets or not all(presets):
         raise InputError(f"an arm names no preset: {list(entry.preset)}")
+    if (n := len(presets) * math.prod(map(len, grids))) > _MOST_ARMS:
+        raise InputError(
+            f"the grid of an arm has {n} combinations, at most {_MOST_ARMS} are run: {', '.join(entry.set)}",
+            "name fewer values, or write the combinations as arms of their own",
+        )
     varied = [k for k, grid in enumerate(grids) if len(grid) > 1]
     for preset in presets:
         for chosen in itertools.product(*grids):

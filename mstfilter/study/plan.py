@@ -30,6 +30,8 @@ from mstfilter.runs import as_json, code_version, component_files, library_versi
 from mstfilter.scene import content_key
 from mstfilter.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms
 
+_MOST_RUNS = 1_000_000
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -113,6 +115,12 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     if study.reference and study.reference not in [arm.name for arm in arms]:
         raise InputError(
             f"reference is {study.reference!r}, which is not an arm", f"there are: {', '.join(a.name for a in arms)}"
+        )
+    if (n := len(arms) * len(scenes) * len(study.seeds)) > _MOST_RUNS:
+        raise InputError(
+            f"study {study.name} has {n} runs, at most {_MOST_RUNS} are planned: {len(arms)} arms, {len(scenes)} "
+            f"scenes and {len(study.seeds)} seeds",
+            "split the study",
         )
     runs = tuple(
         StudyRun(arm, scene, seed, _hash([arm.key, scene.key, seed]))

@@ -76,6 +76,10 @@ class _Result(BaseModel):
     identity: str
     rows: list[_Row] = []
     costs: list[_Cost] = []
+    error: str = ""
+    hints: list[str] = []
+    trace: str = ""
+    tries: int = 1
 
     @model_validator(mode="after")
     def _agree(self) -> _Result:

@@ -132,7 +132,7 @@ def test_with_an_empty_prediction_the_samples_come_back(update):
     assert found == set(keys(proposed))
     for h in fused.particles:
         if h.n_objects:
-            assert any(h is p for p in proposed.particles)
+            assert any(h.labels is p.labels and h.occupancy is p.occupancy for p in proposed.particles)
 
 
 class OnScenes(UpdateContract):

@@ -170,6 +170,30 @@ def test_a_network_that_cannot_be_used_is_one_error(tmp_path, case):
     assert message in caught.value.message and "\n" not in caught.value.message
 
 
+def test_an_endless_loop_in_onnx_is_stopped(tmp_path, monkeypatch):
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    make, kind = onnx.helper, onnx.TensorProto
+    inner = [make.make_tensor_value_info("i", kind.INT64, [])]
+    for name in "cv":
+        inner.append(make.make_tensor_value_info(name, kind.BOOL if name == "c" else kind.FLOAT, None))
+    outer = [make.make_tensor_value_info(f"{one.name}2", one.type.tensor_type.elem_type, None) for one in inner[1:]]
+    body = make.make_graph([make.make_node("Identity", [n], [f"{n}2"]) for n in "cv"], "body", inner, outer)
+    nodes = [
+        make.make_node("Constant", [], ["true"], value=make.make_tensor("t", kind.BOOL, [], [1])),
+        make.make_node("ReduceMean", ["x"], ["mean"], axes=[1], keepdims=0),
+        make.make_node("Loop", ["", "true", "mean"], ["y"], body=body),
+    ]
+    x = make.make_tensor_value_info("x", kind.FLOAT, ["n", len(CHANNELS), "a", "b", "c"])
+    y = make.make_tensor_value_info("y", kind.FLOAT, ["n", "a", "b", "c"])
+    model = make.make_model(make.make_graph(nodes, "g", [x], [y]), opset_imports=[make.make_opsetid("", 13)])
+    model.ir_version = 8
+    onnx.save(model, tmp_path / "loop.onnx")
+    monkeypatch.setattr("mstfilter.completion.unet._LONGEST_S", 0.5)
+    with pytest.raises(InputError, match=r"it has not ended after 0\.5 s, as in an endless loop"):
+        load_network(str(tmp_path / "loop.onnx"))
+
+
 def test_onnx_files_that_cannot_be_used(onnx_page, tmp_path, monkeypatch):
     net = Convolution(2).build()
     onnx_page(net)

@@ -49,6 +49,30 @@ def test_crossover_carries_probabilities(a, b, crossover, seed):
         np.testing.assert_array_equal(same.shares.probability[same.labels > 0], unsure[0].shares.probability[a > 0])
 
 
+@settings(max_examples=60, deadline=None)
+@given(labels, labels, crossovers, st.integers(0, 1000))
+def test_objects_of_both_parents_have_different_ids(a, b, crossover, seed):
+    """Also if the parents use the same ids, as without `birth`. Predicted objects keep theirs."""
+    proposed, predicted = Hypothesis.from_labels(a, SMALL), Hypothesis.from_labels(b, SMALL)
+    child = crossover.cross(np.random.default_rng(seed), proposed, predicted)
+    assert len({o.id for o in child.objects}) == child.n_objects
+    apart = crossover.cross(np.random.default_rng(seed), proposed.born_at(1), predicted)
+    kept, known = {o.id for o in child.objects}, {o.id for o in predicted.objects}
+    if predicted.objects and proposed.objects:
+        assert kept & known == {o.id for o in apart.objects} & known
+
+
+def test_the_update_gives_new_objects_the_ids_of_its_pause():
+    """An id is not given again, even if its object was lost before."""
+    a, b = np.zeros(GRID.shape, np.uint16), np.zeros(GRID.shape, np.uint16)
+    a[:3, :3, :3], b[10:13, :3, :3], b[20:23, :3, :3] = 2, 1, 2
+    predicted, proposed = (Population((Hypothesis.from_labels(one, GRID),)) for one in (a, b))
+    update = CrossoverUpdate(NoFreeSpace(), Crossover(mode_filter=NO_FILTER))
+    found = update.update(np.random.default_rng(0), predicted, proposed, clip(7))
+    assert {o.id for o in found.particles[0].objects} == {2, 7 * 65536 + 1, 7 * 65536 + 2}
+    assert {o.birth for o in found.particles[0].objects} == {0, 7}
+
+
 @settings(max_examples=150, deadline=None)
 @given(labels, labels, crossovers, st.integers(0, 1000))
 def test_crossover_invariants(a, b, crossover, seed):

@@ -201,6 +201,10 @@ HOSTILE = {
         broken("a.npz", occupancy=np.full((2, 2, 2), 2), origin=np.zeros(3), voxel_size=0.1),
         "not between 0 and 1",
     ),
+    "three voxel sizes": (
+        broken("a.npz", occupancy=np.ones((2, 2, 2)), origin=np.zeros(3), voxel_size=[0.1, 0.1, 0.1]),
+        "voxel size is array([0.1, 0.1, 0.1])",
+    ),
     "flat occupancy": (broken("a.npz", occupancy=np.ones((2, 2)), origin=np.zeros(3), voxel_size=0.1), "(A, B, C)"),
     "voxels of size 0": (
         broken("a.npz", occupancy=np.ones((2, 2, 2)), origin=np.zeros(3), voxel_size=0),

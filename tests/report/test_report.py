@@ -11,10 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mstfilter.belief import Belief
 from mstfilter.errors import InputError
 from mstfilter.report import run_report, viewpoint
 from mstfilter.report.run_numbers import read_numbers
 from mstfilter.report.run_report import write_report
+from mstfilter.report.scenes import scenes_of_run
 from mstfilter.runs import HypothesisCodec, RunFolder
 from mstfilter.scene import Hypothesis, project, render
 from mstfilter.scoring import BeliefScore, read_truth, score_pauses, weighted_coverage
@@ -153,6 +155,23 @@ def test_notes_of_any_shape(tmp_path):
     assert "deep.er" in page.text and "own slot" in page.text and "1e-09" in page.text
 
 
+def test_the_first_picture_is_the_estimate(tmp_path):
+    """Of hypotheses with equal weights the first is a random draw; the estimate agrees best with all of them."""
+    run = make_run(tmp_path / "run", pauses=1)
+    odd, one, other = (labels_of(*boxes) for boxes in (((0, 0, 2),), ((8, 8, 4),), ((8, 8, 5),)))
+    made = tuple(Hypothesis.from_labels(labels, GRID) for labels in (odd, one, other))
+    save_state(run.pause(0) / "state.npz", State(1, Population(made), Key(7), False), HypothesisCodec())
+    info = run.info(0) | {"weights": [1 / 3] * 3}
+    (run.pause(0) / "info.json").write_text(json.dumps(info))
+    estimate = Belief(run.state(0).population).estimate()
+    assert estimate.key in (made[1].key, made[2].key)
+    views = scenes_of_run(run)[0].views
+    assert views[0].hypothesis.key == estimate.key and views[0].text.startswith("estimate, weight 0.33")
+    assert [view.members for view in views[1:-1]] == [(k,) for k in range(3) if (k,) != views[0].members]
+    k = next(k for k in range(3) if made[k].key == estimate.key)
+    assert f"The estimate at the last pause, over the image: hypothesis #{k}" in read(write_report(run))[1].text
+
+
 def test_only_the_heaviest_of_many_hypotheses_have_cards(tmp_path):
     run = make_run(tmp_path / "run", pauses=1)
     from dataclasses import replace
@@ -164,14 +183,16 @@ def test_only_the_heaviest_of_many_hypotheses_have_cards(tmp_path):
         labels[k % 15, 3:6, :2] = 1
         labels[15 - k % 15, 9:12, : 1 + k // 15] = 2
         many.append(replace(first, labels=labels, objects=type(first).from_labels(labels, first.grid).objects))
-    state = State(1, Population(tuple(many)), Key(0), False)
+    state = State(1, Population(tuple(many)), Key(7), False)
     save_state(run.pause(0) / "state.npz", state, HypothesisCodec())
     info = run.info(0)
     info |= {"weights": [1 / 20] * 20, "n": 20, "quality": {f: [0.5] * 20 for f in info["quality"]}}
     info["parents"] = {"proposed": list(range(20))}
     (run.pause(0) / "info.json").write_text(json.dumps(info))
     _, page = read(write_report(run))
-    assert "The 12 most probable are shown; the others have 40 % of the weight." in page.text
+    assert (
+        "The estimate and the 11 most probable of the others are shown; the rest has 40 % of the weight." in page.text
+    )
 
 
 def test_errors(tmp_path):

@@ -126,6 +126,22 @@ def test_conclusions_leave_out_arms_that_are_reported_only(tmp_path):
     assert "theirs minus ours" in text and "floor minus ours" not in text
 
 
+def test_null_in_a_result(tmp_path):
+    """A number that is not known is left out; a result with null elsewhere is no result."""
+    study = make_study(tmp_path, n_scenes=2, groups=("s",))
+    paths = {json.loads(p.read_text())["status"]: p for p in sorted(study.glob(f"runs/*/{RESULT}"))}
+    done, failed = (json.loads(paths[status].read_text()) for status in ("done", "failed"))
+    n = len(StudyFolder.open(study).rows())
+    for change in ({"qualities": [0.5, None, 0.6]}, {"qualities": [None]}, {"qualities": None}, {"quality": None}):
+        rows = [{**row, **change} for row in done["rows"]]
+        paths["done"].write_text(json.dumps({**done, "rows": rows}))
+        assert write_study_report(study).is_file() and len(StudyFolder.open(study).rows()) == n
+    for name in ("error", "hints", "trace", "tries"):
+        paths["failed"].write_text(json.dumps({**failed, name: [None] if name == "hints" else None}))
+        StudyFolder.open(study).write_tables()
+        assert write_study_report(study).is_file() and StudyFolder.open(study).failures() == []
+
+
 def test_a_study_without_results_has_a_page(tmp_path):
     study = make_study(tmp_path)
     for path in study.rglob(RESULT):

@@ -15,7 +15,7 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.formats import save_recording
-from mstfilter.report import recording_page, run_page, viewer
+from mstfilter.report import recording_page, run_page, viewer, write_report
 from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
 from tests.report.pages import check_html
 from tests.report.runs import GRID, make_run, recording, truth_at
@@ -122,6 +122,17 @@ def test_the_command_writes_a_file_of_the_run(run, tmp_path, capsys):
     run.check_replaceable()
     assert call("view", run.path, "--out", tmp_path / "page.html", capsys=capsys)[0] == 0
     assert (tmp_path / "page.html").is_file()
+
+
+def test_a_run_without_pauses_or_description(tmp_path, capsys):
+    run = make_run(tmp_path / "run", 1)
+    description = json.loads((run.path / "run.json").read_text())
+    del description["description"]
+    (run.path / "run.json").write_text(json.dumps(description))
+    assert "two boxes" in run_page(run).text and write_report(run).is_file()
+    shutil.rmtree(run.path / "pauses")
+    code, _, err = call("view", run.path, capsys=capsys)
+    assert code == 2 and "the run has no complete pause yet\nhint: repeat the command" in err
 
 
 def test_the_name_of_a_recording_is_no_path_and_no_place_of_the_page(tmp_path, monkeypatch, capsys):

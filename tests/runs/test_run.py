@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,6 +104,55 @@ def test_a_folder_of_another_run_is_refused(recording, finished, tmp_path):
     (tmp_path / "other" / "precious.txt").write_text("x")
     with pytest.raises(InputError, match="not an empty folder"):
         filter_recording(recording, load_config("mst"), tmp_path / "other", seed=3)
+
+
+@pytest.mark.parametrize(("source", "target"), [(0, 1), (1, 0), (2, 2)])
+def test_pauses_of_another_run_or_pause_are_refused(recording, finished, tmp_path, source, target):
+    """A pause of a run with another seed, and another pause of this run. Without it, the run is resumed."""
+    shutil.copytree(finished.path, tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    shutil.rmtree(run.pause(target))
+    if source == target:
+        other = filter_recording(recording, load_config("mst", ["n=3", "n_proposed=2"]), tmp_path / "other", seed=4)
+        shutil.copytree(other.pause(source), run.pause(target))
+    else:
+        shutil.copytree(finished.pause(source), run.pause(target))
+    message = f"{target:03d} is of another run or pause: its state is of pause {source} with seed "
+    for reads in (lambda: filter_recording(recording, load_config("mst"), run.path, seed=2), run.check):
+        with pytest.raises(InputError, match=message) as raised:
+            reads()
+        assert f"remove the folders of pause {target} and all later pauses" in raised.value.hints[0]
+    for t in range(target, 3):
+        shutil.rmtree(run.pause(t))
+    filter_recording(recording, load_config("mst"), run.path, seed=2)
+    assert content(run.path) == content(finished.path)
+
+
+@pytest.mark.parametrize(
+    "damage", [Path.unlink, lambda path: path.write_text("{"), lambda path: path.write_text("7")]
+)
+def test_times_are_no_part_of_the_result(recording, finished, tmp_path, damage):
+    """A run without them is resumed, and has scores and a report."""
+    shutil.copytree(finished.path, tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    damage(run.pause(0) / "seconds.json")
+    shutil.rmtree(run.pause(2))
+    filter_recording(recording, load_config("mst"), run.path, seed=2)
+    assert content(run.path) == content(finished.path) and run.seconds(0) == {} != run.seconds(1)
+    assert len(run.estimates()) == 3
+
+
+@pytest.mark.parametrize("pause", [1, 2, 3])
+def test_a_folder_that_is_removed_while_the_run_is_written_is_named(recording, tmp_path, pause):
+    """Nothing is written in its place."""
+
+    def remove(done, total):
+        if done == pause:
+            shutil.rmtree(tmp_path / "run")
+
+    with pytest.raises(InputError, match="was removed while the run was written"):
+        filter_recording(recording, load_config("floor_one_blob"), tmp_path / "run", progress=remove)
+    assert not (tmp_path / "run").exists()
 
 
 def test_broken_input_and_useless_settings_make_no_folder(recording, tmp_path):

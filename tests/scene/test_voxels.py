@@ -211,6 +211,32 @@ def test_encoding_is_lossless_and_reproducible():
     assert {name: a.tobytes() for name, a in again.items()} == {name: a.tobytes() for name, a in arrays.items()}
 
 
+def test_a_voxel_size_is_one_number():
+    arrays = encode_hypotheses([Hypothesis.from_labels(np.zeros(GRID.shape, np.uint16), GRID)])
+    for wrong in ([0.01, 0.01, 0.01], [0.01], np.nan, "x"):
+        with pytest.raises(InputError, match="voxel size is "):
+            VoxelGrid((0, 0, 0), wrong, (1, 1, 1))
+        with pytest.raises(InputError, match="voxel size is .*, expected one number"):
+            VoxelGrid.from_bounds((0, 0, 0), (1, 1, 1), wrong)
+        with pytest.raises(InputError, match="voxel size is "):
+            decode_hypotheses(arrays | {"voxel_size": np.array(wrong)})
+    with pytest.raises(InputError, match="grid"):
+        VoxelGrid.from_bounds((0, 0, 0), (1e300, 1, 1), 1e-300)
+
+
+def test_objects_of_one_id_are_refused():
+    labels = np.zeros((2, 2, 2), np.uint16)
+    labels[0], labels[1] = 1, 2
+    grid = VoxelGrid((0, 0, 0), 0.01, (2, 2, 2))
+    records = tuple(ObjectRecord(label, 5) for label in (1, 2))
+    with pytest.raises(InputError, match=r"labels \[1, 2\] have one id, 5"):
+        Hypothesis(labels, grid, records)
+    first, second = ObjectRecord.born(1, 3), ObjectRecord.born(1, 3, taken={3 * 65536 + 1, 4 * 65536 + 1})
+    assert (first.id, second.id) == (3 * 65536 + 1, 5 * 65536 + 1)
+    whole = Hypothesis.from_labels(labels, grid)
+    assert [o.id for o in whole.born_at(2).objects] == [2 * 65536 + 1, 2 * 65536 + 2] and whole.born_at(0) is whole
+
+
 def test_points_mesh_pose_and_box_of_an_object():
     grid = VoxelGrid((-0.2, -0.2, 0.0), 0.01, (60, 60, 20))
     x, y, z = (grid.centre_of(np.argwhere(np.ones(grid.shape, bool)))).reshape(*grid.shape, 3).transpose(3, 0, 1, 2)

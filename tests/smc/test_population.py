@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.errors import InputError, LostRunError
 from mstfilter.smc import Always, Candidates, Population, WeightResampler, bootstrap, log_mean_exp
-from mstfilter.smc.population import union
+from mstfilter.smc.population import take, union
 from tests.smc.models import AR1
 
 
@@ -32,6 +32,29 @@ def test_take_selects_from_every_kind(particles):
         assert population.best["a"] == 3
     else:
         np.testing.assert_array_equal(chosen.particles[:, 0], [9, 9, 0])
+
+
+def test_different_particles_of_equal_weight_have_no_best_one():
+    """After resampling, the first particle is a random draw. Copies of one particle are that particle."""
+    for particles in (np.arange(3.0), {"x": np.arange(3.0), "y": np.zeros(3)}, ("a", "b", "c"), Candidates(str, 3)):
+        with pytest.raises(InputError, match="2 of 3 particles share the largest weight") as raised:
+            _ = Population(particles, np.log([2.0, 1.0, 2.0])).best
+        assert "estimate" in raised.value.hints[0]
+        copies = Population(particles).take(np.array([2, 2, 0]), np.log([2.0, 2.0, 1.0]))
+        assert copies.best == Population(take(particles, np.array([2]))).best
+    assert Population({"x": np.array([5, 5]), "y": np.array([1, 1])}).best == {"x": 5, "y": 1}
+
+
+def test_a_selection_without_weight_is_named():
+    """It is the choice of the caller, and no lost run."""
+    population = Population(np.arange(3.0), np.array([0, -np.inf, -np.inf]))
+    with pytest.raises(InputError, match="all 2 selected particles have weight 0") as raised:
+        population.take(np.array([1, 2]))
+    assert not isinstance(raised.value, LostRunError)
+    with pytest.raises(InputError, match="no particle is selected"):
+        population.take(np.array([], int))
+    with pytest.raises(LostRunError, match="no particle explains"):
+        population.reweighted(np.full(3, -np.inf))
 
 
 @pytest.mark.parametrize("variables", [("a", "b"), ("b", "a")])

@@ -10,9 +10,11 @@ import sys
 
 import pytest
 
+from mstfilter.cli.studying import _print_failures
 from mstfilter.formats import open_recording
 from mstfilter.presets import load_config
 from mstfilter.runs import filter_recording
+from mstfilter.study import JobOutcome
 from tests.study.scenes import slide
 from tests.study.test_failures import BROKEN, FAST, hanging_study, wait_for
 from tests.test_cli import HEAVY, call, python
@@ -75,6 +77,18 @@ def test_messages_go_to_the_log(config, tmp_path, caplog, capsys):
     assert code == 0 and "slide: pause 1 filtered in" in error and "filtered in" not in out
     code, out, error = call(*run, tmp_path / "b", capsys=capsys)
     assert code == 0 and "filtered in" not in out + error
+
+
+def test_many_failures_are_a_few_lines(capsys):
+    """Equal errors are one line with one set of hints; of different errors, the first ten are printed."""
+    hints = tuple(map(str, range(1000)))
+    failed = [(f"run {k}", JobOutcome("failed", "it broke", hints)) for k in range(1000)]
+    failed += [(f"other {k}", JobOutcome("failed", f"error {k}")) for k in range(1000)]
+    _print_failures(failed)
+    out, err = capsys.readouterr()
+    assert out.splitlines()[:2] == ["failed      run 0 and 999 more: it broke", "failed      other 0: error 0"]
+    assert out.splitlines()[10:] == ["failed      991 more runs, with other errors"]
+    assert err.splitlines() == [f"hint: {k}" for k in range(10)]
 
 
 def test_an_unknown_component_is_answered_before_heavy_imports(tmp_path):

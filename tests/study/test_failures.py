@@ -202,6 +202,13 @@ WRONG = {
     'scenes = [{recordings = "absent-*"}]': "recording does not exist",
     'scenes = [{family = "demo"}]': "has no seeds",
     "scenes = [{seeds = 1}]": "needs either family",
+    'seeds = "0-3000000000"': "are more than 100000 seeds",
+    "arms = [{{set = {}}}]".format([f"{name}={','.join(map(str, range(1, 33)))}" for name in "nnnnnn"]): (
+        "the grid of an arm has 1073741824 combinations, at most 10000 are run"
+    ),
+    'seeds = "0-50000"\narms = [{set = "update.n_views=1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21"}]': (
+        "1050021 runs, at most 1000000 are planned: 21 arms, 1 scenes and 50001 seeds"
+    ),
     'reference = "mine"': "reference is 'mine', which is not an arm",
     "colour = 1": "fields of a study",
     'keep = "some"': "keep",
@@ -216,7 +223,8 @@ def test_a_wrong_study_is_one_clear_error_before_any_run(folder, tmp_path, line)
         "scenes": f'scenes = [{{recordings = "{folder / "slide"}"}}]',
         "arms": 'arms = [{set = "transition=identity"}]',
     }
-    kept = [text for name, text in base.items() if not line.startswith(name)]
+    given = [one.partition(" ")[0] for one in line.splitlines()]
+    kept = [text for name, text in base.items() if name not in given]
     (tmp_path / "study.toml").write_text("\n".join([*kept, line]))
     with pytest.raises(InputError) as caught:
         run_study(load_study(tmp_path / "study.toml"), tmp_path / "out", cache=tmp_path / "cache")

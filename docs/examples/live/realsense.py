@@ -7,8 +7,8 @@ import mstfilter
 
 
 def show(pause):
-    best = pause.state.population.best
-    print(f"pause {pause.index}: {best.n_objects} objects, {pause.latency_s:.1f} s after the last frame")
+    scene = mstfilter.Belief(pause.state.population).estimate()
+    print(f"pause {pause.index}: {scene.n_objects} objects, {pause.latency_s:.1f} s after the last frame")
 
 
 pipeline, config = rs.pipeline(), rs.config()

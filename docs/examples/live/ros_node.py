@@ -6,9 +6,9 @@ The node is started by ``python ros_node.py --ros-args -p colour:=/camera/color/
 - ``depth_scale``: metres per unit of 16-bit depth (0.001). ``tolerance_s``: largest difference of two stamps (0.02).
 - ``filter``: name of a preset. ``hold_s``: see `mstfilter.formats.Settled`.
 
-Published at every pause: ``~/labels`` (sensor_msgs/Image, mono16), the objects of the best hypothesis, and
-``~/belief`` (std_msgs/String), the JSON of `belief_json`. rclpy is imported when the node is started. Everything else
-works on messages of any library that has their fields, such as rosbags.
+Published at every pause: ``~/labels`` (sensor_msgs/Image, mono16), the objects of the estimate
+(`Belief.estimate`), and ``~/belief`` (std_msgs/String), the JSON of `belief_json`. rclpy is imported when the node is
+started. Everything else works on messages of any library that has their fields, such as rosbags.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.belief import Belief
 from mstfilter.errors import missing_library, warn_user
 from mstfilter.formats import Settled
 from mstfilter.formats.bag import colour_image, depth_image
@@ -87,9 +88,9 @@ class ImagePairs:
 
 
 def label_image(pause: Pause) -> np.ndarray:
-    """Labels (H, W) uint16 of the objects of the best hypothesis in the image of the pause."""
+    """Labels (H, W) uint16 of the objects of the estimate in the image of the pause."""
     assert pause.state.population is not None
-    return project(pause.state.population.best, pause.clip.after.camera)
+    return project(Belief(pause.state.population).estimate(), pause.clip.after.camera)
 
 
 def belief_json(pause: Pause) -> str:
