@@ -15,9 +15,6 @@ not on the robot. Flow that is computed only from the first and the last frame f
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Literal
@@ -79,7 +76,8 @@ class DenseFlow(Bounded):
     """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward.
 
     `preset` is the preset of OpenCV. With the region "changed", the flow between two frames is zero outside a box
-    around the pixels that changed. With "image", the flow is computed in the whole image.
+    around the pixels that changed. With "image", the flow is computed in the whole image. The flow depends on the
+    number of OpenCV's threads, so this number becomes 1 in the whole process.
     """
 
     preset: Literal["ultrafast", "fast", "medium"] = "medium"
@@ -129,8 +127,8 @@ class FlowTracker:
     def add(self, frame: Frame) -> None:
         """Add the next frame. The previously added frame is used if the motion since the last used frame is large."""
         small, dis = _small(frame), cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
-        with _one_thread():
-            flow = dis.calc(self._small, small, None)
+        _one_thread()
+        flow = dis.calc(self._small, small, None)
         # The robot is excluded: it moves fast and is not tracked.
         speed = _speed(flow, self._last) / _SMALL_WIDTH
         if len(self.keys) > 1 and self._moved + speed > _FRAME_MOTION:
@@ -201,25 +199,13 @@ def _speed(flow: np.ndarray, frame: Frame) -> float:
     return float(np.quantile(seen, 0.995)) if len(seen) else 0.0
 
 
-_calls = {"open": 0, "threads": 0}  # blocks of `_one_thread` in all threads, and the setting outside of them
-_calls_lock = threading.Lock()
+def _one_thread() -> None:
+    """Limit OpenCV to one thread, because the flow depends on the number of threads.
 
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit OpenCV to one thread, because the flow depends on the number of threads."""
-    with _calls_lock:  # the setting is global: the first block changes it, and the last one restores it
-        if not _calls["open"]:
-            _calls["threads"] = cv2.getNumThreads()
-            cv2.setNumThreads(1)
-        _calls["open"] += 1
-    try:
-        yield
-    finally:
-        with _calls_lock:
-            _calls["open"] -= 1
-            if not _calls["open"]:
-                cv2.setNumThreads(_calls["threads"])
+    The limit stays. To restore the number after each call would end and start OpenCV's threads again and again.
+    """
+    if cv2.getNumThreads() != 1:
+        cv2.setNumThreads(1)
 
 
 def _robot(frame: Frame) -> np.ndarray:
@@ -267,8 +253,8 @@ def _flow(a: Frame, b: Frame, preset: str, box: tuple[slice, slice]) -> tuple[np
         dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
         return np.asarray(dis.calc(grey[first], grey[second], None))
 
-    with _one_thread():
-        return together(lambda: between(0, 1), lambda: between(1, 0))
+    _one_thread()
+    return together(lambda: between(0, 1), lambda: between(1, 0))
 
 
 def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
