@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
+import os
 import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
@@ -95,6 +96,28 @@ def progress_of(progress: Any, what: str = "", bars: str = "progress_bar") -> It
             yield advance
     else:
         yield progress or (lambda *arguments: None)
+
+
+# A forked process has no copy of OpenCV's threads and would wait for them for ever, so they end before a fork.
+_opencv_threads = 1
+
+
+def _end_threads_of_opencv() -> None:
+    global _opencv_threads
+    opencv: Any = sys.modules.get("cv2")
+    if hasattr(opencv, "setNumThreads"):
+        _opencv_threads = opencv.getNumThreads()
+        opencv.setNumThreads(1)
+
+
+def _restore_threads_of_opencv() -> None:
+    opencv: Any = sys.modules.get("cv2")
+    if hasattr(opencv, "setNumThreads"):
+        opencv.setNumThreads(_opencv_threads)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_end_threads_of_opencv, after_in_parent=_restore_threads_of_opencv)
 
 
 SYSTEM_PACKAGES = ("libusb-1.0-0", "libgl1", "libegl1", "libgomp1")

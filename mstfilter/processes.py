@@ -16,9 +16,12 @@ import logging
 import os
 import platform
 import sys
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar, copy_context
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -102,53 +105,90 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_pools: list[ThreadPoolExecutor] = []  # of the blocks `parallel`, innermost last
+_MOST_THREADS = 1024  # of the pool, which starts a thread only if all others are busy
+#: How many calls the current block `parallel` may still start in the pool. A call in the pool is in the block that
+#: started it, and blocks of several threads do not affect each other.
+_free_threads: ContextVar[threading.Semaphore] = ContextVar("free_threads")
+_NO_THREADS = threading.Semaphore(0)  # outside of all blocks
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The pool of all blocks `parallel` of a process; a forked child has its own, since threads are not copied."""
+    return ThreadPoolExecutor(_MOST_THREADS, "mstfilter")
 
 
 @contextmanager
 def parallel(n_threads: int) -> Iterator[None]:
-    """In the block, `together` uses up to `n_threads` threads. The number of threads does not change results."""
-    if n_threads < 2:
+    """In the block, `together` and `each` use up to `n_threads` threads, which does not change results.
+
+    Blocks in several threads are independent: each has its own number. A block in another block replaces its number.
+    """
+    token = _free_threads.set(threading.Semaphore(max(n_threads - 1, 0)))
+    try:
         yield
-        return
-    with ThreadPoolExecutor(n_threads - 1, "mstfilter") as pool:
-        _pools.append(pool)
-        try:
-            yield
-        finally:
-            _pools.remove(pool)
+    finally:
+        _free_threads.reset(token)
 
 
 def together(first: Callable[[], _A], second: Callable[[], _B]) -> tuple[_A, _B]:
     """The results of two independent functions, computed at the same time in a block `parallel`."""
-    if not _pools:
-        return first(), second()
-    other = _pools[-1].submit(second)
-    try:
-        found = first()
-    except BaseException:
-        if not other.cancel():
-            other.exception()  # wait, so that nothing continues after the error
-        raise
-    # A call that has not begun is made here. So nested calls cannot wait for each other.
-    return found, second() if other.cancel() else other.result()
+    calls: tuple[Callable[[], Any], ...] = (first, second)
+    found = each(lambda call: call(), calls)
+    return found[0], found[1]
 
 
 def each(function: Callable[[_A], _B], items: Iterable[_A]) -> list[_B]:
-    """The results of a function for several items, computed two at a time in a block `parallel`.
+    """The results of a function for several items, computed at the same time in a block `parallel`.
 
-    The calls must be independent and free of side effects.
+    The calls must be independent and free of side effects. They begin in the order of the items. After an error no
+    further call begins, and the error of the first item with one is raised, as in a loop.
     """
     given = list(items)
     found: dict[int, _B] = {}
+    failed: dict[int, BaseException] = {}
     waiting = iter(range(len(given)))  # `next` of an iterator over a range is atomic
 
     def work() -> None:
         for k in waiting:
-            found[k] = function(given[k])
+            try:
+                found[k] = function(given[k])
+            except BaseException as error:
+                failed[k] = error
+                deque(waiting, maxlen=0)
 
-    together(work, work)
+    with _helped(work, len(given) - 1):
+        try:
+            work()
+        finally:
+            deque(waiting, maxlen=0)  # also after Ctrl-C between two calls
+    if failed:
+        raise failed[min(failed, key=lambda k: (isinstance(failed[k], Exception), k))]  # Ctrl-C before all others
     return [found[k] for k in range(len(given))]
+
+
+@contextmanager
+def _helped(work: Callable[[], None], most: int) -> Iterator[None]:
+    """In the block, free threads of the block `parallel` call a function too, at most `most`. Waits for them."""
+    free, helpers = _free_threads.get(_NO_THREADS), list[Future[None]]()
+
+    def help_once() -> None:
+        try:
+            work()
+        finally:
+            free.release()
+
+    try:
+        while len(helpers) < most and free.acquire(blocking=False):
+            helpers.append(_pool(os.getpid()).submit(copy_context().run, help_once))
+        yield
+    finally:
+        # A call that has not begun is not needed. So nested calls never wait for a thread.
+        for helper in helpers:
+            if helper.cancel():
+                free.release()
+            else:
+                helper.result()
 
 
 def _cpu() -> str:

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from itertools import pairwise
@@ -152,12 +152,12 @@ class Redwood(VideoFormat):
         known: set[str] = set()  # names of the images that were read
         pairs: list[tuple[Path, Path]] = []  # the first and the latest one
         trial: tuple[Path, Path] | None = None  # the pair that is being read
-        n, since, failed = 0, time.monotonic(), None
+        n, since, failed, age = 0, time.monotonic(), None, _Ages()
         while time.monotonic() - since < idle_s:
             try:
                 new, images = self._files(path, known)
                 new = [file for file in new if _mask(path, file).is_file()] if (path / "robot").is_dir() else new
-                for pair in _complete(new, images, after=pairs[-1:]):
+                for pair in _complete(new, images, pairs[-1:], age):
                     trial = pair
                     colour, depth = map(list, zip(*pairs[:1], pair, strict=True))
                     video = self._video(path, colour, depth)
@@ -170,7 +170,7 @@ class Redwood(VideoFormat):
                     since, failed, trial = time.monotonic(), None, None
             except InputError as error:  # there is no image yet, or a file is incomplete
                 failed = error
-                if trial and min(map(_age, trial)) > _PARTNER_S:
+                if trial and min(map(age, trial)) > _PARTNER_S:
                     warn_user(f"images {trial[0].name}, {trial[1].name} of {path} are skipped: {error.message}")
                     known.update(file.name for file in trial)
                     n, trial, failed = n + 1, None, None
@@ -263,12 +263,28 @@ def _images(folder: Path, suffixes: tuple[str, ...], known: Collection[str] = ()
     return ordered
 
 
-def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Path]]) -> list[tuple[Path, Path]]:
+class _Ages:
+    """Seconds since the last change of a file was seen. The time in the file system may be that of another clock."""
+
+    def __init__(self) -> None:
+        self._seen: dict[Path, tuple[tuple[int, int], float]] = {}
+
+    def __call__(self, file: Path) -> float:
+        found, now = file.stat(), time.monotonic()
+        state = found.st_size, found.st_mtime_ns
+        if self._seen.get(file, (None, now))[0] != state:
+            self._seen[file] = state, now
+        return now - self._seen[file][1]
+
+
+def _complete(
+    colour: list[Path], depth: list[Path], after: list[tuple[Path, Path]], age: Callable[[Path], float]
+) -> list[tuple[Path, Path]]:
     """Pairs of images with equal numbers that are completely written and later than the last pair in `after`."""
     last = _number(after[0][0]) if after else Decimal(-2)
     of_number = {_number(file): file for file in depth}
     later = [file for file in colour if _number(file) > last]
-    late = [_number(file) for file in later if _number(file) not in of_number and _age(file) < _PARTNER_S]
+    late = [_number(file) for file in later if _number(file) not in of_number and age(file) < _PARTNER_S]
     later = [file for file in later if _number(file) < min(late, default=Decimal("inf"))]
     pairs = [(file, of_number[n]) for file in later if (n := _number(file)) in of_number]
     if not pairs and not after:
@@ -276,14 +292,9 @@ def _complete(colour: list[Path], depth: list[Path], after: list[tuple[Path, Pat
             "no colour image has a depth image of the same number",
             "a live run pairs images by number: give both images of a pair the same name",
         )
-    if not pairs or min(map(_age, pairs[-1])) > _WRITTEN_S:
+    if not pairs or min(map(age, pairs[-1])) > _WRITTEN_S:
         return pairs
     return pairs[:-1]
-
-
-def _age(file: Path) -> float:
-    """Seconds since the last change of a file."""
-    return time.time() - file.stat().st_mtime
 
 
 def _numbers(file: Path) -> list[Decimal]:

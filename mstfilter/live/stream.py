@@ -64,7 +64,8 @@ class Pause:
     state: State  #: the state of the filter
     info: Info  #: the record of the step
     latency_s: float  #: seconds from the push of the last frame to the result
-    #: Numbers of frames so far: "pushed"; dropped for the reasons "late", "no depth" or "overflow" (queue is full);
+    #: Numbers of frames so far: "pushed"; dropped for the reasons "late", "ahead" (a stamp far ahead), "no depth" or
+    #: "overflow" (queue is full);
     #: "thinned", which are removed from a long clip.
     counts: dict[str, int]
 
@@ -73,6 +74,10 @@ class Pause:
         """The particles."""
         assert self.state.population is not None
         return tuple(self.state.population.particles)
+
+
+_FAR_BEHIND_S = 1.0  # a frame that is later than this is not late: the clock was set, or a stamp is wrong
+_FAR_AHEAD_S = 86_400.0  # no camera skips a day, unless the program waits as long
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +118,8 @@ class Stream:
     -----
     If `max_frames` frames are queued, new frames are dropped. If a clip reaches `max_frames`, frames with little
     motion are removed from the clip. `counts` has the numbers. At most four times `max_frames` frames are in memory.
-    An error in a thread is raised by the next call of `push`, `wait` or `close`.
+    An exception that leaves the ``with`` block of a stream, such as Ctrl-C, drops the queued frames; the step that is
+    being computed is completed. An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
     def __init__(
@@ -146,9 +152,12 @@ class Stream:
         self._clip: list[_Item] = []
         self._trackers: list[Any] = []
         self._n_pauses = 0
-        self._last_time = -np.inf
+        self._last_time, self._last_arrived = -np.inf, 0.0
+        self._clock_change = 0.0  # seconds from stamps to times of the stream
+        self._strange: float | None = None  # the stamp of the frame before, if it was far from the last time
         self._posed: bool | None = None  # whether the frames have poses
         self._closing, self._closed = threading.Lock(), False
+        self._abandoned = False  # whether an error or Ctrl-C ends the stream: queued frames are not filtered
         self._step: Future[None] | None = None
         self._error: BaseException | None = None
         self.last: Pause | None = None  #: the result at the last pause
@@ -191,7 +200,8 @@ class Stream:
         -------
         bool
             Whether the frame was accepted. A frame is dropped and counted if it has no depth, if its time stamp is
-            not later than the previous time stamp, or if the queue is full.
+            not later than the previous time stamp, or if the queue is full. After a time stamp far ahead, or after
+            the clock is set, one frame is dropped, and the times of the stream continue from the last one.
 
         Raises
         ------
@@ -203,16 +213,17 @@ class Stream:
             self._check_caller("push(wait=True)")
         self._check()
         self._check_open()
-        number, time = self.counts["pushed"], arrived if time is None else float(time)
+        number, stamp = self.counts["pushed"], arrived if time is None else float(time)
         self.counts["pushed"] += 1
-        if not np.isfinite(time):
-            raise InputError(f"time of frame {number} is {time}, expected seconds")
+        if not np.isfinite(stamp):
+            raise InputError(f"time of frame {number} is {stamp}, expected seconds")
         if np.ndim(rgb) != 3:
             raise InputError(f"colour image of frame {number} has shape {np.shape(rgb)}, expected (H, W, 3)")
         if depth is None or not np.any(np.isfinite(depth) & (np.asarray(depth) > 0)):
             return self._dropped("no depth", number, pause)
-        if time <= self._last_time:
-            return self._dropped("late", number, pause)
+        ascending, why = self._ascending(number, stamp, arrived)
+        if why:
+            return self._dropped(why, number, pause)
         if self._queue.full() and not wait:  # before the images are copied
             return self._dropped("overflow", number, pause)
         camera = self._camera
@@ -234,17 +245,40 @@ class Stream:
             with self._closing:  # which is never held while a thread waits for a place in the queue
                 self._check_open()
                 if not self._queue.full():
-                    self._queue.put(_Item(number, frame, time, pause, arrived))
+                    self._queue.put(_Item(number, frame, ascending, pause, arrived))
                     break
             if not wait:
                 return self._dropped("overflow", number, pause)
             clock.sleep(0.002)
-        self._last_time, self._camera, self._posed = time, known, pose is not None
+        self._last_time, self._last_arrived = ascending, arrived
+        self._camera, self._posed = known, pose is not None
         return True
+
+    def _ascending(self, number: int, stamp: float, arrived: float) -> tuple[float, str]:
+        """The time of a frame in the stream, and why the frame is dropped, if it is.
+
+        A stamp that is far from the last one is wrong, or the clock was set. The next frame tells: if its stamp
+        follows, the times of the stream continue from the last one.
+        """
+        before, self._strange = self._strange, None
+        step = stamp + self._clock_change - self._last_time
+        if 0 < step <= max(_FAR_AHEAD_S, 2 * (arrived - self._last_arrived)) or self._last_time == -np.inf:
+            return stamp + self._clock_change, ""
+        if -_FAR_BEHIND_S <= step <= 0:
+            return 0.0, "late"
+        if before is None or not 0 < stamp - before <= _FAR_AHEAD_S:
+            self._strange = stamp
+            return 0.0, "late" if step < 0 else "ahead"
+        warn_user(
+            f"the times jump by {step:.6g} s at frame {number}: the clock was set, or an earlier time was wrong",
+            "the times of the stream continue after the last frame; times of a clock that is not set are safer",
+        )
+        self._clock_change = self._last_time - before
+        return self._last_time + (stamp - before), ""
 
     def _dropped(self, why: str, number: int, pause: bool | None = None) -> bool:
         if pause or (why != "no depth" and not self.counts[why]):
-            hint = "every frame needs a depth image, and times have to ascend, also after the clock is set"
+            hint = "every frame needs a depth image, and times have to ascend"
             if why == "overflow":
                 hint = "the frames arrive faster than they are processed: push fewer, or push(..., wait=True)"
             text = f"frame {number} is dropped: {why}{', a given pause is lost' * bool(pause)}"
@@ -286,7 +320,7 @@ class Stream:
         if first:
             self._queue.put(None)
         self._watcher.join()
-        self._pool.shutdown()
+        self._pool.shutdown(cancel_futures=self._abandoned)
         self._check()
 
     def __enter__(self) -> Self:
@@ -296,6 +330,7 @@ class Stream:
         if kind is None:
             self.close()
         else:
+            self._abandoned = True
             with contextlib.suppress(Exception):  # the first error is raised
                 self.close()
 
@@ -315,7 +350,7 @@ class Stream:
     def _watch(self) -> None:
         while (item := self._queue.get()) is not None:
             try:
-                if self._error is None:
+                if self._error is None and not self._abandoned:
                     self._take(item)
             except BaseException as error:
                 self._error = self._error or error
@@ -380,6 +415,8 @@ class Stream:
     def _end_clip(self) -> None:
         if self._step is not None:
             self._step.result()  # at most one complete clip waits
+        if self._abandoned:
+            return
         items, trackers = tuple(self._clip), tuple(self._trackers)
         frames, times = tuple(item.frame for item in items), tuple(item.time for item in items)
         assert isinstance(self._grid, VoxelGrid)

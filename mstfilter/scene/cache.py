@@ -17,6 +17,7 @@ the stored results.
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -179,8 +180,19 @@ class Cache:
             self._disk.close()
             self._disk = before
 
+    def after_fork(self) -> None:
+        """Make the copy in a forked process usable, where no thread computes the values that are being computed."""
+        self._pending.clear()
+        self._lock.release()
+
 
 scene_cache = Cache()  #: The cache of this process
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=scene_cache._lock.acquire,
+        after_in_parent=scene_cache._lock.release,
+        after_in_child=scene_cache.after_fork,
+    )
 
 
 memo = scene_cache.get  #: ``memo(name, key, compute)``: the value of ``compute()``, computed once

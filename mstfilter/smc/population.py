@@ -83,7 +83,7 @@ class Candidates(Sequence[_T], Generic[_T]):
         return self._built[index]
 
     def built(self) -> tuple[_T, ...]:
-        """All candidates in order, built one by one, or two at a time in a block `mstfilter.processes.parallel`."""
+        """All candidates in order, built at the same time in a block `mstfilter.processes.parallel`."""
         _, first = np.unique(self._indices, return_index=True)
         each(self.__getitem__, np.sort(first))
         return tuple(self)

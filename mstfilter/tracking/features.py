@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 
 from mstfilter.fields import Bounded, PositiveFloat
-from mstfilter.scene import Frame, depth_sigma, memo
+from mstfilter.scene import Frame, depth_sigma, memo, scaled_area
 
 _DEPTH_SIGMAS = 4.0  # limit of the difference of two readings, in its standard deviations
+_LEAST_STILL = 500  # pixels of an image of 640 x 480 with the same depth that determine the exposure
 _N_EXPOSURE_PIXELS = 20000
 _MAX_PAIRS = 20000  # matches with the smallest descriptor distances are kept
 _PRIOR_VARIANCE = 20.0**2  # grey levels squared; where colours vary less, the gain stays near 1
@@ -53,7 +54,9 @@ def matched_colour(frame: Frame, reference: Frame, width: int = 3) -> np.ndarray
 def _exposure(frame: Frame, reference: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Gain (3,) and offset (3,) that map colours of the frame to those of the reference."""
     still = np.flatnonzero(same_depth(reference, frame))
-    if len(still) < 500:  # without depth: assume that most of the image is still
+    if len(still) < scaled_area(
+        _LEAST_STILL, frame.depth.size
+    ):  # without depth: assume that most of the image is still
         still = np.arange(frame.depth.size)
     still = still[:: max(1, len(still) // _N_EXPOSURE_PIXELS)]
     x_all = smooth_colour(frame).reshape(-1, 3)[still].astype(np.float64)

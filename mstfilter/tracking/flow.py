@@ -15,9 +15,6 @@ not on the robot. Flow that is computed only from the first and the last frame f
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Literal
@@ -29,22 +26,25 @@ from scipy.spatial import cKDTree
 
 from mstfilter.fields import Bounded
 from mstfilter.processes import together
-from mstfilter.scene import Clip, Frame, depth_sigma, fill_from_nearest, max_of_three, memo
+from mstfilter.scene import Clip, Frame, depth_sigma, fill_from_nearest, max_of_three, memo, scaled_length
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
 _PRESETS = ("ultrafast", "fast", "medium")
-_GRID = np.s_[::2, ::2]  # rows and columns of the followed points
+# Lengths in pixels are those of an image of 640 columns.
+_GRID = 2  # pixels between the rows and columns of the followed points
+_ISOLATED = 3  # pixels, side of the smallest square of changed pixels that is not noise
+_VOTE_REACH, _VOTE_UNIT, _VOTE_CAP = 12, 6.0, 4.0  # pixels, see `_vote`
 _N_VOTERS = 5
 #: Frames are skipped until the motion since the last used frame reaches this fraction of the image width: errors
 #: accumulate with the number of frames, but flow fails for long motions.
 _FRAME_MOTION = 0.03
-_ROUND_TRIP = 1.0  # pixels, largest forward-backward error of a track
+_ROUND_TRIP = 1.0  # pixels of an image of any size, largest forward-backward error of a track
 _DEPTH_JUMP = 0.03  # metres, largest change of depth of a track between consecutive frames
 _COLOUR_JUMP = 30.0  # grey levels per channel, largest change of colour of a track between consecutive frames
 _CHANGE_SIGMAS = 5.7  # smallest change of depth that is motion, in standard deviations of the noise of one reading
 _COLOUR_CHANGE = 12.0  # smallest change of colour that is motion, grey levels in any channel
-#: Pixels. Margin of the box beside the changed pixels. The corners of the box are multiples of the second number, so
-#: that the patches of DIS are those of the whole image.
+#: Pixels of an image of any size, as the patches of DIS. Margin of the box beside the changed pixels. The corners of
+#: the box are multiples of the second number, so that the patches of DIS are those of the whole image.
 _MARGIN, _STEP = 24, 48
 
 
@@ -67,7 +67,7 @@ class ClipTracks:
     @cached_property
     def coherently_unchanged(self) -> np.ndarray:
         """(H, W) bool: `unchanged`, also True at isolated changed pixels, which are treated as noise."""
-        return ~_opened(~self.unchanged, 3)
+        return ~_opened(~self.unchanged, _ISOLATED)
 
     def points_in(self, mask: np.ndarray) -> np.ndarray:
         """Indices of the points that start inside a mask (H, W) and are valid until the end."""
@@ -79,7 +79,8 @@ class DenseFlow(Bounded):
     """Dense inverse search flow (Kroeger et al., ECCV 2016; OpenCV's DIS), forward and backward.
 
     `preset` is the preset of OpenCV. With the region "changed", the flow between two frames is zero outside a box
-    around the pixels that changed. With "image", the flow is computed in the whole image.
+    around the pixels that changed. With "image", the flow is computed in the whole image. The flow depends on the
+    number of OpenCV's threads, so this number becomes 1 in the whole process.
     """
 
     preset: Literal["ultrafast", "fast", "medium"] = "medium"
@@ -119,9 +120,11 @@ class FlowTracker:
         self._settings = settings
         self._first = self._used = self._last = first
         self._small, self._moved = _small(first), 0.0
-        self._start = np.stack([columns[_GRID].ravel(), rows[_GRID].ravel()], axis=1)
+        step = max(1, round(scaled_length(_GRID, width)))
+        followed = np.s_[::step, ::step]
+        self._start = np.stack([columns[followed].ravel(), rows[followed].ravel()], axis=1)
         self._end = self._start.copy()
-        self._alive = ~_robot(first)[_GRID].ravel()
+        self._alive = ~_robot(first)[followed].ravel()
         self._grid = np.stack([columns, rows], axis=-1)
         self._pull = self._grid.copy()  # position in the first frame of every pixel of the last used frame
         self._known = ~_robot(first)
@@ -129,8 +132,8 @@ class FlowTracker:
     def add(self, frame: Frame) -> None:
         """Add the next frame. The previously added frame is used if the motion since the last used frame is large."""
         small, dis = _small(frame), cv2.DISOpticalFlow_create(_PRESETS.index("ultrafast"))  # type: ignore[attr-defined]
-        with _one_thread():
-            flow = dis.calc(self._small, small, None)
+        _one_thread()
+        flow = dis.calc(self._small, small, None)
         # The robot is excluded: it moves fast and is not tracked.
         speed = _speed(flow, self._last) / _SMALL_WIDTH
         if len(self.keys) > 1 and self._moved + speed > _FRAME_MOTION:
@@ -201,25 +204,13 @@ def _speed(flow: np.ndarray, frame: Frame) -> float:
     return float(np.quantile(seen, 0.995)) if len(seen) else 0.0
 
 
-_calls = {"open": 0, "threads": 0}  # blocks of `_one_thread` in all threads, and the setting outside of them
-_calls_lock = threading.Lock()
+def _one_thread() -> None:
+    """Limit OpenCV to one thread, because the flow depends on the number of threads.
 
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit OpenCV to one thread, because the flow depends on the number of threads."""
-    with _calls_lock:  # the setting is global: the first block changes it, and the last one restores it
-        if not _calls["open"]:
-            _calls["threads"] = cv2.getNumThreads()
-            cv2.setNumThreads(1)
-        _calls["open"] += 1
-    try:
-        yield
-    finally:
-        with _calls_lock:
-            _calls["open"] -= 1
-            if not _calls["open"]:
-                cv2.setNumThreads(_calls["threads"])
+    The limit stays. To restore the number after each call would end and start OpenCV's threads again and again.
+    """
+    if cv2.getNumThreads() != 1:
+        cv2.setNumThreads(1)
 
 
 def _robot(frame: Frame) -> np.ndarray:
@@ -234,7 +225,8 @@ def _changed(a: Frame, b: Frame) -> tuple[tuple[slice, slice], np.ndarray]:
     seen = ~(_robot(a) | _robot(b))
     jump, colour = np.abs(b.depth - a.depth), max_of_three(np.abs(smooth_colour(b) - smooth_colour(a)))
     # At edges, depth has more noise than colour.
-    changed = _opened(seen & (jump > _CHANGE_SIGMAS * depth_sigma(a.depth)), 3) | (seen & (colour > _COLOUR_CHANGE))
+    changed = _opened(seen & (jump > _CHANGE_SIGMAS * depth_sigma(a.depth)), _ISOLATED)
+    changed |= seen & (colour > _COLOUR_CHANGE)
     changed = _opened(changed, 2)
     settled = seen & ~(jump > _DEPTH_JUMP) & (colour <= _COLOUR_JUMP)
     # In a shorter box, DIS uses fewer scales than in the whole image, and long motions are lost.
@@ -252,9 +244,16 @@ def _changed(a: Frame, b: Frame) -> tuple[tuple[slice, slice], np.ndarray]:
     return (sides[0], sides[1]), settled
 
 
-def _opened(mask: np.ndarray, side: int) -> np.ndarray:
-    """The parts of a mask (H, W) bool that contain a square of `side` pixels."""
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+def _opened(mask: np.ndarray, side: float) -> np.ndarray:
+    """The parts of a mask (H, W) bool that contain a square, whose side is given for an image of 640 columns."""
+    n = max(1, round(scaled_length(side, mask.shape[1])))
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((n, n), np.uint8)) > 0
+
+
+def dilated(mask: np.ndarray, reach: float) -> np.ndarray:
+    """A mask (H, W) bool with the pixels around it, up to a distance that is given for an image of 640 columns."""
+    n = 2 * max(1, round(scaled_length(reach, mask.shape[1]))) + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((n, n), np.uint8)) > 0
 
 
 def _flow(a: Frame, b: Frame, preset: str, box: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
@@ -267,8 +266,8 @@ def _flow(a: Frame, b: Frame, preset: str, box: tuple[slice, slice]) -> tuple[np
         dis = cv2.DISOpticalFlow_create(_PRESETS.index(preset))  # type: ignore[attr-defined]
         return np.asarray(dis.calc(grey[first], grey[second], None))
 
-    with _one_thread():
-        return together(lambda: between(0, 1), lambda: between(1, 0))
+    _one_thread()
+    return together(lambda: between(0, 1), lambda: between(1, 0))
 
 
 def _sample(field: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -333,10 +332,9 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     if not len(uncertain) or not known.any():
         return pull[uncertain]
     # Only valid pixels within 12 pixels of an uncertain one are voters.
-    image = np.zeros((height, width), np.uint8)
-    image.ravel()[uncertain] = 1
-    nearby = cv2.dilate(image, np.ones((25, 25), np.uint8)) > 0
-    candidates = np.flatnonzero(nearby.ravel() & known)
+    image = np.zeros((height, width), bool)
+    image.ravel()[uncertain] = True
+    candidates = np.flatnonzero(dilated(image, _VOTE_REACH).ravel() & known)
     if len(candidates) > 20000:  # every other row and column is sufficient
         rows, columns = np.divmod(candidates, width)
         candidates = candidates[(rows % 2 == 0) & (columns % 2 == 0)]
@@ -350,7 +348,7 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
         rays = frame.camera.rays()[rows, columns] @ pose[:3, :3].T
         place = (rays * depth[rows, columns, None] + pose[:3, 3]) / 0.012
     else:
-        place = np.stack([columns, rows], axis=1) / 6.0
+        place = np.stack([columns, rows], axis=1) / scaled_length(_VOTE_UNIT, width)
     features = np.hstack([place, smooth_colour(frame)[rows, columns] / 20.0])
     tree = cKDTree(features[: len(candidates)], balanced_tree=False, compact_nodes=False)
     _, found = tree.query(features[len(candidates) :], k=min(_N_VOTERS, len(candidates)), eps=0.5)
@@ -361,5 +359,6 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     rows, columns = np.divmod(voters.T, width)
     offsets = list(zip(pull[voters.T, 0] - columns, pull[voters.T, 1] - rows, strict=True))
     # Operations over long axes are several times faster than those over axes of five elements.
-    apart = [sum(np.minimum(np.abs(a - x) + np.abs(b - y), 4.0) for x, y in offsets) for a, b in offsets]
+    cap = scaled_length(_VOTE_CAP, width)
+    apart = [sum(np.minimum(np.abs(a - x) + np.abs(b - y), cap) for x, y in offsets) for a, b in offsets]
     return pull[voters[np.arange(len(uncertain)), np.argmin(apart, axis=0)]]

@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform
 from mstfilter.errors import InputError
 from mstfilter.fields import Bounded, Share
 from mstfilter.processes import each
-from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid, content_key, memo
+from mstfilter.scene import Clip, Crop, Hypothesis, ObjectRecord, Occupancy, VoxelGrid, content_key, memo, scaled_area
 from mstfilter.smc import Population, Transition, child
 from mstfilter.tracking.flow import DenseFlow
 from mstfilter.tracking.rigid import invert, move_points
@@ -289,7 +289,8 @@ class TrackingTransition(Transition):
     tracker : MaskTracker, optional
         Tracks the masks of moving objects to the last frame. By default, the flow is used instead.
     min_support : int
-        Smallest number of pixels of an object that agree with the depth image. Objects with fewer are not tracked.
+        Smallest number of pixels of an object that agree with the depth image, in an image of 640 x 480 pixels. It is
+        scaled by the area of the image. Objects with fewer are not tracked.
     """
 
     rule: MotionRule = field(default_factory=MstRule)
@@ -369,7 +370,7 @@ class TrackingTransition(Transition):
         for segment in (one for of_hypothesis in segments for one in of_hypothesis.values()):
             if segment.key not in found:
                 track = Track(segment, clip, tracks)
-                if len(segment.support) < self.min_support:
+                if len(segment.support) < max(1.0, scaled_area(self.min_support, clip.before.depth.size)):
                     found[segment.key] = "unsupported", ()
                 elif self.static.rests(track):
                     found[segment.key] = "static", ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import runpy
 import sys
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -49,6 +50,28 @@ def test_the_node_has_the_results_of_the_frames_in_its_messages():
     assert set(best["objects"][0]) == {"label", "id", "voxels", "centre", "T_world_box", "sides"}
 
 
+@pytest.mark.parametrize("start", [None, 0.0])
+def test_the_node_uses_all_frames_whose_stamps_are_0(start):
+    """Stamps that a driver leaves 0, and the first stamp of simulated time, which is 0 too."""
+    messages = [message for topic, _, (_, message) in scene_messages(False) if topic in (COLOUR, DEPTH)]
+    pushed = []
+    stream = SimpleNamespace(push=lambda rgb, depth, when: pushed.append(when))
+    pairs = NODE.ImagePairs(stream)
+    first = NODE.stamp_of(messages[0])
+    for message in messages[:8]:
+        seconds = 0.0 if start is None else round(NODE.stamp_of(message) - first, 3)
+        stamp = SimpleNamespace(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+        fields = {
+            name: getattr(message, name) for name in ("height", "width", "encoding", "is_bigendian", "step", "data")
+        }
+        image = SimpleNamespace(header=SimpleNamespace(stamp=stamp), **fields)
+        (pairs.add_colour if message.encoding == "rgb8" else pairs.add_depth)(image)
+    assert len(pushed) == pairs.n_pairs == 4
+    assert pushed[0] == 0 and (np.diff(pushed) > 0).all()
+    if start is not None:
+        np.testing.assert_allclose(pushed, np.arange(4) / FPS, atol=1e-6)
+
+
 def test_the_matrix_of_rectified_images_is_that_of_their_projection():
     raw, projection = [500, 0, 320, 0, 500, 240, 0, 0, 1], [480, 0, 310, 0, 0, 480, 236, 0, 0, 0, 1, 0]
     info = SimpleNamespace(k=raw, p=projection, d=[0.1, -0.2, 0, 0, 0])
@@ -78,16 +101,19 @@ def results(monkeypatch):
     return found
 
 
-def images():
-    """Colour and millimetres of the frames, then the interruption by the user."""
+def images(results):
+    """Colour and millimetres of the frames, then, after two results, the interruption by the user."""
     rgb, depth, _ = video()
     for k in range(len(SHIFTS)):
         yield rgb[k], np.rint(1000 * depth[k]).astype(np.uint16), k / FPS
+    deadline = time.perf_counter() + 300
+    while len(results) < 2 and time.perf_counter() < deadline:
+        time.sleep(0.05)
     raise KeyboardInterrupt
 
 
 def test_the_example_of_a_realsense_camera(monkeypatch, results, capsys):
-    frames, stopped = images(), []
+    frames, stopped = images(results), []
 
     def wait_for_frames():
         rgb, depth, t = next(frames)
@@ -120,7 +146,7 @@ def test_the_example_of_a_realsense_camera(monkeypatch, results, capsys):
 
 
 def test_the_example_of_an_open3d_sensor(monkeypatch, results, capsys):
-    frames = images()
+    frames = images(results)
     times = iter(np.arange(len(SHIFTS)) / FPS)
 
     def capture_frame(aligned):

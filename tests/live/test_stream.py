@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,6 +109,82 @@ def test_late_frames_and_frames_without_depth_are_dropped_and_counted():
     assert arrays(found[-1].state) == arrays(filtered(pauses=RULE)[-1])
 
 
+FAR = {"one stamp far ahead": 1e9, "one stamp ahead": 1e3, "one stamp in milliseconds": 1e12, "one old stamp": -50.0}
+
+
+@pytest.mark.parametrize("k", [0, 6])
+@pytest.mark.parametrize("change", [*FAR, "clock set back", "clock set ahead"])
+def test_a_stream_recovers_from_a_wrong_stamp_and_from_a_clock_that_is_set(change, k):
+    times = TIMES + 100
+    if change in FAR:
+        times[k] += FAR[change]
+    else:
+        times[k:] += -50 if change == "clock set back" else 1e7
+    found = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        with mstfilter.Stream(CAMERA.K, FAST, seed=4, pauses=None, on_pause=found.append) as stream:
+            accepted = [stream.push(RGB[j], DEPTH[j], times[j], pause=j in (4, 15)) for j in range(len(TIMES))]
+    assert accepted.count(False) <= 1 and accepted[4] and accepted[15]
+    assert [pause.frames[-1] for pause in found] == [4, 15]
+    stamps = found[1].clip.times
+    assert (np.diff(stamps) > 0).all()
+    if change == "one stamp ahead" and k:  # the step to the wrong stamp remains
+        assert np.diff(stamps).max() == pytest.approx(1e3, abs=1)
+    else:
+        assert np.diff(stamps).max() < 0.25
+
+
+def test_the_change_of_a_clock_is_told_and_a_late_frame_is_none():
+    with mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
+        for when in (100.0, 100.1):
+            assert stream.push(RGB[0], DEPTH[0], when)
+        with pytest.warns(InputWarning, match="late"):
+            assert not stream.push(RGB[0], DEPTH[0], 99.8)
+        assert not stream.push(RGB[0], DEPTH[0], 99.9)  # frames that arrive late, in a row
+        assert stream.push(RGB[0], DEPTH[0], 100.2)
+        assert not stream.push(RGB[0], DEPTH[0], 5.0)
+        with pytest.warns(InputWarning, match=r"jump by -95.1 s at frame 6: the clock was set"):
+            assert stream.push(RGB[0], DEPTH[0], 5.1)
+        assert stream.push(RGB[0], DEPTH[0], 5.2)
+        assert stream.counts == {"pushed": 8, "late": 3}
+
+
+def test_an_exception_drops_the_queue():
+    """The step that is being computed is completed; of the ten frames that wait, each a pause, none is filtered."""
+    begun, gate, found = threading.Event(), threading.Event(), []
+
+    def show(pause):
+        begun.set()
+        gate.wait()
+        found.append(pause.index)
+
+    with pytest.raises(KeyboardInterrupt), mstfilter.Stream(CAMERA.K, FAST, pauses=None, on_pause=show) as stream:
+        stream.push(RGB[0], DEPTH[0], 0.0, pause=True)
+        begun.wait()
+        for k in range(1, 11):
+            stream.push(RGB[k], DEPTH[k], float(k), pause=True)
+        threading.Timer(0.2, gate.set).start()
+        raise KeyboardInterrupt
+    assert found == [0]
+    with pytest.raises(InputError, match="closed"):
+        stream.push(RGB[0], DEPTH[0], 20.0)
+
+
+def test_streams_in_several_threads_have_the_results_of_one():
+    def run(k):
+        found = []
+        with mstfilter.Stream(CAMERA.K, FAST, seed=k, pauses=None, threads=2, on_pause=found.append) as stream:
+            for j in range(0, len(SHIFTS), 4):
+                stream.push(RGB[j], DEPTH[j], TIMES[j], pause=True, wait=True)
+        return [arrays(pause.state) for pause in found]
+
+    expected = [run(k) for k in range(3)]
+    scene_cache.clear()
+    with ThreadPoolExecutor(3) as users:
+        assert list(users.map(run, range(3))) == expected
+
+
 def test_a_long_clip_is_thinned_and_has_the_result_of_the_frames_that_remain():
     found = []
     with mstfilter.Stream(CAMERA.K, FAST, seed=4, pauses=None, max_frames=6, on_pause=found.append) as stream:
@@ -186,6 +264,22 @@ def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_p
     with pytest.warns(InputWarning, match="00003.png, 00003.png of .* are skipped: .* no reading"):
         times = [when for when, _ in Redwood(fps=10).arriving(path, idle_s=1.5)]
     assert times == pytest.approx([0, 0.1, 0.2, 0.4])
+
+
+@pytest.mark.parametrize("hours", [-5, 5])
+def test_a_live_folder_does_not_trust_the_times_of_files(tmp_path, monkeypatch, hours):
+    """Files of a computer whose clock differs: without the depth image of frame 1, the others are read."""
+    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
+    path = write_redwood(tmp_path / "data", (0, 1, 2, 3))
+    late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
+    when = time.time() + 3600 * hours
+    for file in (*path.glob("color/*"), *path.glob("depth/*"), late):
+        os.utime(file, (when, when))
+    times = [when for when, _ in Redwood(fps=10).arriving(path, idle_s=5)]
+    assert times == pytest.approx([0, 0.1, 0.2])
+    threading.Timer(0.1, lambda: late.rename(path / "depth" / "00001.png")).start()
+    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 60)
+    assert len(list(Redwood(fps=10).arriving(path, idle_s=5))) == 4
 
 
 def test_no_frame_is_accepted_that_is_not_processed():

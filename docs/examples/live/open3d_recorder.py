@@ -20,11 +20,13 @@ if not sensor.connect(0):
 # Intrinsics of the colour camera in this mode: `AzureKinectMKVReader` of a recording reports them.
 K = np.array([[605.0, 0, 639.5], [0, 605.0, 359.5], [0, 0, 1]])
 
-with mstfilter.Stream(K, "mst", on_pause=show) as stream:
-    try:
+try:
+    with mstfilter.Stream(K, "mst", on_pause=show) as stream:  # Ctrl-C drops the frames that wait
         while True:
             frame = sensor.capture_frame(True)  # depth is aligned to colour
             if frame is not None:
                 stream.push(np.asarray(frame.color), np.asarray(frame.depth) * 0.001, time.monotonic())
-    except KeyboardInterrupt:
-        sensor.disconnect()
+except KeyboardInterrupt:
+    pass
+finally:
+    sensor.disconnect()

@@ -20,13 +20,15 @@ lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrins
 K = np.array([[lens.fx, 0, lens.ppx], [0, lens.fy, lens.ppy], [0, 0, 1]])
 align = rs.align(rs.stream.color)
 
-with mstfilter.Stream(K, "mst", on_pause=show) as stream:
-    try:
+try:
+    with mstfilter.Stream(K, "mst", on_pause=show) as stream:  # Ctrl-C drops the frames that wait
         while True:
             frames = align.process(pipeline.wait_for_frames())
             colour, depth = frames.get_color_frame(), frames.get_depth_frame()
             stream.push(
                 np.asarray(colour.get_data()), np.asarray(depth.get_data()) * scale, frames.get_timestamp() / 1000
             )
-    except KeyboardInterrupt:
-        pipeline.stop()
+except KeyboardInterrupt:
+    pass
+finally:
+    pipeline.stop()

@@ -14,7 +14,9 @@ started. Everything else works on messages of any library that has their fields,
 from __future__ import annotations
 
 import json
+import time
 from collections import deque
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -52,12 +54,13 @@ class ImagePairs:
     """Pushes pairs of colour and depth messages into a stream.
 
     A colour image is paired with the first depth image whose stamp differs by at most `tolerance_s`. Images without a
-    partner are dropped when a later pair is complete.
+    partner are dropped when a later pair is complete. If a driver leaves the stamps 0, images are paired in the order
+    of their arrival, and the time of a pair is that of its arrival, in seconds since the first pair.
     """
 
     def __init__(self, stream: Stream, depth_scale: float = 0.001, tolerance_s: float = 0.02) -> None:
         self.stream, self.depth_scale, self.tolerance_s = stream, depth_scale, tolerance_s
-        self.n_pairs = 0
+        self.n_pairs, self._start = 0, 0.0
         self._colour: deque[Any] = deque(maxlen=_WAITING)
         self._depth: deque[Any] = deque(maxlen=_WAITING)
 
@@ -82,7 +85,9 @@ class ImagePairs:
                     pass
                 rgb = colour_image(colour, False, "colour message")
                 metres = depth_image(depth, False, self.depth_scale, "depth message")
-                self.stream.push(rgb, metres, stamp_of(colour))
+                now = time.monotonic()
+                self._start = self._start or now
+                self.stream.push(rgb, metres, stamp_of(colour) or now - self._start)
                 self.n_pairs += 1
                 break
 
@@ -113,8 +118,8 @@ def belief_json(pause: Pause) -> str:
                 }
             )
         found.append({"weight": round(float(weight), 6), "objects": objects})
-    time = pause.clip.times[-1]
-    return json.dumps({"pause": pause.index, "time": time, "counts": pause.counts, "hypotheses": found})
+    last = pause.clip.times[-1]
+    return json.dumps({"pause": pause.index, "time": last, "counts": pause.counts, "hypotheses": found})
 
 
 def main() -> None:
@@ -139,6 +144,7 @@ def main() -> None:
     settings = parameter("depth_scale", 0.001), parameter("tolerance_s", 0.02)
     name, rule = parameter("filter", "mst"), Settled(hold_s=parameter("hold_s", 0.5))
     labels, belief = node.create_publisher(Image, "~/labels", 1), node.create_publisher(String, "~/belief", 1)
+    ends = ExitStack()
     streams: list[Stream] = []
 
     def publish(pause: Pause) -> None:
@@ -150,19 +156,19 @@ def main() -> None:
 
     def start(message: Any) -> None:
         if not streams:
-            streams.append(Stream(camera_matrix(message, colour), name, pauses=rule, on_pause=publish))
+            stream = Stream(camera_matrix(message, colour), name, pauses=rule, on_pause=publish)
+            streams.append(ends.enter_context(stream))
             pairs = ImagePairs(streams[0], *settings)
             node.create_subscription(Image, colour, pairs.add_colour, qos_profile_sensor_data)
             node.create_subscription(Image, depth, pairs.add_depth, qos_profile_sensor_data)
 
     node.create_subscription(CameraInfo, info, start, qos_profile_sensor_data)
     try:
-        rclpy.spin(node)
+        with ends:  # Ctrl-C drops the frames that wait
+            rclpy.spin(node)
     except KeyboardInterrupt:
         pass
     finally:
-        for stream in streams:
-            stream.close()
         node.destroy_node()
 
 
