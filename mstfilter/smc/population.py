@@ -159,7 +159,7 @@ def _freeze(particles: Particles) -> Particles:
 def _check_log_weights(lw: np.ndarray, n: int) -> None:
     if lw.shape != (n,):
         raise InputError(f"log weights have shape {lw.shape}, expected ({n},) as there are {n} particles")
-    top = lw.max()  # NaN if any is NaN, so one pass finds all three errors
+    top = np.maximum.reduce(lw)  # NaN if any is NaN, so one pass finds all three errors
     if not top < np.inf:
         wrong = np.flatnonzero(~(lw < np.inf))
         raise InputError(
@@ -266,10 +266,10 @@ class Population:
     def _summary(self) -> tuple[float, float]:
         """Effective sample size and log mean weight, computed together and cached, because each step uses both."""
         if "_both" not in self.__dict__:
-            top = self.log_weights.max()
+            top = np.maximum.reduce(self.log_weights)  # faster than `max` for few particles
             weights = self.log_weights - top
             np.exp(weights, out=weights)
-            total = float(weights.sum())
+            total = float(np.add.reduce(weights))
             both = (total * total / float(weights @ weights), float(top) + math.log(total / len(weights)))
             object.__setattr__(self, "_both", both)
         return self.__dict__["_both"]
@@ -301,16 +301,22 @@ class Population:
         Raises InputError if the indices are not integers from 0 to n - 1.
         """
         indices = _within(_integers("indices", indices), len(self))
-        return Population(
-            take(self.particles, indices),
-            self.log_weights[indices] if log_weights is None else log_weights,
-            {name: index[indices] for name, index in self.parents.items()},
-            self.notes,
-        )
+        if len(indices) == 0:
+            raise InputError("no particles are selected", "a population has at least one particle")
+        lw = self.log_weights[indices] if log_weights is None else np.asarray(log_weights, dtype=np.float64)
+        _check_log_weights(lw, len(indices))
+        new = self.labelled({name: frozen_view(index[indices]) for name, index in self.parents.items()}, self.notes)
+        new.__dict__.update(particles=_freeze(take(self.particles, indices)), log_weights=frozen_view(lw))
+        new.__dict__.pop("_both", None)
+        return new
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
         """Select particles as `take` does, set ``parents["ancestor"]``, and add the given values to `notes`."""
-        return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
+        new = self.take(ancestors, log_weights)
+        new.__dict__["parents"]["ancestor"] = _integers("ancestors", ancestors)
+        if notes:
+            new.__dict__["notes"] = {**self.notes, **notes}
+        return new
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
         """The same particles with the given ``parents["ancestor"]``, and the given values added to `notes`."""
@@ -348,7 +354,9 @@ class Population:
 
     def realised(self) -> Population:
         """The same population, with all `Candidates` built."""
-        if isinstance(self.particles, Candidates):
+        if type(self.particles) is not np.ndarray and isinstance(
+            self.particles, Candidates
+        ):  # the first test is fast
             return replace(self, particles=self.particles.built())
         return self
 

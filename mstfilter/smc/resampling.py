@@ -216,7 +216,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
         raise InputError(f"log weights have shape {lw.shape}, expected one number per particle")
     if not isinstance(n, (int, np.integer)) or n < 1:
         raise InputError(f"resampling to {n} particles, expected an integer of at least 1")
-    top = lw.max()
+    top = np.maximum.reduce(lw)
     if not -np.inf < top < np.inf:
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
         raise InputError(f"log weights cannot be resampled: entry {at} is {lw[at]}, the largest is {top}")
@@ -238,13 +238,11 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
     The weights are (..., m). The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same shift.
     """
     ends = weights.cumsum(axis=-1)
-    total = ends[..., -1:]
+    total = ends[-1] if ends.ndim == 1 else ends[..., -1:]  # scalars are faster where arrays are short
     last = ends == total
     ends *= n / total
     _subtract(ends, shifts)
-    np.ceil(
-        ends, out=ends
-    )  # the number of points below each cumulative weight: greater than -1 before, so not negative
+    np.ceil(ends, out=ends)  # the number of points below each cumulative weight: not negative, as it was above -1
     np.putmask(ends, last, n)  # whatever the rounding
     return expanded(ends.astype(np.int64), n)
 
@@ -252,7 +250,7 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
 def _subtract(positions: np.ndarray, shifts: np.ndarray) -> None:
     """Subtract from each position (..., m) the shift of its stratum, in place."""
     if shifts.shape[-1] == 1:
-        positions -= shifts
+        positions -= shifts[0] if shifts.ndim == 1 else shifts
     elif positions.ndim == 2:
         for row, shift in zip(positions, shifts, strict=True):
             _subtract(row, shift)
