@@ -391,7 +391,7 @@ class _Slot:
         name = self._here.name
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - self._here.began
         if isinstance(error, InputError):
-            raise type(error)(f"step {self.t}, {name}: {error.message}", *error.hints) from error
+            raise error.with_message(f"step {self.t}, {name}: {error.message}") from error
         if isinstance(error, Exception):
             error.add_note(f"in step {self.t}, {name}")
 
