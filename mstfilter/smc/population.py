@@ -150,10 +150,24 @@ def _freeze(particles: Particles) -> Particles:
     if isinstance(particles, np.ndarray):
         return frozen_view(particles)
     if isinstance(particles, (dict, Mapping)):
-        return {name: _freeze(np.asanyarray(a)) for name, a in particles.items()}
+        return {name: frozen_view(_numpy_array(f"variable {name!r}", a)) for name, a in particles.items()}
     if isinstance(particles, Candidates):
         return particles
+    if hasattr(particles, "__dlpack__"):
+        _numpy_array("particles", particles)
     return tuple(particles)
+
+
+def _numpy_array(what: str, array: Any) -> np.ndarray:
+    """The array of a variable. Raises InputError for an array of another library, which numpy may not convert."""
+    if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):  # which all libraries of arrays define
+        library, name = type(array).__module__.partition(".")[0].removesuffix("lib"), type(array).__name__
+        raise InputError(
+            f"{what}: found {name} of {library}, expected a NumPy array",
+            "x.detach().cpu().numpy() converts a torch tensor, numpy.asarray(x) a JAX array",
+            "a function of a model gets NumPy arrays: convert to the other library first and back at the end",
+        )
+    return np.asanyarray(array)
 
 
 def _check_log_weights(lw: np.ndarray, n: int) -> None:
