@@ -24,15 +24,46 @@ from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Self, TypeVar
+
+_Error = TypeVar("_Error", bound="_WithHints")
 
 
 class _WithHints(Exception):
+    message: str
+    hints: tuple[str, ...] = ()
+
+    def __new__(cls, *args: Any, **named: Any) -> Self:
+        new = super().__new__(cls, *args)
+        new.message = printable(Exception.__str__(new))  # of a subclass whose constructor does not call the one below
+        return new
+
     def __init__(self, message: str, *hints: str) -> None:
         self.message, self.hints = printable(message), tuple(map(printable, hints))
         super().__init__(self.message)
         for hint in self.hints:
             self.add_note(f"hint: {hint}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (type(self), self.args, self.__dict__)
+
+    def with_message(self, message: str) -> Self:
+        """The same error, of the same class and with the same attributes and hints, with another message.
+
+        A subclass may have a constructor with other parameters, so the constructor is not called.
+        """
+        message = printable(message)
+        return _rebuilt(type(self), (message,), {**self.__dict__, "message": message})
+
+
+def _rebuilt(cls: type[_Error], args: tuple[Any, ...], attributes: dict[str, Any]) -> _Error:
+    """An error with the given arguments and attributes, made without its constructor."""
+    new = cls.__new__(cls, *args)
+    new.__dict__.update(attributes)
+    new.args = args
+    if notes := attributes.get("__notes__"):
+        new.__notes__ = list(notes)
+    return new
 
 
 class InputError(_WithHints, ValueError):
@@ -72,12 +103,16 @@ def warn_user(message: str, *hints: str) -> None:
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Put `where` before the message of an InputError that the block raises, unless the message contains it."""
+    """Put `where` before the message of an InputError that the block raises, unless the message contains it.
+
+    The error keeps its class.
+    """
     try:
         yield
     except InputError as error:
-        message = error.message if where in error.message else f"{where}: {error.message}"
-        raise InputError(message, *error.hints) from error
+        if where in error.message:
+            raise
+        raise error.with_message(f"{where}: {error.message}") from error
 
 
 def reason(error: BaseException) -> str:
@@ -154,15 +189,20 @@ def check_component(name: str, value: Any, interface: type, optional: bool = Fal
     raise InputError(f"{name} is {found}, expected {article} {interface.__name__}", *hints)
 
 
-def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> MissingLibraryError:
+def missing_library(error: ImportError, what: str, *hints: str, library: str = "") -> InputError:
     """The error for a library that `what` needs and that cannot be imported.
+
+    It is a `MissingLibraryError`, unless memory ran out while the library was loaded.
 
     `library` is the name of the library. The default is the name of the module in `error`.
     """
     library = library or (error.name or "").partition(".")[0] or "a library"
-    return MissingLibraryError(
-        f"{what} needs {library}, which cannot be imported: {error}", install_hint(library), *hints
-    )
+    if exhausted(error):
+        return InputError(f"out of memory: {what} cannot load {library}: {error}", _LESS_MEMORY)
+    install = install_hint(library)
+    if not isinstance(error, ModuleNotFoundError) and library != "a library":
+        install = f"if {library} is damaged or incomplete, install it again: {install}"
+    return MissingLibraryError(f"{what} needs {library}, which cannot be imported: {error}", install, *hints)
 
 
 def install_hint(library: str) -> str:
@@ -173,7 +213,6 @@ def install_hint(library: str) -> str:
 #: What pip installs for a library that has another name there, or that belongs to an extra of this package.
 _PACKAGES = {
     "cv2": "opencv-python-headless",
-    "pytest": "'mstfilter[check]'",
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "xarray": "'mstfilter[xarray]'",
@@ -201,14 +240,31 @@ def place_in_user_file(error: BaseException) -> str | None:
 
 
 def exhausted(error: BaseException) -> InputError | None:
-    """The message for the user if memory, disk space or the size of a file ran out; None for other errors."""
-    if isinstance(error, MemoryError) or "allocate" in str(error):  # cv2 and torch have no class for it
-        return InputError("out of memory", "use fewer workers, fewer particles or larger voxels")
+    """The message for the user if memory, disk space or the size of a file ran out; None for other errors.
+
+    An import may fail because memory ran out: the loader of shared libraries says so in its text, and a package may
+    raise ImportError for a MemoryError.
+    """
+    short: BaseException | None = error
+    while isinstance(short, ImportError) and not _is_out_of_memory(short):
+        short = short.__cause__ or short.__context__
+    if short is not None and _is_out_of_memory(short):
+        return InputError("out of memory", _LESS_MEMORY)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return InputError(f"no space left: {error}", "free disk space and repeat the command")
     if isinstance(error, OSError) and error.errno == errno.EFBIG:
         return InputError(f"a file exceeds the largest size: {error}", "`ulimit -f` shows the limit of the shell")
     return None
+
+
+_LESS_MEMORY = "use fewer workers, fewer particles or larger voxels"
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    text = str(error)  # cv2, torch and the loader of shared libraries have no class for it
+    if "static TLS block" in text:  # has a fixed size, however much memory is free
+        return False
+    return isinstance(error, MemoryError) or "allocate" in text or "failed to map segment" in text
 
 
 def describe_error(error: BaseException) -> str:

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.errors import MissingLibraryError, missing_library
+from mstfilter.errors import MissingLibraryError, exhausted, missing_library
 
 
 def exported(init: str | Path) -> dict[str, str]:
@@ -127,13 +127,15 @@ def import_open3d() -> ModuleType:
     """Import open3d, limited to one thread. Only this function imports the package, which needs system libraries.
 
     With several threads the order of a parallel sum varies, so the last digits of results vary. Raises
-    MissingLibraryError if the package or a required system library is missing.
+    MissingLibraryError if the package or a required system library is missing, and InputError if memory runs out.
     """
     try:
         open3d = import_module("open3d")
     except ModuleNotFoundError as error:
         raise missing_library(error, "this function") from error
     except (ImportError, OSError) as error:  # a shared library does not load
+        if short := exhausted(error):
+            raise short.with_message(f"out of memory: open3d cannot be loaded: {error}") from error
         raise MissingLibraryError(
             f"open3d cannot be imported: {error}",
             f"install its libraries: apt-get install {' '.join(SYSTEM_PACKAGES)}",

@@ -210,7 +210,7 @@ class Registry:
         try:
             return cls(**values) if base is None else dataclasses.replace(base, **values)
         except InputError as error:
-            raise InputError(f"{prefix}{error.message}", *error.hints) from error
+            raise error.with_message(f"{prefix}{error.message}") from error
         except TypeError as error:
             raise InputError(f"{prefix}{cls.__name__} cannot be made: {error}") from error
 

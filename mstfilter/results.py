@@ -80,7 +80,7 @@ def _checked(name: str, method: Any, check: Callable[..., Any]) -> Any:
         try:
             return check(self, found, *arguments, **named)
         except InputError as error:
-            raise InputError(f"{_name_of(self, name)} {error.message}", *error.hints) from None
+            raise error.with_message(f"{_name_of(self, name)} {error.message}") from None
 
     call.__check__ = check  # type: ignore[attr-defined]
     return call

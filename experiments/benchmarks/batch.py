@@ -17,10 +17,10 @@ import numpy as np
 
 from mstfilter.smc import (
     Killing,
-    Residual,
     Multinomial,
     Normal,
     Program,
+    Residual,
     Ssp,
     StateSpaceModel,
     Stratified,

@@ -195,8 +195,16 @@ if hasattr(os, "register_at_fork"):
     )
 
 
-memo = scene_cache.get  #: ``memo(name, key, compute)``: the value of ``compute()``, computed once
-memo_many = scene_cache.get_many  #: the values of several keys
+def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
+    """The value of ``compute()``, computed once in this process: `Cache.get` of `scene_cache`."""
+    return scene_cache.get(name, key, compute, stored_as)
+
+
+def memo_many(
+    name: str, keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Sequence[_Value]], stored_as: Any = None
+) -> list[_Value]:
+    """The values of several keys, each computed once in this process: `Cache.get_many` of `scene_cache`."""
+    return scene_cache.get_many(name, keys, compute, stored_as)
 
 
 def _size_of(value: Any) -> int:

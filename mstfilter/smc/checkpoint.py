@@ -74,8 +74,9 @@ def load_state(path: Path, codec: Codec | None = None, *, limit: int = 2**40) ->
         key = Key(int(head["seed"]), tuple(head["path"]))
         return State(int(head["t"]), population, key, bool(head["properly_weighted"]))
     except InputError as error:
-        message = error.message if str(path) in error.message else f"checkpoint {path}: {error.message}"
-        raise InputError(message, *error.hints) from error
+        if str(path) in error.message:
+            raise
+        raise error.with_message(f"checkpoint {path}: {error.message}") from error
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path} is not a checkpoint of a filter ({type(error).__name__}: {reason(error)})", _DAMAGED

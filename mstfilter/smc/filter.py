@@ -25,7 +25,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -126,7 +126,7 @@ class ParticleFilter(AtStep):
         lines = [f"ParticleFilter(n={self.n}, n_proposed={self.n_proposed}, resample={self.resample!r})"]
         return "\n  ".join([*lines, ", ".join(f"{slot} {name[:24]}" for slot, name in parts.items())])
 
-    @property
+    @cached_property
     def properly_weighted(self) -> bool:
         """Whether all components are properly weighted and there is no `proposal`.
 
@@ -285,7 +285,7 @@ class _Step:
 
     def extend(self, past: Population | None) -> tuple[Population | None, Population | None]:
         """The predicted and the proposed particles, which are independent given the observation."""
-        if past is None or self.observation is None:
+        if past is None or self.observation is None or self.filter.proposal is None:
             predicted = self.predict(past)
             return predicted, self.propose(predicted)
         found = together(lambda: self.predict(past), lambda: self.propose(past))
@@ -439,7 +439,7 @@ class _Slot:
         name = self._here.name
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - self._here.began
         if isinstance(error, InputError):
-            raise type(error)(f"step {self.t}, {name}: {error.message}", *error.hints) from error
+            raise error.with_message(f"step {self.t}, {name}: {error.message}") from error
         slip = usual_slip(error) if isinstance(error, TypeError | ValueError | AttributeError) else None
         place = place_in_user_file(error) if slip and error is not None else None
         if slip and place:

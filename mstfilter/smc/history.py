@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,7 @@ def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> 
 
     Each collector is a function of (state, info). The result of a collector must have the same shape at every step.
     """
+    check_collectors(collectors)
     rows: dict[str, list[Any]] = {name: [] for name in collectors}
     state, times = None, []
     for state, info in steps:
@@ -128,6 +130,20 @@ def collect(steps: Iterable[tuple[State, Info]], /, **collectors: Collector) -> 
             rows[name].append(np.asarray(collector(state, info)))
     values = {name: stacked(name, row) for name, row in rows.items()}
     return History(values, ("time",), {"time": np.array(times, dtype=np.int64)}, state)
+
+
+def check_collectors(collectors: Mapping[str, Any]) -> None:
+    """Raise InputError if a collector is not a function. A misspelled parameter is taken for a collector."""
+    for name, collector in collectors.items():
+        if callable(collector):
+            continue
+        hints = ["a collector is a function (state, info) that is given by name, for example ess=ess or mean=mean"]
+        if isinstance(collector, Iterable) and not isinstance(collector, (str, bytes)):
+            named = [getattr(function, "__name__", "") for function in collector if callable(function)]
+            hints = [f"give each collector by its name: {', '.join(f'{n}={n}' for n in named)}"] if named else hints
+        elif isinstance(collector, Integral):
+            hints.append(f"the number of runs is the number of seeds: seeds=range({collector})")
+        raise InputError(f"{name} is {collector!r}, which is neither a parameter nor a collector", *hints)
 
 
 def stacked(name: str, rows: list[np.ndarray]) -> np.ndarray:

@@ -19,7 +19,7 @@ A model with parameters is a function that returns a filter:
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -185,7 +185,7 @@ def pmmh(
     log_prior : callable
         ``(theta) -> float``: the log prior density; -inf outside of the support.
     start : (d,) or (R, d) array_like
-        First parameters of one chain or of R chains.
+        First parameters of one chain or of R chains, in the order in which `filter_of` takes them.
     scale : (d,) or (d, d) array_like
         Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
     batched : bool
@@ -199,7 +199,9 @@ def pmmh(
     InputError
         If the prior is zero at the start of a chain, or if 20 estimates of the evidence at the start are zero.
     """
-    theta = np.array(start, np.float64, ndmin=2)
+    theta = np.atleast_2d(_numbers("start", start))
+    if theta.ndim > 2:
+        raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
     root = _step_root(scale, theta.shape[1])
     check_integer("n_iterations", n_iterations)
     posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
@@ -237,9 +239,26 @@ def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.n
     return state
 
 
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """A new float64 array of the values of parameters. Raises InputError if they are not finite numbers."""
+    if isinstance(value, Mapping):
+        raise InputError(
+            f"{name} is a mapping with the keys {', '.join(map(str, value))}, expected an array of numbers",
+            f"parameters have an order and no names: {name}={[*value.values()]}",
+            f"name them where they are used: {', '.join(map(str, value))} = theta",
+        )
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {value!r}, expected an array of numbers") from error
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{name} is {numbers.tolist()}, expected finite numbers")
+    return numbers
+
+
 def _step_root(scale: Any, d: int) -> np.ndarray:
     """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
-    scale = np.asarray(scale, np.float64)
+    scale = _numbers("scale", scale)
     if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():
         return np.diag(np.broadcast_to(scale, d))
     try:
@@ -276,7 +295,7 @@ def ensemble(
     """
     import emcee
 
-    theta = np.array(start, np.float64)
+    theta = _numbers("start", start)
     if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
         raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
     check_integer("n_iterations", n_iterations)
@@ -316,7 +335,9 @@ def particle_gibbs(
     """
     check_integer("n_iterations", n_iterations)
     key = Key(seed).child("particle gibbs")
-    theta = np.array(start, np.float64)
+    theta = _numbers("start", start)
+    if theta.ndim != 1:
+        raise InputError(f"start has shape {theta.shape}, expected (d,)")
     path = conditional_path(filter_of(theta), observations, key.child("start"))
     thetas, paths, moved = np.empty((n_iterations, 1, len(theta))), [], 0
     for i in range(n_iterations):

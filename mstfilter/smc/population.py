@@ -160,16 +160,30 @@ def _freeze(particles: Particles) -> Particles:
     if isinstance(particles, np.ndarray):
         return frozen_view(particles)
     if isinstance(particles, (dict, Mapping)):
-        return {name: _freeze(np.asanyarray(a)) for name, a in particles.items()}
+        return {name: frozen_view(_numpy_array(f"variable {name!r}", a)) for name, a in particles.items()}
     if isinstance(particles, Candidates):
         return particles
+    if hasattr(particles, "__dlpack__"):
+        _numpy_array("particles", particles)
     return tuple(particles)
+
+
+def _numpy_array(what: str, array: Any) -> np.ndarray:
+    """The array of a variable. Raises InputError for an array of another library, which numpy may not convert."""
+    if not isinstance(array, np.ndarray) and hasattr(array, "__dlpack__"):  # which all libraries of arrays define
+        library, name = type(array).__module__.partition(".")[0].removesuffix("lib"), type(array).__name__
+        raise InputError(
+            f"{what}: found {name} of {library}, expected a NumPy array",
+            "x.detach().cpu().numpy() converts a torch tensor, numpy.asarray(x) a JAX array",
+            "a function of a model gets NumPy arrays: convert to the other library first and back at the end",
+        )
+    return np.asanyarray(array)
 
 
 def _check_log_weights(lw: np.ndarray, n: int) -> None:
     if lw.shape != (n,):
         raise InputError(f"log weights have shape {lw.shape}, expected ({n},) as there are {n} particles")
-    top = lw.max()  # NaN if any is NaN, so one pass finds all three errors
+    top = np.maximum.reduce(lw)  # NaN if any is NaN, so one pass finds all three errors
     if not top < np.inf:
         wrong = np.flatnonzero(~(lw < np.inf))
         raise InputError(
@@ -276,10 +290,10 @@ class Population:
     def _summary(self) -> tuple[float, float]:
         """Effective sample size and log mean weight, computed together and cached, because each step uses both."""
         if "_both" not in self.__dict__:
-            top = self.log_weights.max()
+            top = np.maximum.reduce(self.log_weights)  # faster than `max` for few particles
             weights = self.log_weights - top
             np.exp(weights, out=weights)
-            total = float(weights.sum())
+            total = float(np.add.reduce(weights))
             both = (total * total / float(weights @ weights), float(top) + math.log(total / len(weights)))
             object.__setattr__(self, "_both", both)
         return self.__dict__["_both"]
@@ -323,24 +337,28 @@ class Population:
         particles have weight 0.
         """
         indices = _within(_integers("indices", indices), len(self))
-        if not len(indices):
+        if len(indices) == 0:
             raise InputError("no particle is selected", "name at least one index")
+        lw = self.log_weights[indices] if log_weights is None else np.asarray(log_weights, dtype=np.float64)
         try:
-            return Population(
-                take(self.particles, indices),
-                self.log_weights[indices] if log_weights is None else log_weights,
-                {name: index[indices] for name, index in self.parents.items()},
-                self.notes,
-            )
+            _check_log_weights(lw, len(indices))
         except LostRunError:
             raise InputError(
                 f"all {len(indices)} selected particles have weight 0",
                 "select among those of positive weight: np.flatnonzero(population.weights)",
             ) from None
+        new = self.labelled({name: frozen_view(index[indices]) for name, index in self.parents.items()}, self.notes)
+        new.__dict__.update(particles=_freeze(take(self.particles, indices)), log_weights=frozen_view(lw))
+        new.__dict__.pop("_both", None)
+        return new
 
     def select(self, ancestors: np.ndarray, log_weights: np.ndarray, **notes: Any) -> Population:
         """Select particles as `take` does, set ``parents["ancestor"]``, and add the given values to `notes`."""
-        return self.take(ancestors, log_weights).with_ancestors(ancestors, **notes)
+        new = self.take(ancestors, log_weights)
+        new.__dict__["parents"]["ancestor"] = _integers("ancestors", ancestors)
+        if notes:
+            new.__dict__["notes"] = {**self.notes, **notes}
+        return new
 
     def with_ancestors(self, ancestors: np.ndarray, **notes: Any) -> Population:
         """The same particles with the given ``parents["ancestor"]``, and the given values added to `notes`."""
@@ -378,7 +396,9 @@ class Population:
 
     def realised(self) -> Population:
         """The same population, with all `Candidates` built."""
-        if isinstance(self.particles, Candidates):
+        if type(self.particles) is not np.ndarray and isinstance(
+            self.particles, Candidates
+        ):  # the first test is fast
             return replace(self, particles=self.particles.built())
         return self
 

@@ -33,7 +33,7 @@ Liu and Chen (1998).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -216,7 +216,7 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
         raise InputError(f"log weights have shape {lw.shape}, expected one number per particle")
     if not isinstance(n, (int, np.integer)) or n < 1:
         raise InputError(f"resampling to {n} particles, expected an integer of at least 1")
-    top = lw.max()
+    top = np.maximum.reduce(lw)
     if not -np.inf < top < np.inf:
         at = int(np.flatnonzero(~np.isfinite(lw) & ~np.isneginf(lw))[0]) if not np.isneginf(top) else 0
         raise InputError(f"log weights cannot be resampled: entry {at} is {lw[at]}, the largest is {top}")
@@ -238,13 +238,11 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
     The weights are (..., m). The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same shift.
     """
     ends = weights.cumsum(axis=-1)
-    total = ends[..., -1:]
+    total = ends[-1] if ends.ndim == 1 else ends[..., -1:]  # scalars are faster where arrays are short
     last = ends == total
     ends *= n / total
     _subtract(ends, shifts)
-    np.ceil(
-        ends, out=ends
-    )  # the number of points below each cumulative weight: greater than -1 before, so not negative
+    np.ceil(ends, out=ends)  # the number of points below each cumulative weight: not negative, as it was above -1
     np.putmask(ends, last, n)  # whatever the rounding
     return expanded(ends.astype(np.int64), n)
 
@@ -252,7 +250,7 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
 def _subtract(positions: np.ndarray, shifts: np.ndarray) -> None:
     """Subtract from each position (..., m) the shift of its stratum, in place."""
     if shifts.shape[-1] == 1:
-        positions -= shifts
+        positions -= shifts[0] if shifts.ndim == 1 else shifts
     elif positions.ndim == 2:
         for row, shift in zip(positions, shifts, strict=True):
             _subtract(row, shift)
@@ -284,7 +282,9 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
 def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
     """(..., n) indices, sorted, drawn independently by weights (..., m)."""
     points = ordered_uniforms(rng, n, weights.shape[:-1])
-    return search(weights, points) if weights.ndim == 1 else np.stack(list(map(search, weights, points)))
+    if weights.ndim == 1:
+        return search(weights, points, ascending=True)
+    return np.stack([search(w, p, ascending=True) for w, p in zip(weights, points, strict=True)])
 
 
 def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = ()) -> np.ndarray:
@@ -295,9 +295,50 @@ def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = (
     return points[..., :-1]
 
 
-def search(weights: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) index of the interval that contains each point. Interval i of [0, 1) has length weight i / total."""
+def search(weights: np.ndarray, points: np.ndarray, ascending: bool = False) -> np.ndarray:
+    """(n,) index of the interval that contains each point. Interval i of [0, 1) has length weight i / total.
+
+    A search for many points is faster if the points are `ascending`.
+    """
     cumulative = weights.cumsum()
-    index = cumulative.searchsorted(points * cumulative[-1], side="right")  # "right" skips weights of zero
+    find = _search_ascending if ascending else np.searchsorted
+    index = find(cumulative, points * cumulative[-1], side="right")  # "right" skips weights of zero
     # A point rounded up to the total belongs to the last particle of positive weight.
-    return np.minimum(index, cumulative.searchsorted(cumulative[-1]))
+    return np.minimum(index, cumulative.searchsorted(cumulative[-1]), out=index)
+
+
+def _search_ascending(edges: np.ndarray, points: np.ndarray, side: Literal["right"]) -> np.ndarray:
+    """The result of `np.searchsorted` for ascending points: a quarter of the time for a million of each.
+
+    The number of edges in lower bins than a point is a lower bound of its index. The bins, one for each edge and each
+    point on average, are those of a block of points at a time, so that they stay in cache.
+    """
+    if len(points) < _BLOCK or 4 * len(points) < len(edges):
+        return np.searchsorted(edges, points, side)
+    index = np.empty(len(points), np.int64)
+    scale = (len(edges) + len(points)) / edges[-1]
+    begin, offset = 0, 0.0  # the first edge above the points of earlier blocks, and the bin of the last of them
+    for start in range(0, len(points), 8 * _BLOCK):
+        block, found = points[start : start + 8 * _BLOCK], index[start : start + 8 * _BLOCK]
+        end = int(np.searchsorted(edges, block[-1], side))
+        near = np.append(edges[begin:end], np.inf)
+        bins = _bins(block, scale, offset)
+        below = np.bincount(_bins(near[:-1], scale, offset), minlength=bins[-1] + 1)
+        offset += float(bins[-1])
+        below.cumsum(out=below)
+        below[-1] = 0  # below bin 0, where the next line reads it
+        bins -= 1
+        below.take(bins, out=found, mode="wrap")
+        found += near.take(found) <= block
+        low = np.flatnonzero(near.take(found) <= block)
+        found[low] = np.searchsorted(near, block[low], side)
+        found += begin
+        begin = end
+    return index
+
+
+def _bins(values: np.ndarray, scale: float, offset: float) -> np.ndarray:
+    """The bin of each value. Bins have width 1 / scale and count from `offset`. int32 is faster than int64."""
+    scaled = values * scale
+    scaled -= offset
+    return scaled.astype(np.int32)

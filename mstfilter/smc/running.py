@@ -19,21 +19,22 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import islice, product
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError, check_integer, naming
+from mstfilter.errors import InputError, LostRunError, check_component, check_integer, naming
 from mstfilter.lazy import progress_of
 from mstfilter.processes import environment
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
-from mstfilter.smc.history import Collector, History, check_one_shape, collect, log_evidence
+from mstfilter.smc.history import Collector, History, check_collectors, check_one_shape, collect, log_evidence
 from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Info, State
 from mstfilter.smc.streams import Key
@@ -59,7 +60,7 @@ def run_many(
     observations : iterable
         T observations, the same for all runs. A missing observation is None. Use `WithInput` for an input.
     seeds : iterable of int
-        Different non-negative integers.
+        Different non-negative integers, one for each run. ``seeds=range(100)`` makes 100 runs.
     workers : int
         Number of processes. With 1, all runs are made in the calling process. Otherwise joblib's loky starts workers,
         which get the filters by cloudpickle. If a worker dies, InputError names the runs that may have caused it.
@@ -68,7 +69,7 @@ def run_many(
     progress : bool or callable
         True shows a progress bar. A function is called as ``progress(done, total)`` whenever runs finish.
     **collectors
-        Collectors by name, as in `collect`. The default is `log_evidence`.
+        Collectors by name, as in `collect`: ``mean=mean``. The default is `log_evidence`.
 
     Returns
     -------
@@ -77,22 +78,61 @@ def run_many(
         A run ends if all weights are zero (`LostRunError`). From this step on, the log evidence is -inf, and other
         results are NaN. `History.lost` gives the reason for each such run.
     """
-    arms = dict(filters) if isinstance(filters, Mapping) else {_ALONE: filters}
-    if not arms:
-        raise InputError("there are no filters to run")
+    arms = _arms(filters)
     check_integer("workers", workers)
-    collectors, seeds = collectors or {"log_evidence": log_evidence}, [int(seed) for seed in seeds]
-    if not seeds:
-        raise InputError("there are no seeds")
-    if len(set(seeds)) < len(seeds):
-        raise InputError(f"a seed occurs twice in {seeds}", "every run has a seed of its own")
-    job = _Job(arms, list(check_observations(observations)), seeds, collectors, together)
+    check_collectors(collectors)
+    job = _Job(
+        arms,
+        list(check_observations(observations)),
+        _different_seeds(seeds),
+        collectors or {"log_evidence": log_evidence},
+        together,
+    )
     found: dict[_Task, Collected] = {}
     with progress_of(progress, "runs") as advance:
         for runs in _finished(job, job.chunks(), workers):
             found.update(runs)
             advance(len(found), len(arms) * len(job.seeds))
     return job.history(found, isinstance(filters, Mapping))
+
+
+def _arms(filters: Any) -> dict[str, ParticleFilter]:
+    """The filters by name. Raises InputError if a filter is missing or is something else."""
+    if isinstance(filters, ParticleFilter):
+        return {_ALONE: filters}
+    if not isinstance(filters, Mapping):
+        hints = []
+        if isinstance(filters, Sequence) and all(isinstance(filter, ParticleFilter) for filter in filters):
+            hints = ['give each filter a name: {"small": bootstrap(model, 100), "large": bootstrap(model, 1000)}']
+        raise InputError(
+            f"filters are a {type(filters).__name__}, expected a ParticleFilter or a mapping from names to filters",
+            *hints,
+        )
+    if not filters:
+        raise InputError("there are no filters to run")
+    for name, filter in filters.items():
+        check_component(f"filter {name!r}", filter, ParticleFilter)
+    return dict(filters)
+
+
+def _different_seeds(seeds: Any) -> list[int]:
+    """The seeds as a list. Raises InputError if they are not different non-negative integers."""
+    if isinstance(seeds, Integral):
+        raise InputError(
+            f"seeds are {seeds}, expected one seed for each run",
+            f"{seeds} runs: seeds=range({seeds})",
+            f"one run with the seed {seeds}: seeds=[{seeds}]",
+        )
+    if isinstance(seeds, str) or not isinstance(seeds, Iterable):
+        raise InputError(f"seeds are {seeds!r}, expected integers", "for example seeds=range(100)")
+    found = list(seeds)
+    for seed in found:
+        check_integer("a seed", seed, "for example seeds=range(100)", at_least=0)
+    if not found:
+        raise InputError("there are no seeds")
+    if len(set(found)) < len(found):
+        raise InputError(f"a seed occurs twice in {found}", "every run has a seed of its own")
+    return [int(seed) for seed in found]
 
 
 _MOST_ROWS = 100_000  # particles of a sweep; more are not faster

@@ -5,6 +5,7 @@ Chi-square tests at 1e-4, means at 5 standard errors: false alarm below 2e-3 for
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -367,7 +368,15 @@ def test_what_chains_reject():
         with pytest.raises(InputError, match="scale is"):
             pmmh(filter_of, YS, log_prior, [0.1], scale, 5)
     with pytest.warns(UserWarning, match="one by one: a component looks at several particles"):
-        pmmh(lambda theta: replace(bootstrap(AR1, 5), size=Kld(n_min=2, n_max=9)), YS, log_prior, [0.1], 0.5, 5, batched=True)
+        pmmh(
+            lambda theta: replace(bootstrap(AR1, 5), size=Kld(n_min=2, n_max=9)),
+            YS,
+            log_prior,
+            [0.1],
+            0.5,
+            5,
+            batched=True,
+        )
     with pytest.raises(InputError, match="not properly weighted"):
         pmmh(lambda theta: bootstrap(AR1, 5, LargestWeights()), YS, log_prior, [0.1], 0.5, 5)
     with pytest.raises(InputError, match=r"start has shape \(1, 1\)"):
@@ -412,3 +421,27 @@ def test_a_path_survives_if_all_free_particles_have_weight_zero():
     law = ((grid >= 0) & (grid <= 1)) * like * (move @ (like * (move @ like)))
     mean = (grid * law).sum() / law.sum()
     assert np.mean([p[0] for p in paths]) == pytest.approx(mean, abs=0.05)
+
+
+@pytest.mark.parametrize("infer", [pmmh, ensemble, particle_gibbs])
+def test_parameters_are_an_array_of_numbers(infer):
+    """Names have no order: a mapping is refused before the first run of a filter."""
+
+    def call(start, **given):
+        arguments = {"log_prior": lambda theta: 0.0, "scale": [0.1, 0.1], "draw": None, "n_iterations": 3}
+        taken = inspect.signature(infer).parameters
+        named = {name: value for name, value in {**arguments, **given}.items() if name in taken}
+        infer(lambda theta: None, [0.0], start=start, **named)
+
+    with pytest.raises(InputError, match="start is a mapping with the keys rho, sigma") as found:
+        call({"rho": 0.5, "sigma": 1.0})
+    assert "start=[0.5, 1.0]" in found.value.hints[0] and "rho, sigma = theta" in found.value.hints[1]
+    with pytest.raises(InputError, match="start is 'rho', expected an array of numbers"):
+        call("rho")
+    with pytest.raises(InputError, match="expected finite numbers"):
+        call([0.5, np.nan])
+    with pytest.raises(InputError, match="start has shape"):
+        call(np.zeros((2, 3, 4)))
+    if infer is pmmh:
+        with pytest.raises(InputError, match="scale is a mapping with the keys rho, sigma"):
+            call([0.5, 1.0], scale={"rho": 0.1, "sigma": 0.1})

@@ -187,3 +187,21 @@ def test_wrong_ancestors_are_a_named_error(ancestors, message):
 def test_parents_are_integers():
     with pytest.raises(InputError, match='parents "previous" are of type float64, expected integers'):
         Population(np.zeros(2), parents={"previous": np.array([0.0, 1.7])})
+
+
+def test_arrays_of_other_libraries_are_named_with_the_cure():
+    """The elements of a tensor would otherwise be the particles: objects, which no function of numpy understands."""
+    torch = pytest.importorskip("torch")
+    needs_grad = torch.zeros(3, requires_grad=True)
+    jax_array = type("ArrayImpl", (), {"__module__": "jaxlib._jax", "__dlpack__": None, "__len__": lambda self: 3})
+    for array, named in ((torch.zeros(3), "Tensor of torch"), (needs_grad, "Tensor of torch")):
+        for particles, what in ((array, "particles"), ({"x": array}, "variable 'x'")):
+            with pytest.raises(InputError, match=f"{what}: found {named}, expected a NumPy array") as found:
+                Population(particles)
+            assert "x.detach().cpu().numpy()" in found.value.hints[0]
+    with pytest.raises(InputError, match=r"found ArrayImpl of jax,"):
+        Population(jax_array())
+    with pytest.raises(InputError, match="found Tensor of torch"):
+        Population(np.zeros(3)).moved(torch.zeros(3))
+    assert Population({"x": [1.0, 2.0]}).particles["x"].tolist() == [1.0, 2.0]
+    assert len(Population([torch.zeros(3), torch.zeros(3)])) == 2  # two objects

@@ -114,6 +114,21 @@ def test_one_point_per_stratum_equals_a_search(kind, m, n):
         np.testing.assert_array_equal(inverse_cdf(weights, shifts, n), expected)
 
 
+@pytest.mark.parametrize("kind", ["even", "zeros", "ends", "heavy", "one", "equal"])
+@pytest.mark.parametrize(("m", "n"), [(5_000, 30_000), (100_000, 100_000), (300_000, 90_000), (7, 200_000)])
+def test_ascending_points_are_searched_as_numpy_does(kind, m, n):
+    """Points between the ends of intervals, at ends, several at one end, in a small part, and at the total."""
+    weights, rng = hostile_weights(kind, m), np.random.default_rng(m + n)
+    ends = np.cumsum(weights)
+    last = np.searchsorted(ends, ends[-1])
+    inside, near = rng.random(n // 4), 0.25 + 1e-4 * rng.random(n // 4)
+    at_ends = rng.choice(ends / ends[-1], n - 2 * (n // 4))
+    for points in (np.sort(rng.random(n)), np.sort(np.concatenate((inside, near, at_ends)))):
+        expected = np.minimum(np.searchsorted(ends, points * ends[-1], side="right"), last)
+        np.testing.assert_array_equal(search(weights, points, ascending=True), expected)
+        np.testing.assert_array_equal(search(weights, points), expected)
+
+
 def test_points_at_the_ends_of_intervals():
     """A point at an end belongs to the next particle of positive weight; one rounded up to the total, to the last."""
     weights, points = np.array([0.0, 0.25, 0.0, 0.75, 0.0]), np.array([0.0, 0.25, 1.0])

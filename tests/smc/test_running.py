@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import sys
 import tracemalloc
 from dataclasses import replace
@@ -239,6 +240,38 @@ def test_observations_that_cannot_be_meant_are_refused_before_the_first_step(obs
 # --- tables --------------------------------------------------------------------------------------------------------
 RNG = np.random.default_rng(0)
 CHAINS = Chains(RNG.normal(size=(4, 2, 3)), RNG.normal(size=(4, 2)), RNG.normal(size=(4, 2)), np.array([0.25, 0.5]))
+
+
+MISTAKES_OF_RUN_MANY = {
+    "seeds are 100, expected one seed for each run": ({"seeds": 100}, "seeds=range(100)"),
+    "a seed is 1.5, expected an integer": ({"seeds": [0, 1.5]}, "seeds=range(100)"),
+    "a seed is True, expected an integer": ({"seeds": [True]}, "seeds=range(100)"),
+    "seeds are '0-9', expected integers": ({"seeds": "0-9"}, "seeds=range(100)"),
+    "seeds are None, expected integers": ({"seeds": None}, "seeds=range(100)"),
+    "n_runs is 100, which is neither a parameter nor a collector": ({"n_runs": 100}, "seeds=range(100)"),
+    "collect is [<function mean": ({"collect": [mean]}, "mean=mean"),
+    "n is 'many', which is neither": ({"n": "many"}, "ess=ess"),
+    "filters are a list, expected a ParticleFilter or a mapping": (
+        {"filters": [bootstrap(AR1, 8), bootstrap(AR1, 9)]},
+        'give each filter a name: {"small"',
+    ),
+    "filters are a StateSpaceModel, expected": ({"filters": AR1}, ""),
+    "filter 'a' is 3, expected a ParticleFilter": ({"filters": {"a": 3}}, ""),
+    "there are no filters": ({"filters": {}}, ""),
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES_OF_RUN_MANY)
+def test_mistakes_of_run_many_are_named_with_what_may_be_given(message):
+    given, hint = MISTAKES_OF_RUN_MANY[message]
+    with pytest.raises(InputError, match=re.escape(message)) as found:
+        run_many(**{"filters": bootstrap(AR1, 8), "observations": ar1_observations(3), "seeds": [0], **given})
+    assert hint in " ".join(found.value.hints)
+
+
+def test_a_collector_that_is_no_function():
+    with pytest.raises(InputError, match=re.escape("ess is 0.5, which is neither")):
+        collect(bootstrap(AR1, 8).iterate(ar1_observations(3)), ess=0.5)
 
 
 def test_columns_of_chains():

@@ -159,8 +159,8 @@ def _explained(error: Exception, run: ProgramRun, previous: Any) -> Exception:
         place += f", line {own.lineno}" + f" `{own.line}`" * bool(own.line)
     if isinstance(error, InputError):
         if run.inside:
-            return type(error)(f"{run.what}: {error.message}", *error.hints)
-        return type(error)(f"{error.message} ({place})", *error.hints) if frames else error
+            return error.with_message(f"{run.what}: {error.message}")
+        return error.with_message(f"{error.message} ({place})") if frames else error
     if type(error).__module__.split(".")[0] not in ("builtins", "numpy", "scipy"):
         return error
     if isinstance(error, KeyError) and isinstance(previous, Mapping) and error.args and error.args[0] not in previous:
