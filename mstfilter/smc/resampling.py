@@ -33,7 +33,7 @@ Liu and Chen (1998).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -45,32 +45,24 @@ from mstfilter.smc.interfaces import WeightResampler
 class Multinomial(WeightResampler):
     """Independent draws by weight (Gordon, Salmond, Smith 1993). N_i has the largest variance of all schemes."""
 
-    batched: ClassVar[bool] = True
-
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        return independent_draws(rng, weights_of_runs(log_weights, n), n), None
+        return independent_draws(rng, checked_weights(log_weights, n), n), None
 
 
 @dataclass(frozen=True)
 class Stratified(WeightResampler):
     """Draws one uniform point in each of n equal strata of [0, 1) (Kitagawa 1996)."""
 
-    batched: ClassVar[bool] = True
-
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        weights = weights_of_runs(log_weights, n)
-        return inverse_cdf(weights, rng.random((*weights.shape[:-1], n)), n), None
+        return inverse_cdf(checked_weights(log_weights, n), rng.random(n), n), None
 
 
 @dataclass(frozen=True)
 class Systematic(WeightResampler):
     """Makes floor or ceil of n W_i copies, by one uniform number (Carpenter, Clifford, Fearnhead 1999)."""
 
-    batched: ClassVar[bool] = True
-
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
-        weights = weights_of_runs(log_weights, n)
-        return inverse_cdf(weights, rng.random((*weights.shape[:-1], 1)), n), None
+        return inverse_cdf(checked_weights(log_weights, n), rng.random(1), n), None
 
 
 def certain_copies(weights: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -224,51 +216,30 @@ def checked_weights(log_weights: np.ndarray, n: int) -> np.ndarray:
     return np.exp(weights, out=weights)
 
 
-def weights_of_runs(log_weights: np.ndarray, n: int) -> np.ndarray:
-    """(m,) weights by `checked_weights` for one run; (R, m) weights with maximum 1, unchecked, for R runs."""
-    if log_weights.ndim != 2:
-        return checked_weights(log_weights, n)
-    weights = log_weights - log_weights.max(axis=1, keepdims=True)
-    return np.exp(weights, out=weights)
-
-
 def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) ascending indices at which the cumulative weights reach the points (k + shift_k) / n, k = 0 .. n - 1.
+    """(n,) ascending indices at which the cumulative weights (m,) reach the points (k + shift_k) / n, k = 0 .. n - 1.
 
-    The weights are (..., m). The shifts, in [0, 1), are (..., n), or (..., 1) if all strata have the same shift.
+    The shifts, in [0, 1), are (n,), or (1,) if all points have the same one.
     """
-    ends = weights.cumsum(axis=-1)
-    total = ends[-1] if ends.ndim == 1 else ends[..., -1:]  # scalars are faster where arrays are short
+    ends = weights.cumsum()
+    total = ends[-1]
     last = ends == total
     ends *= n / total
-    _subtract(ends, shifts)
+    if len(shifts) == 1:
+        ends -= shifts[0]
+    else:
+        for begin in range(0, len(ends), _BLOCK):
+            block = ends[begin : begin + _BLOCK]
+            block -= shifts.take(block.astype(np.int64), mode="clip")  # the last position lies in stratum n
     np.ceil(ends, out=ends)  # the number of points below each cumulative weight: not negative, as it was above -1
     np.putmask(ends, last, n)  # whatever the rounding
     return expanded(ends.astype(np.int64), n)
 
 
-def _subtract(positions: np.ndarray, shifts: np.ndarray) -> None:
-    """Subtract from each position (..., m) the shift of its stratum, in place."""
-    if shifts.shape[-1] == 1:
-        positions -= shifts[0] if shifts.ndim == 1 else shifts
-    elif positions.ndim == 2:
-        for row, shift in zip(positions, shifts, strict=True):
-            _subtract(row, shift)
-    else:
-        for begin in range(0, len(positions), _BLOCK):
-            block = positions[begin : begin + _BLOCK]
-            block -= shifts.take(block.astype(np.int64), mode="clip")  # the last position lies in stratum n
-
-
 def expanded(ends: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) indices. Index i fills the positions ends[i - 1] to ends[i] - 1."""
-    if ends.ndim == 1:
-        counts = np.bincount(ends[:-1], minlength=n)[:n]
-        return counts.cumsum(out=counts)
-    rows, width = len(ends), n + 2  # rounding may give n + 1
-    ends = ends[:, :-1] + width * np.arange(rows)[:, None]
-    counts = np.bincount(ends.ravel(), minlength=rows * width).reshape(rows, width)
-    return counts[:, :n].cumsum(axis=1)
+    """(n,) indices. Index i fills the positions ends[i - 1] to ends[i] - 1."""
+    counts = np.bincount(ends[:-1], minlength=n)[:n]
+    return counts.cumsum(out=counts)
 
 
 def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
@@ -279,20 +250,17 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
     return np.minimum(index, (cumulative < total).sum(axis=1))
 
 
-def independent_draws(rng: Any, weights: np.ndarray, n: int) -> np.ndarray:
-    """(..., n) indices, sorted, drawn independently by weights (..., m)."""
-    points = ordered_uniforms(rng, n, weights.shape[:-1])
-    if weights.ndim == 1:
-        return search(weights, points, ascending=True)
-    return np.stack([search(w, p, ascending=True) for w, p in zip(weights, points, strict=True)])
+def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
+    """(n,) indices, sorted, drawn independently by weights (m,)."""
+    return search(weights, ordered_uniforms(rng, n), ascending=True)
 
 
-def ordered_uniforms(rng: np.random.Generator, n: int, rows: tuple[int, ...] = ()) -> np.ndarray:
-    """``(*rows, n)`` uniforms on [0, 1], ascending in each row, in O(n) by normalised exponential spacings."""
-    points = rng.standard_exponential((*rows, n + 1))
-    np.cumsum(points, axis=-1, out=points)
-    points /= points[..., -1:]
-    return points[..., :-1]
+def ordered_uniforms(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n,) ascending uniforms on [0, 1], in O(n) by normalised exponential spacings."""
+    points = rng.standard_exponential(n + 1)
+    points.cumsum(out=points)
+    points /= points[-1]
+    return points[:-1]
 
 
 def search(weights: np.ndarray, points: np.ndarray, ascending: bool = False) -> np.ndarray:
