@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -27,32 +30,57 @@ def check(
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Values of fields.")
     ] = None,
+    budget: Annotated[
+        float, typer.Option(min=1, metavar="SECONDS", help="Time for all properties. The rest is not tested.")
+    ] = 120,
 ) -> None:
     """Test whether a component keeps the contract of its interface."""
-    from mstfilter.presets import REGISTRY, settings
-    from mstfilter.smc.testing import FALSE_ALARM
-    from mstfilter.testing import run_contract
+    from mstfilter.smc.testing import FALSE_ALARM, CheckResult
+    from mstfilter.testing import check_of, run_contract
 
-    kind, _, name = ("", "", component) if ".py:" in component else component.partition(".")
-    if ".py:" not in component and kind not in REGISTRY.kinds:
-        raise InputError(
-            f"{component!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows"
-        )
-    cls = REGISTRY.find_class(kind, name, component, allow_files=True)
-    results = run_contract(REGISTRY.make(cls, settings(overrides or ()), allow_files=True))
-    for result in results:
+    subject = _subject(component, overrides or [])
+    name = type(subject).__name__
+    print(f"{'input':<9}{check_of(subject).input}", flush=True)
+
+    def show(result: CheckResult) -> None:
         state = "broken" if result.failure else "skipped" if result.skipped else "holds"
-        print(f"{state:<9}{result.statement}")
-        if result.failure or result.skipped:
-            print(f"{'':<9}  {result.failure or result.skipped}  [{result.name}]")
+        print(f"{'untested' if result.out_of_time else state:<9}{result.statement}")
+        for line in filter(None, (result.failure or result.skipped, result.remark)):
+            print(f"{'':<9}  {line}  [{result.name}]")
+        sys.stdout.flush()
+
+    results = run_contract(subject, budget=budget, progress=show)
     statistical = sum(result.statistical and not result.skipped for result in results)
     if statistical:
         print(f"{statistical} of these are statistical, each with a false-alarm rate of at most {FALSE_ALARM:.0e}")
-    broken = sum(result.failure is not None for result in results)
+    broken, late = (
+        sum(map(bool, states)) for states in zip(*((r.failure, r.out_of_time) for r in results), strict=True)
+    )
     verdict = f"{broken} {'property is' if broken == 1 else 'properties are'} broken"
-    print(f"{cls.__name__}: {verdict if broken else 'all properties that apply hold'}")
+    untested = f"{late} {'is' if late == 1 else 'are'} not tested in {budget:g} s (--budget)" if late else ""
+    if not broken:
+        verdict = "no tested property is broken" if late else "all properties that apply hold"
+    print(f"{name}: {', '.join(filter(None, (verdict, untested)))}")
     if broken:
         raise typer.Exit(1)
+
+
+def _subject(name: str, overrides: list[str]) -> Any:
+    """What `check` tests: the component with the given fields. This is the place for other kinds of subjects."""
+    from mstfilter.presets import REGISTRY, settings
+
+    kind, _, known = ("", "", name) if ".py:" in name else name.partition(".")
+    if ".py:" not in name and kind not in REGISTRY.kinds:
+        raise InputError(f"{name!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows")
+    cls = REGISTRY.find_class(kind, known, name, allow_files=True)
+    if not dataclasses.is_dataclass(cls) and not overrides and not inspect.isabstract(cls):
+        try:
+            return cls()
+        except TypeError as error:
+            raise InputError(
+                f"{cls.__name__} cannot be made without arguments: {error}", "give its fields defaults"
+            ) from error
+    return REGISTRY.make(cls, settings(overrides), allow_files=True)
 
 
 @app.command()

@@ -1,11 +1,23 @@
 from mstfilter.resources import starter_kinds as starter_kinds, write_starter as write_starter
+from mstfilter.testing.checking import (
+    check_of as check_of,
+    contract_of as contract_of,
+    run_contract as run_contract,
+)
+from mstfilter.testing.hypotheses import (
+    EvidenceContract as EvidenceContract,
+    SceneProposalContract as SceneProposalContract,
+    SceneSimilarityContract as SceneSimilarityContract,
+    SceneTransitionContract as SceneTransitionContract,
+)
 from mstfilter.testing.scenes import scene_example as scene_example
 from mstfilter.testing.stages import (
     STAGE_OWNERS as STAGE_OWNERS,
+    BoundaryModelContract as BoundaryModelContract,
     CompleterContract as CompleterContract,
-    EvidenceContract as EvidenceContract,
+    MaskTrackerContract as MaskTrackerContract,
     MotionRuleContract as MotionRuleContract,
+    ProjectionContract as ProjectionContract,
+    RegistrationContract as RegistrationContract,
     StageContract as StageContract,
-    contract_of as contract_of,
-    run_contract as run_contract,
 )

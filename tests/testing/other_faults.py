@@ -425,7 +425,12 @@ plant(
     OneDraw=(_DRAWN, "is below", lambda rng, y, n: np.full(n, SD0 * rng.standard_normal()), exact_prior),
     CutDraws=(_DRAWN, "is below", lambda rng, y, n: SD0 * rng.standard_normal(n).clip(-2.9, 2.9), exact_prior),
     Unweighted=(_DRAWN, "is below", lambda rng, y, n: optimal_initial(y).sample(rng, n), exact_prior),
-    Pairs=(_DRAWN, "times the variance", lambda rng, y, n: SD0 * in_blocks(rng, range(n), 2), exact_prior),
+    Pairs=(
+        "draws_vary_like_independent_ones",
+        "times the variance",
+        lambda rng, y, n: SD0 * in_blocks(rng, range(n), 2),
+        exact_prior,
+    ),
     WeightsOfMeanTwo=(_DRAWN, "the mean weight is", lambda rng, y, n: weighed(rng, y, n, 2.0), exact_prior),
 )
 correct_draws, correct_weighed, correct_antithetic = map(

@@ -16,11 +16,16 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
+import random
+import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, TypeVar
-from unittest import SkipTest
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple, TypeVar
+from unittest import SkipTest, mock
 
 import numpy as np
 
@@ -46,8 +51,15 @@ def prerequisite(test: _Test) -> _Test:
     return test
 
 
+class OutOfTime(SkipTest):
+    """The time of a test is used up. The message says what was tested until then."""
+
+
+_GENERATOR = np.random.default_rng  # the function itself: a test replaces it for the component
+
+
 def seeded(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(seed)
+    return _GENERATOR(seed)
 
 
 class Contract:
@@ -57,6 +69,7 @@ class Contract:
     """
 
     returns: ClassVar[type] = object  #: type of the result of a call
+    until = math.inf  #: value of `time.monotonic` at which a test ends; `check_properties` sets it
 
     def make(self) -> Any:
         """The component to test."""
@@ -80,6 +93,7 @@ class Contract:
 
     def checked_call(self, component: Any, inputs: dict[str, Any], rng: np.random.Generator | None = None) -> Any:
         """Call the component once and check the result. The message of an exception describes the inputs."""
+        self.check_time()
         with reports_errors(inputs):
             result = self.call(component, seeded(3) if rng is None else rng, inputs)
         kind, expected = type(result).__name__, self.returns.__name__
@@ -92,6 +106,22 @@ class Contract:
         few = self.inputs(6)
         objects = isinstance(getattr(few.get("population"), "particles", None), tuple)
         return [few] if objects else [few, self.inputs(1)]
+
+    @cached_property
+    def remarks(self) -> list[str]:
+        """What a test says although the property holds."""
+        return []
+
+    def check_time(self, seconds: float = 0.0, what: str = "") -> None:
+        """End the test if its time is used up, or if less than `seconds` are left for what comes next."""
+        left = self.until - time.monotonic()
+        if left <= 0 or seconds > left:
+            raise OutOfTime(what or "out of time")
+
+    @property
+    def on_numbers(self) -> bool:
+        """Whether the particles are those of the base class: independent normal numbers, with observation 0.5."""
+        return type(self).example is Contract.example
 
     def fresh(self) -> Any:
         """A component that has not been called: a copy of the result of `make`, if the component can be copied."""
@@ -119,13 +149,19 @@ class Contract:
     def test_depends_on_its_arguments_only(self) -> None:
         """Equal arguments and generators give equal results. With ``draws = False`` the generator is not used."""
         used, draws, found = self.fresh(), getattr(self.make(), "draws", True), []
+        uses = own = False
         for inputs in (self.inputs(6, 1), *self.variants()):
+            self.check_time()
             rngs = [seeded(7) for _ in range(3)]
             components = self.fresh(), self.fresh(), used
-            with skips_errors():
+            with skips_errors(), _own_generators(type(used).__module__) as generators:
                 found.append([_plain(self.call(*c, inputs)) for c in zip(components, rngs, strict=True)])
-            unused = rngs[0].bit_generator.state == seeded(7).bit_generator.state
-            assert unused or draws, "it declares draws = False and draws from its generator"
+            advanced = rngs[0].bit_generator.state != seeded(7).bit_generator.state
+            assert draws or not advanced, "it declares draws = False and draws from its generator"
+            if draws and not (advanced or uses):  # child streams do not advance a generator
+                with skips_errors():
+                    uses = not same(found[-1][0], _plain(self.call(self.fresh(), seeded(8), inputs)))
+            uses, own = uses or advanced, own or bool(generators)
         assert all(same(one, again) for one, again, _ in found), (
             "two runs with equal generators differ: a random number does not come from `rng`"
         )
@@ -133,6 +169,17 @@ class Contract:
             "a component that was used before gives another result than a new one: it keeps state, for example "
             "values of its first call"
         )
+        if draws and not uses:
+            self.check_unused_generator(own)
+
+    def check_unused_generator(self, own: bool) -> None:
+        """Judge a component with ``draws = True`` that never uses its generator. `own`: it makes another one."""
+        cls = type(self.make())
+        declared = any("draws" in vars(base) for base in cls.__mro__ if not base.__module__.startswith("mstfilter."))
+        assert not own, "it never uses its generator, and draws from another one: use `rng` only"
+        assert not declared, "it declares draws = True and never uses its generator"
+        if isinstance(getattr(cls, "draws", None), property):
+            self.remarks.append("it never uses its generator; draws = False in the class says so")
 
 
 class ScaleContract(Contract):
@@ -157,9 +204,33 @@ class ScaleContract(Contract):
                 assert result == found, f"{fault} change its answer"
                 continue
             a, b = (_selected(one) for one in (result, found))
-            assert all(map(close, a, b)), f"{fault} change the particles"
+            if not all(map(close, a, b)):  # rounding may decide a draw, as in the alias method
+                self._compare_laws(component, inputs, given, f"{fault} change the particles")
+                continue
             kept = close(found.log_weights - shift, result.log_weights)
             assert kept or not component.properly_weighted, f"{fault} do not add it to those of the result"
+
+    def features(self, result: Population, given: Population) -> np.ndarray:
+        """(k,) numbers whose distributions describe the results for the input `given`."""
+        change = result.log_weights - given.log_mean_weight
+        return np.concatenate([np.ravel(one) for one in (*_selected(result), change)])
+
+    def _compare_laws(self, component: Any, inputs: dict[str, Any], scaled: Population, fault: str) -> None:
+        """Compare the distributions of results for the input and for the same input with a common factor."""
+        from scipy.stats import ks_2samp
+
+        samples = []
+        for given in (inputs[self.weighted], scaled):
+            arguments = {**inputs, self.weighted: given}
+            with np.errstate(all="ignore"):
+                results = [self.checked_call(component, arguments, seeded(k)) for k in range(10, 210)]
+            samples.append([self.features(one, given) for one in results])
+        sizes = {len(row) for rows in samples for row in rows}
+        assert len(sizes) == 1, fault
+        columns = np.round(samples, 9).transpose(2, 0, 1)
+        assert all(ks_2samp(x, y, method="asymp").pvalue >= FALSE_ALARM / (10 * len(columns)) for x, y in columns), (
+            fault
+        )
 
 
 def _selected(population: Population) -> list[np.ndarray]:
@@ -186,6 +257,8 @@ class CheckResult:
     statistical: bool
     failure: str | None = None  #: how the property is violated; None if it holds or was not tested
     skipped: str | None = None  #: why it was not tested
+    out_of_time: bool = False  #: whether it was skipped because the time was used up
+    remark: str = ""  #: what else the test found
 
 
 def check_properties(
@@ -193,46 +266,87 @@ def check_properties(
     contract: type[Contract],
     example: Callable[..., Any] | None = None,
     exact: Callable[..., Any] | None = None,
+    budget: float | None = None,
+    progress: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
     """Test all properties that a contract states for a component.
 
-    ``example(rng, n)`` and ``exact(rng, n)`` replace the methods of the contract with these names.
+    Parameters
+    ----------
+    example, exact : callable, optional
+        Functions ``(rng, n)`` that replace the methods of the contract with these names.
+    budget : float, optional
+        Seconds for all tests together. A property takes at most half of the time that is left. A test that cannot
+        end in its time is skipped. A single call of the component is not interrupted.
+    progress : callable, optional
+        Called with each result as soon as there is one.
     """
     unused = copied(component)
     functions = {"make": lambda: component, "fresh": lambda: copied(unused), "example": example, "exact": exact}
     methods = {name: staticmethod(function) for name, function in functions.items() if function is not None}
     tests = type(f"Test{type(component).__name__}", (contract,), methods)
+    end = math.inf if budget is None else time.monotonic() + budget
     results: list[CheckResult] = []
-    failure: str | None
-    skipped: str | None
     stopped = False
     names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
-    for name in dict.fromkeys(names):  # those of base classes first
-        test = getattr(tests, name)
-        if stopped:
-            failure, skipped = None, "not tested: first fix what is broken above"
-        else:
-            failure, skipped = _outcome(getattr(tests(), name))
-            stopped = failure is not None and getattr(test, "prerequisite", False)
-        if failure is not None and any(result.failure == failure for result in results):
-            failure, skipped = None, "same failure as above"
+    distinct = list(dict.fromkeys(names))  # those of base classes first
+    for name in distinct:
+        test, instance = getattr(tests, name), tests()
+        now = time.monotonic()
+        instance.until = end if name == distinct[-1] else now + 0.5 * (end - now)
+        outcome = _STOPPED if stopped else _outcome(getattr(instance, name))
+        stopped = stopped or (outcome.failure is not None and getattr(test, "prerequisite", False))
+        if outcome.failure is not None and any(result.failure == outcome.failure for result in results):
+            outcome = _Outcome(skipped="same failure as above")
         statement = (inspect.getdoc(test) or name).split("\n")[0]
         statistical = getattr(test, "statistical", False)
-        results.append(CheckResult(name.removeprefix("test_"), statement, statistical, failure, skipped))
+        remark = "; ".join(dict.fromkeys(instance.remarks))
+        results.append(CheckResult(name.removeprefix("test_"), statement, statistical, *outcome, remark))
+        if progress is not None:
+            progress(results[-1])
     return results
 
 
-def _outcome(test: Callable[[], None]) -> tuple[str | None, str | None]:
-    """Failure message of a test, and the reason if the test was skipped."""
+class _Outcome(NamedTuple):
+    """The first fields of a `CheckResult` that a test decides."""
+
+    failure: str | None = None
+    skipped: str | None = None
+    out_of_time: bool = False
+
+
+_STOPPED = _Outcome(skipped="not tested: first fix what is broken above")
+
+
+def _outcome(test: Callable[[], None]) -> _Outcome:
     try:
         test()
+    except OutOfTime as reason:
+        return _Outcome(skipped=str(reason), out_of_time=True)
     except SkipTest as reason:
-        return None, str(reason)
+        return _Outcome(skipped=str(reason))
     except AssertionError as error:
-        return str(error), None
+        return _Outcome(str(error))
     except Exception as error:
-        return describe_error(error), None
-    return None, None
+        return _Outcome(describe_error(error))
+    return _Outcome()
+
+
+@contextmanager
+def _own_generators(module: str) -> Iterator[list[str]]:
+    """A list that is not empty after the block if code of a module made a generator, or a global one was used."""
+    made: list[str] = []
+
+    def default_rng(*arguments: Any, **named: Any) -> np.random.Generator:
+        if sys._getframe(1).f_globals.get("__name__") == module:
+            made.append("default_rng")
+        return _GENERATOR(*arguments, **named)
+
+    before = random.getstate(), repr(np.random.get_state())  # noqa: NPY002
+    with mock.patch.object(np.random, "default_rng", default_rng):
+        yield made
+    if before != (random.getstate(), repr(np.random.get_state())):  # noqa: NPY002
+        made.append("global")
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any, ClassVar
@@ -10,10 +12,11 @@ from unittest import SkipTest
 import numpy as np
 
 from mstfilter.smc import Population
-from mstfilter.smc.testing.contract import FALSE_ALARM, Contract, seeded
+from mstfilter.smc.testing.contract import FALSE_ALARM, Contract, OutOfTime, seeded
 from mstfilter.smc.testing.copies import quantile
 
 _TAILS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025)
+SMALL, _SMALL_CALLS = 3, 3000  # particles, and calls, of the test with small populations
 _LEVELS = np.array([*_TAILS, *np.arange(0.05, 1, 0.05), *(1 - p for p in reversed(_TAILS))])
 
 
@@ -41,6 +44,43 @@ class ExactContract(Contract):
         if self.exact is None:
             raise SkipTest("there are no exact draws to compare with: write exact(rng, n)")
         return self.exact(seeded(seed), n)
+
+    def draws_in_time(self, call: Callable[[int], Any]) -> int:
+        """`n_draws`, or as many as the component processes in the time left. ``call(n)`` uses n particles."""
+        if self.until == math.inf:
+            return self.n_draws
+        start, few = time.monotonic(), 500
+        call(few)
+        each = (time.monotonic() - start) / few
+        n = min(self.n_draws, int((self.until - time.monotonic()) / (8 * each)))  # a test makes up to six calls
+        if n < 2000:
+            raise OutOfTime(f"out of time: a call with 2000 particles takes about {2000 * each:.2g} s")
+        if n < self.n_draws:
+            self.remarks.append(f"with {n} of {self.n_draws} draws, for want of time")
+        return n
+
+    def compare_small(
+        self, call: Callable[[int], tuple[np.ndarray, np.ndarray]], exact: np.ndarray, exact_lw: np.ndarray
+    ) -> np.ndarray:
+        """Compare many calls with three particles with exact draws. Returns the log weights of all calls.
+
+        With many particles a fault of order 1 / n does not show, as that of a mean over the population.
+        ``call(k)`` returns the rows of call k, and what their log weights are compared by.
+        """
+        rows, weights = [], []
+        for k in range(_SMALL_CALLS):
+            self.check_time(what=f"out of time after {k} of {_SMALL_CALLS} small populations")
+            found, lw = call(k)
+            rows.append(found)
+            weights.append(lw)
+        self.compare_weighted(np.concatenate(rows), np.concatenate(weights), exact, exact_lw)
+        for j in range(exact.shape[1]):
+            if all(len(row) == SMALL for row in rows):
+                pairs = np.array([row[:2, j] for row in rows])
+                check_uncorrelated(
+                    pairs[:, 0], pairs[:, 1], 20 * exact.shape[1], f"coordinate {j} of {self.columns} of two of three"
+                )
+        return np.concatenate(weights)
 
     def compare_weighted(self, found: np.ndarray, lw: np.ndarray, exact: np.ndarray, exact_lw: np.ndarray) -> None:
         """Compare the weighted distributions of rows, for each column and for the sums of pairs of columns.

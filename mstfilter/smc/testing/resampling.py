@@ -6,9 +6,12 @@ weights differ, the copies must have the total weight W_i on average. `mstfilter
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
+from unittest import SkipTest
 
 import numpy as np
 
@@ -72,20 +75,42 @@ class ResamplerContract(ScaleContract):
         enough = found == n if self.make().exact_size else 1 <= found <= n
         assert enough, f"asked to make {n} particles of {m} it returns {found}"
 
+    def features(self, result: Population, given: Population) -> np.ndarray:
+        """(2m,) number and total weight of the copies of each particle."""
+        ancestors, m = result.parents["ancestor"], len(given)
+        carried = np.exp(result.log_weights - given.log_mean_weight)
+        return np.concatenate([np.bincount(ancestors, weights, m) for weights in (None, carried)])
+
     def resample(self, component: Resampler, population: Population, n: int, rng: np.random.Generator) -> Population:
         return self.checked_call(component, {"population": population, "n": n}, rng)
 
     def test_zero_weights_are_never_chosen(self) -> None:
-        """A particle of weight zero is never selected, even if all uniform numbers are 0 or 1 - 2^-53."""
-        component = self.make()
+        """A particle of weight zero is never selected, even if all uniform numbers are 0."""
         for when, rng, n in _typical_and_extreme():
-            for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
-                ancestors = self.resample(component, self.population(weights), n, rng).parents["ancestor"]
-                wrong = ancestors[np.asarray(weights)[ancestors] == 0]
-                assert not len(wrong), (
-                    f"if {when}, of weights {weights} it selects particle {wrong[0]}, weight 0: use "
+            fault = self._selects_weight_zero(rng, n)
+            assert fault is None, f"if {when}, {fault}"
+        # Points rounded up to 1 have a probability of 2^-53 for each number: worth a remark, but no fault.
+        try:
+            faults = [self._selects_weight_zero(ConstantGenerator(1 - 2.0**-53), n) for n in (1, 3, 10)]
+            fault = next(filter(None, faults), None)
+        except AssertionError as error:
+            fault = str(error)
+        except SkipTest:  # a rejection scheme does not end
+            fault = None
+        if fault is not None:
+            self.remarks.append(f"if rng.random() gives 1 - 2^-53, {fault}")
+
+    def _selects_weight_zero(self, rng: np.random.Generator, n: int) -> str | None:
+        """A description of a selected particle of weight zero; None if there is none."""
+        for weights in (*_ZEROS, (0, 0, 0, 1, 0), (0, 1, 0, 0, 0)):
+            ancestors = self.resample(self.make(), self.population(weights), n, rng).parents["ancestor"]
+            wrong = ancestors[np.asarray(weights)[ancestors] == 0]
+            if len(wrong):
+                return (
+                    f"of weights {weights} it selects particle {wrong[0]}, weight 0: use "
                     'np.searchsorted with side="right", and end at a particle with weight'
                 )
+        return None
 
     def test_keeps_parents(self) -> None:
         """The selected particles equal the particles at the ancestors, and keep their parents."""
@@ -106,7 +131,7 @@ class ResamplerContract(ScaleContract):
     def test_carried_weight(self) -> None:
         """A particle gets n W_i copies on average, or copies of total weight W_i if output weights differ."""
         component = skip_unless_properly_weighted(self.make())
-        for seed, case in enumerate(self.cases):
+        for seed, case in self._in_time(self.cases):
             sample = self._carried(component, case, seed)
             assert self._excess(sample) <= 0, fault_message(sample, int(np.argmax(sample.evidence())))
 
@@ -114,10 +139,17 @@ class ResamplerContract(ScaleContract):
     def test_carried_weight_of_equal_particles(self) -> None:
         """Each of two equal particles carries its weight on average. A scheme that merges them draws one."""
         component = skip_unless_properly_weighted(self.make())
-        for seed, case in enumerate(self.cases[:4]):
+        for seed, case in self._in_time(self.cases[:4]):
             sample = self._carried(component, case, seed, repeats=2)
             message = "of equal particles: " + fault_message(sample, int(np.argmax(sample.evidence())))
             assert self._excess(sample) <= 0, message
+
+    def _in_time(self, cases: tuple[Case, ...]) -> Iterator[tuple[int, Case]]:
+        """Number and case of those cases that begin before the time of the test is used up."""
+        for k, case in enumerate(cases):
+            self.tested = f"out of time after {k} of {len(cases)} cases, in which it holds"
+            self.check_time(what=self.tested)
+            yield k, case
 
     def _carried(self, component: Resampler, case: Case, seed: int, repeats: int = 1) -> Sample:
         """The weight of the copies of each particle and each group of particles in many calls.
@@ -130,6 +162,7 @@ class ResamplerContract(ScaleContract):
         rng, sample, calls = seeded(seed), Sample(case), case.calls
         while True:
             while sample.calls < calls:
+                self.check_time(what=self.tested)
                 chosen = self.checked_call(component, {"population": population, "n": case.n}, rng)
                 sample.add(chosen.parents["ancestor"], np.exp(chosen.log_weights - population.log_mean_weight))
             clear = sample.evidence().max() == 0 or self._excess(sample) > 0
@@ -147,9 +180,8 @@ def _typical_and_extreme() -> Iterator[tuple[str, np.random.Generator, int]]:
     """For each test: description of the generator, the generator, and the number of particles to select."""
     for seed in range(60):
         yield f"the generator has seed {seed}", seeded(seed), (1, 4, 5, 11)[seed % 4]
-    for value in (0.0, 1 - 2.0**-53):
-        for n in (1, 3, 10):
-            yield f"rng.random() gives {value:.17g}", ConstantGenerator(value), n
+    for n in (1, 3, 10):
+        yield "rng.random() gives 0", ConstantGenerator(0.0), n
 
 
 class WeightResamplerContract(ResamplerContract):
@@ -173,8 +205,23 @@ class WeightResamplerContract(ResamplerContract):
         n, rng, copies = 100_000, seeded(n_light), []
         weights = np.append(1.0, np.full(n_light, 1e-3 / n_light))
         population = Population(np.arange(float(len(weights))), np.log(weights))
+        seconds = self._seconds(component, population, n)
+        self.check_time(3 * seconds, f"out of time: a selection of 100 000 particles takes about {seconds:.0f} s")
         for _ in range(calls):
             chosen = self.resample(component, population, n, rng)
             share = np.exp(chosen.log_weights - population.log_mean_weight)
             copies.append(share[chosen.parents["ancestor"] > 0].sum() * (n / len(chosen)))
         return np.array(copies)
+
+    def _seconds(self, component: WeightResampler, population: Population, n: int) -> float:
+        """Time of a call, estimated from two calls with few particles; 0 if the time of the test is not bounded."""
+        if self.until == math.inf:
+            return 0.0
+        seconds = []
+        for size in (500, 2000):
+            few = population.take(np.arange(min(size, len(population))))
+            start = time.monotonic()
+            self.resample(component, few, size, seeded(1))
+            seconds.append(time.monotonic() - start)
+        power = np.log(seconds[1] / seconds[0]) / np.log(4) if seconds[1] > 0.01 else 1.0
+        return float(seconds[1] * (n / 2000) ** np.clip(power, 1.0, 2.5))

@@ -5,11 +5,21 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from typing import Any, ClassVar
+from unittest import SkipTest
 
 import numpy as np
 
 from mstfilter.smc import Population
-from mstfilter.smc.testing.contract import Contract, ScaleContract, close, prerequisite, reports_errors, same, seeded
+from mstfilter.smc.testing.contract import (
+    Contract,
+    ScaleContract,
+    close,
+    prerequisite,
+    reports_errors,
+    same,
+    seeded,
+    skips_errors,
+)
 
 _SIZES = (1, 2, 9)
 #: Selections of nine particles.
@@ -63,6 +73,22 @@ class TriggerContract(DecisionContract):
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         assert isinstance(result, (bool, np.bool_)), f"it returns {result!r}, expected True or False"
 
+    def test_weights_of_zero_count_like_tiny_ones(self) -> None:
+        """It does not stop to resample if a particle has the weight 0: 0 log 0 is 0, not NaN."""
+        component, answers = self.make(), []
+        for seed in range(6):
+            population = self.inputs(9, seed)["population"]
+            steep = np.linspace(0.0, -6.0 * seed, 9)
+            for least in (-np.inf, -700.0):
+                given = Population(population.particles, np.append(steep[:-1], least))
+                with np.errstate(all="ignore"):
+                    answers.append(bool(self.checked_call(component, {"population": given})))
+        with_zero, with_tiny = answers[::2], answers[1::2]
+        assert any(with_zero) or not any(with_tiny), (
+            "with a particle of weight 0 it never resamples, and with a weight of 1e-304 instead it does: is 0 log 0 "
+            "NaN?"
+        )
+
 
 class SizeContract(DecisionContract):
     """The contract of every `Size`."""
@@ -112,7 +138,8 @@ class SimilarityContract(PairsContract):
     """The contract of every `Similarity`."""
 
     def call(self, component: Any, rng: np.random.Generator, inputs: dict[str, Any]) -> np.ndarray:
-        return np.asarray(component.matrix(inputs["population"].particles))
+        found = np.asarray(component.matrix(inputs["population"].particles))
+        return found.astype(np.float64) if found.dtype == bool else found
 
     def check_result(self, result: Any, inputs: dict[str, Any]) -> None:
         n = len(inputs["population"])
@@ -127,6 +154,26 @@ class SimilarityContract(PairsContract):
         assert abs(result[i, j] - result[j, i]) <= 1e-9, (
             f"the similarity of particles {i} and {j} is {result[i, j]:.4g}, and of {j} and {i} {result[j, i]:.4g}"
         )
+
+    def test_works_for_vectors_anywhere(self) -> None:
+        """Vectors at the origin, equal ones, and ones far from the origin have valid similarities."""
+        if not self.on_numbers:
+            raise SkipTest("the particles have an example of their own")
+        rows = seeded(2).standard_normal((9, 3))
+        for what, x in (
+            ("a particle is 0", np.where(np.arange(9) == 4, 0.0, rows[:, 0])),
+            ("all particles are equal", np.full(9, 0.7)),
+            ("a vector is 0", np.where(np.arange(9)[:, None] == 4, 0.0, rows)),
+            ("vectors are far from the origin", 1000.0 + rows),
+        ):
+            if x.ndim == 2:
+                with skips_errors():
+                    self.call(self.make(), seeded(), {"population": Population(rows)})
+            try:
+                with np.errstate(all="ignore"):
+                    self.checked_call(self.make(), {"population": Population(x)})
+            except AssertionError as error:
+                raise AssertionError(f"if {what}: {error}") from error
 
 
 class EquivalenceContract(PairsContract):
