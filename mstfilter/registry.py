@@ -352,6 +352,17 @@ def _from_file(path: str, attribute: str) -> type:
     return found
 
 
+def load_attribute(location: str) -> Any:
+    """What a Python file of the user holds under a name: ``./file.py:name``."""
+    path, _, name = location.partition(":")
+    if not Path(path).is_file():
+        raise InputError(f"file does not exist: {path}")
+    module = load_file(path)
+    if not hasattr(module, name):
+        raise InputError(f"{path} has no {name!r}", *suggestion(name, vars(module)))
+    return getattr(module, name)
+
+
 def load_file(path: str | Path) -> ModuleType:
     """The module made by executing a Python file of the user.
 

@@ -26,20 +26,27 @@ def list_(
 
 @app.command()
 def check(
-    component: Annotated[str, typer.Argument(help="./file.py:Class, or KIND.NAME such as resampler.systematic.")],
+    component: Annotated[
+        str, typer.Argument(help="./file.py:Class, ./file.py:model, or KIND.NAME such as resampler.systematic.")
+    ],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[FIELD=VALUE]...", help="Values of fields.")
     ] = None,
     budget: Annotated[
         float, typer.Option(min=1, metavar="SECONDS", help="Time for all properties. The rest is not tested.")
     ] = 120,
+    observations: Annotated[
+        str, typer.Option(metavar="FILE.npy|./FILE.py:NAME", help="Of a model. Default: drawn from the model.")
+    ] = "",
 ) -> None:
-    """Test whether a component keeps the contract of its interface."""
+    """Test whether a component keeps the contract of its interface, or whether a model is one for a filter."""
     from mstfilter.smc.testing import FALSE_ALARM, CheckResult
-    from mstfilter.testing import check_of, run_contract
+    from mstfilter.testing import check_of, is_model, run_contract
 
     subject = _subject(component, overrides or [])
-    name = type(subject).__name__
+    name = component if is_model(subject) else type(subject).__name__
+    if observations and not is_model(subject):
+        raise InputError(f"observations are given, and {component} is no model", "leave --observations out")
     print(f"{'input':<9}{check_of(subject).input}", flush=True)
 
     def show(result: CheckResult) -> None:
@@ -49,7 +56,8 @@ def check(
             print(f"{'':<9}  {line}  [{result.name}]")
         sys.stdout.flush()
 
-    results = run_contract(subject, budget=budget, progress=show)
+    ys = _observations(observations) if observations else None
+    results = run_contract(subject, budget=budget, progress=show, observations=ys)
     statistical = sum(result.statistical and not result.skipped for result in results)
     if statistical:
         print(f"{statistical} of these are statistical, each with a false-alarm rate of at most {FALSE_ALARM:.0e}")
@@ -66,9 +74,15 @@ def check(
 
 
 def _subject(name: str, overrides: list[str]) -> Any:
-    """What `check` tests: the component with the given fields. This is the place for other kinds of subjects."""
+    """What `check` tests: the component with the given fields, or the model of a file."""
     from mstfilter.presets import REGISTRY, settings
+    from mstfilter.registry import load_attribute
+    from mstfilter.testing import is_model
 
+    if ".py:" in name and is_model(found := load_attribute(name)):
+        if overrides:
+            raise InputError(f"{name} is a model, which has no fields to set: {overrides[0]}")
+        return found
     kind, _, known = ("", "", name) if ".py:" in name else name.partition(".")
     if ".py:" not in name and kind not in REGISTRY.kinds:
         raise InputError(f"{name!r} is no component", "give ./file.py:Class, or KIND.NAME as `mstfilter list` shows")
@@ -81,6 +95,23 @@ def _subject(name: str, overrides: list[str]) -> Any:
                 f"{cls.__name__} cannot be made without arguments: {error}", "give its fields defaults"
             ) from error
     return REGISTRY.make(cls, settings(overrides), allow_files=True)
+
+
+def _observations(name: str) -> list[Any]:
+    """The observations of a run, from an .npy file or a sequence in a Python file."""
+    from mstfilter.registry import load_attribute
+    from mstfilter.smc.inputs import check_observations
+
+    if ".py:" in name:
+        return list(check_observations(load_attribute(name)))
+    import numpy as np
+
+    try:
+        return list(check_observations(np.load(name, allow_pickle=False)))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"observations {name}: {error}", "np.save writes an array with one row for each step"
+        ) from error
 
 
 @app.command()

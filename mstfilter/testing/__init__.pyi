@@ -2,6 +2,7 @@ from mstfilter.resources import starter_kinds as starter_kinds, write_starter as
 from mstfilter.testing.checking import (
     check_of as check_of,
     contract_of as contract_of,
+    is_model as is_model,
     run_contract as run_contract,
 )
 from mstfilter.testing.hypotheses import (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 import mstfilter.smc.testing as numbers
 from mstfilter.errors import InputError
 from mstfilter.scene import Hypothesis
-from mstfilter.smc import Population
+from mstfilter.smc import ParticleFilter, Population, Program, StateSpaceModel
 from mstfilter.smc.testing.contract import CheckResult, Contract, check_properties, seeded
 from mstfilter.testing import hypotheses, stages
 from mstfilter.testing.scenes import scene_example
@@ -57,6 +59,8 @@ def check_of(component: Any, example: Callable[..., Any] | None = None) -> Check
     ``example(rng, n)`` is the given function, or the function ``example`` in the module of the component's class.
     Without one, stages of MST and components that work on hypotheses get a scene; others get numbers or vectors.
     """
+    if is_model(component):
+        return Check(numbers.ModelContract, None, "a run of a filter with 200 particles")
     cls = type(component)
     contract = contract_of(cls)
     example = example or _function_beside(cls, "example")
@@ -77,6 +81,11 @@ def check_of(component: Any, example: Callable[..., Any] | None = None) -> Check
     if numbers_work is None or not _knows_scenes(cls):
         return Check(contract, None, f"{_NUMBERS}; for others write example(rng, n) beside the class")
     return Check(_for(contract, True), scene_example, _SCENES)
+
+
+def is_model(component: Any) -> bool:
+    """Whether a component is a model: a `StateSpaceModel`, a `Program`, its function, or a filter made of one."""
+    return isinstance(component, StateSpaceModel | Program | ParticleFilter | FunctionType | functools.partial)
 
 
 _NUMBERS = "numbers (n,)"
@@ -134,8 +143,9 @@ def run_contract(
     exact: Callable[..., Any] | None = None,
     budget: float | None = None,
     progress: Callable[[CheckResult], None] | None = None,
+    observations: Sequence[Any] | None = None,
 ) -> list[CheckResult]:
-    """Test all properties of a component whose interface has a contract.
+    """Test all properties of a component whose interface has a contract, or of a model.
 
     ``example(rng, n)`` returns a population and an observation that the component can process. The default is the
     function ``example`` in the module of the component's class. Without such a function, components that use images
@@ -145,9 +155,13 @@ def run_contract(
     observation, as the contract describes. The default is the function ``exact`` in the module of the class, if any.
 
     With a `budget` in seconds, properties that cannot be tested in time are skipped, and `CheckResult.out_of_time`
-    says so. `progress` is called with each result as soon as there is one.
+    says so. `progress` is called with each result as soon as there is one. `observations` are those of a run of a
+    model; without them they are drawn from the model, if it can be simulated.
     """
     check = check_of(component, example)
+    if is_model(component):
+        contract = type("ModelContract", (numbers.ModelContract,), {"observations": observations})
+        return check_properties(component, contract, budget=budget, progress=progress)
     exact = exact or _function_beside(type(component), "exact")
     return check_properties(component, check.contract, check.example, exact, budget, progress)
 

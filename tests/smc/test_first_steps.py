@@ -296,7 +296,7 @@ def test_check_finds_nothing_in_a_right_model(name):
 def test_check_draws_observations_from_the_model_or_asks_for_them():
     assert all(result.failure is None for result in check_properties(of(), ModelContract))
     (first, *_) = check_properties(by_functions(), ModelContract)
-    assert "no sample_observation" in first.failure
+    assert "no sample_observation" in first.failure and "--observations" in first.failure
 
 
 WRONG_DENSITIES = {

@@ -82,6 +82,7 @@ class ModelContract(ExactContract):
             for t, (given, (state, _)) in enumerate(
                 zip(self.data(), filter.iterate(self.data(), _SEED), strict=False)
             ):
+                self.check_time()
                 y, u = split_input(given)
                 stream = Key(_SEED).child("transition" if t else "initial", t)  # as the filter made it
                 after = state.population
@@ -281,7 +282,7 @@ def _check_integral(w: np.ndarray, fault: str) -> None:
 def simulated(filter: ParticleFilter, n_steps: int, seed: int = 0) -> list[Any]:
     """Observations drawn from the model of a filter: those of the first of two particles."""
     rng, previous, ys = seeded(seed), None, []
-    hint = "give observations: mstfilter check ./model.py:model --observations ./model.py:ys"
+    hint = "give observations (mstfilter check ./model.py:model --observations ./model.py:ys)"
     for t in range(n_steps):
         at = filter.at_step(t, None)
         component: Any = at.initial if previous is None else at.transition
@@ -290,16 +291,16 @@ def simulated(filter: ParticleFilter, n_steps: int, seed: int = 0) -> list[Any]:
             try:
                 run = run_once(component.model, handler, previous, None, 2)
             except Exception as error:
-                raise InputError(f"the program cannot be simulated: {error}", hint) from error
+                raise InputError(f"the program cannot be simulated: {hint}; {error}") from error
             if len(handler.observed) != 1:
                 names = sorted(handler.observed) or "nothing"
-                raise InputError(f"the program observes {names} if it is simulated, expected one name", hint)
+                raise InputError(f"the program observes {names} if it is simulated, expected one name: {hint}")
             previous = {**run.values, **run.returned}
             (y, *_) = next(iter(handler.observed.values()))
         else:
             model = component.model
             if model.sample_observation is None:
-                raise InputError("the model cannot be simulated: it has no sample_observation", hint)
+                raise InputError(f"the model has no sample_observation to draw observations: {hint}")
             previous = model.sample_initial(rng, 2) if t == 0 else model.sample_transition(rng, previous)
             y = np.asarray(model.sample_observation(rng, previous))[0]
         ys.append(y.item() if np.ndim(y) == 0 else y)
