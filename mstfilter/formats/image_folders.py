@@ -97,6 +97,7 @@ def _objects(frame: Frame, labels: np.ndarray | None) -> np.ndarray | None:
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_ALIGNED = re.compile(r"depth.*(align|regist|(to|2)_?(colou?r|rgb))|(align|regist).*depth")
 _STILL = "remove the file if the camera stands still"
 _POLL_S = 0.02
 _WRITTEN_S = 0.3  # age of the last files after which they are complete
@@ -188,6 +189,8 @@ class Redwood(VideoFormat):
     def _files(self, path: Path, known: Collection[str] = ()) -> tuple[list[Path], list[Path]]:
         """Files of colour images and of depth images, except files with names in `known`."""
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
+        if not known:
+            _check_aligned(path, {"depth"}, "rename depth/ to raw/, and {name}/ to depth/")
         return _images(folder, _SUFFIXES, known), _images(path / "depth", _DEPTH_SUFFIXES, known)
 
     def _rate(self, file: Path | None, stored: dict[str, Any]) -> float:
@@ -230,6 +233,15 @@ def _check_masks(path: Path, colour: Iterable[Path]) -> None:
     if other := sorted({*path.glob("robot/[!.]*")} - {_mask(path, file) for file in colour}):
         text = f"{path / 'robot'}: {len(other)} masks of no colour image are not read, for example {other[0].name}"
         warn_user(text, "name a robot mask as its colour image: robot/000000.png for rgb/000000.jpg")
+
+
+def _check_aligned(path: Path, used: Collection[str], hint: str) -> None:
+    """Raise InputError if a folder beside the `used` folders of depth images is named as one of aligned depth."""
+    folders = sorted(p.name for p in path.iterdir() if p.is_dir()) if path.is_dir() else []
+    aligned = [name for name in folders if _ALIGNED.search(name.lower())]
+    if aligned and not set(aligned) & set(used):
+        text = f"{path}: {', '.join(sorted(used))}/ would be read, but {aligned[0]}/ is there: depth must be aligned"
+        raise InputError(text, hint.format(name=aligned[0]), f"or, if they are no depth images: rename {aligned[0]}/")
 
 
 def is_recording(path: Path) -> bool:
@@ -421,6 +433,8 @@ class Tum(VideoFormat):
         outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
         if outside:
             raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
+        used = {(*Path(row[1]).parent.parts, ".")[0] for row in depth}
+        _check_aligned(path, used, "name the files of {name}/ in depth.txt")
         stamps = [[_stamp(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
         times = tuple(stamps[0][i] for i, _ in pairs)

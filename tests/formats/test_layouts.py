@@ -516,3 +516,21 @@ def test_numbers_are_not_paired_with_seconds(tmp_path):
     )
     with pytest.raises(InputError, match="does not fit depth image"):
         Redwood(world=WORLD).open(path)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("name", ["aligned_depth", "depth_aligned", "depth_registered", "aligned_depth_to_color"])
+def test_raw_depth_is_not_read_beside_aligned_depth(tmp_path, layout, name):
+    """Renamed, or named in depth.txt, the aligned depth is read."""
+    path = WRITERS[layout](tmp_path / "data")
+    shutil.copytree(path / "depth", path / name)
+    reader = Tum(K=K, world=WORLD) if layout == "tum" else Redwood(fps=FPS, world=WORLD)
+    with pytest.raises(InputError, match=f"depth/ would be read, but {name}/ is there") as caught:
+        reader.open(path)
+    assert name in caught.value.hints[0]
+    if layout == "tum":
+        (path / "depth.txt").write_text((path / "depth.txt").read_text().replace("depth/", f"{name}/"))
+    else:
+        (path / "depth").rename(path / "raw")
+        (path / name).rename(path / "depth")
+    same_frames(reader.open(path), SHIFTS)
