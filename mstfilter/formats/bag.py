@@ -184,8 +184,7 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
         metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
     elif encoding == "32FC1":
         metres = _pixels(message, np.dtype(np.float32), 1, where)[..., 0].astype(np.float32)
-        if np.any(metres > 0):
-            check_depth(metres, where)
+        check_depth(metres, where)
     else:
         metres = _metres(_pixels(message, np.dtype(np.uint16), 1, where)[..., 0], depth_scale)
     with np.errstate(invalid="ignore"):
