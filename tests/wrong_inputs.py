@@ -10,7 +10,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.formats import open_recording
 from mstfilter.scene import Hypothesis, VoxelGrid, look_at
@@ -102,6 +102,13 @@ def full_of(share):
     return make
 
 
+def turned(degrees):
+    """A pose whose table is tilted."""
+    return changed(
+        T_world_camera=RigidTransform.from_rotation(Rotation.from_rotvec([np.radians(degrees), 0, 0])) * right()[1]
+    )
+
+
 def lowered(metres):
     pose = right()[1]
     return changed(T_world_camera=RigidTransform.from_translation([0, 0, -metres]) * pose)
@@ -112,6 +119,7 @@ WRONG = {
     "the camera moves, without poses": shifted_camera,
     "poses for another number of frames": lambda: changed(T_world_camera=[right()[1]] * 2),
     "inverse pose": lambda: changed(T_world_camera=right()[1].inv()),
+    "table of the pose tilted": lambda: turned(6),
     "table of the pose too low": lambda: lowered(0.06),
     "images upside down, with a pose": lambda: posed(
         rgb=right()[0]["rgb"][:, ::-1, ::-1], depth=right()[0]["depth"][:, ::-1, ::-1]

@@ -4,9 +4,10 @@
 
 The parameters `colour` and `depth` are needed only if several topics are suitable. The camera matrix is K (P for
 rectified images) in the ``camera_info`` topic that belongs to the colour topic. A frame consists of a colour and a
-depth image whose header time stamps are mutually nearest and differ by at most `tolerance_s` seconds. Depth must be
-registered to colour, and both images must have the same size and ``frame_id``. Transforms (tf) are not read. The
-camera is assumed not to move, and its pose is computed from the table.
+depth image whose header time stamps are mutually nearest and differ by at most `tolerance_s` seconds. If a message
+has no stamp, all messages have the times of the log. Depth must be registered to colour, and both images must have
+the same size and ``frame_id``. Transforms (tf) are not read. The camera is assumed not to move, and its pose is
+computed from the table.
 
 Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
 encoding 32FC1 is in metres. Compressed depth is a PNG. In the transport ``compressedDepth``, a header of 12 bytes
@@ -21,13 +22,13 @@ import struct
 import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, missing_library
+from mstfilter.errors import InputError, missing_library, warn_user
 from mstfilter.files import reading
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
 from mstfilter.reading import MAX_TEXT, open_regular
@@ -36,7 +37,10 @@ from mstfilter.scene import check_depth, decode_image
 
 @dataclass(frozen=True)
 class Entry:
-    """Reference to a message: header stamp (s), log time (ns), and index among messages with the same log time."""
+    """Reference to a message: time (s), log time (ns), and index among messages with the same log time.
+
+    The time is the stamp of the header, 0 if the header has none.
+    """
 
     stamp: float
     logged: int
@@ -103,13 +107,13 @@ class BagFile:
         raise InputError(f"bag {self.path} lists messages of {topic} but holds none", "copy it again")
 
     def index(self, topic: str) -> list[Entry]:
-        """Entries of all messages of a topic, in the order of the file. The call reads every message."""
+        """Entries of all messages of a topic, in the order of the log. The call reads every message."""
         entries: list[Entry] = []
         for logged, message in self._messages(topic):
             stamp = message.header.stamp
             seconds = stamp.sec + stamp.nanosec * 1e-9
             ordinal = entries[-1].ordinal + 1 if entries and entries[-1].logged == logged else 0
-            entries.append(Entry(seconds if seconds > 0 else logged * 1e-9, logged, ordinal))
+            entries.append(Entry(max(seconds, 0.0), logged, ordinal))
         return entries
 
     def message(self, topic: str, entry: Entry) -> Any:
@@ -180,8 +184,7 @@ def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) 
         metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
     elif encoding == "32FC1":
         metres = _pixels(message, np.dtype(np.float32), 1, where)[..., 0].astype(np.float32)
-        if np.any(metres > 0):
-            check_depth(metres, where)
+        check_depth(metres, where)
     else:
         metres = _metres(_pixels(message, np.dtype(np.uint16), 1, where)[..., 0], depth_scale)
     with np.errstate(invalid="ignore"):
@@ -229,6 +232,14 @@ def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
 _REGISTERED = "record the aligned depth; or, if it is registered: registered=true"
+#: Topics of the RealSense Viewer, rs-record and pyrealsense2's `enable_record_to_file`, which write unaligned depth.
+_RECORDED_RAW = re.compile(r"/device_\d+/sensor_\d+/\w+/image/data$")
+_ALIGN_RAW = (
+    "align it with Open3D: RSBagReader, open('session.bag') and save_frames('frames'); then convert frames/",
+    "or play the bag with align_depth.enable in ROS and record the aligned depth; or, if it is registered: "
+    "registered=true",
+)
+_ORDER_S = 1.0  # stamps may be this much out of the order of the log: messages wait in queues
 
 
 @dataclass(frozen=True)
@@ -254,8 +265,15 @@ class _Stream:
 
     @property
     def info(self) -> str:
-        """The name of the CameraInfo topic of the images, by the convention of image_transport."""
+        """The name of the CameraInfo topic of the images, by the convention of image_transport or of the recorder."""
+        if self.recorded_raw:
+            return "/".join([*self._parts[:-2], "info", "camera_info"])
         return "/".join([*self._parts[:-1], "camera_info"])
+
+    @property
+    def recorded_raw(self) -> bool:
+        """Whether the images are those of a sensor of a RealSense, not aligned with another sensor."""
+        return _RECORDED_RAW.search(self.name) is not None
 
     @property
     def rectified(self) -> bool:
@@ -277,12 +295,15 @@ class Bag(VideoFormat):
     depth : str
         Depth topic. By default, the only depth topic that is registered to colour is used.
     registered : bool
-        Treat depth as registered to colour even if its frame_id or camera matrix differs.
+        Treat depth as registered to colour even if its topic, frame_id or camera matrix says that it is not.
+    log_times : bool
+        Use the times at which the messages were logged, not the stamps of their headers.
     """
 
     colour: str = ""
     depth: str = ""
     registered: bool = False
+    log_times: bool = False
 
     @classmethod
     def detects(cls, path: Path) -> bool:
@@ -300,7 +321,7 @@ class Bag(VideoFormat):
         colour = _choose(path, "colour", self.colour, pictures, streams)
         depth = self._depth(path, colour, streams)
         K, distortion = self._intrinsics(bag, colour, depth)
-        entries = [bag.index(s.name) for s in (colour, depth)]
+        entries = self._entries(bag, colour.name, depth.name)
         stamps = [[e.stamp for e in listed] for listed in entries]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, f"{path}: {colour.name}")
 
@@ -325,10 +346,28 @@ class Bag(VideoFormat):
             distortion=distortion,
         )
 
+    def _entries(self, bag: BagFile, *topics: str) -> list[list[Entry]]:
+        """The entries of each topic, with the stamps of the headers as times for all messages or for none."""
+        listed = [bag.index(topic) for topic in topics]
+        logged = [[replace(entry, stamp=entry.logged * 1e-9) for entry in entries] for entries in listed]
+        if self.log_times:
+            return logged
+        for topic, entries in zip(topics, listed, strict=True):
+            _check_order(bag.path, topic, entries)
+        missing = [_without_stamp(entries) for entries in listed]
+        for topic, entries, n in zip(topics, listed, missing, strict=True):
+            if 0 < n < len(entries):
+                text = f"{bag.path}: {n} of {len(entries)} messages of {topic} have no time stamp in their headers"
+                warn_user(f"{text}: the times of the log are used for all images")
+        return logged if any(missing) else listed
+
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
         found = [s for s in streams if s.encoding in _DEPTH]
         fitting = [s for s in found if s.size == colour.size and (self.registered or s.frame_id == colour.frame_id)]
         depth = _choose(path, "depth", self.depth, fitting if fitting and not self.depth else found, streams)
+        if depth.recorded_raw and not (self.registered and depth.size == colour.size):
+            text = f"{path}: depth {depth} was recorded as the sensor gives it: it is not registered to colour"
+            raise InputError(text, *_ALIGN_RAW)
         if depth.size != colour.size:
             text = f"{path}: depth {depth} and colour {colour} differ in size: depth is not registered to colour"
             drivers = "RealSense: align_depth.enable, Azure Kinect: depth_to_rgb, Kinect: depth_registered"
@@ -343,30 +382,64 @@ class Bag(VideoFormat):
     ) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """fx, fy, cx, cy and the distortion of the colour image."""
         infos, name = bag.topics(_INFO), colour.info
-        if self.K:
-            distortion = self.distortion
-            if name in infos and not distortion:
-                with contextlib.suppress(InputError):
-                    distortion = _camera_info(bag, name, colour.rectified)[1]
-            return self.K, distortion
-        if name not in infos:
+
+        def stored(stream: _Stream) -> _Info | None:
+            try:
+                return _camera_info(bag, stream.info, stream.rectified) if stream.info in infos else None
+            except InputError:
+                if self.K:
+                    return None
+                raise
+
+        own = stored(colour)
+        if own is None:
+            if self.K:
+                return self.K, self.distortion
             raise InputError(
                 f"{bag.path}: intrinsics are missing, there is no {name} for {colour.name}",
                 "give them: K=fx,fy,cx,cy, and distortion=k1,k2,p1,p2,k3 if the images are distorted",
             )
-        matrix, distortion, size = _camera_info(bag, name, colour.rectified)
-        if size[0] and size != colour.size:
+        matrix, distortion, size = own
+        if not self.K and size[0] and size != colour.size:
             raise InputError(
                 f"{bag.path}: {name} is of images of {size[0]} x {size[1]}, {colour} is not",
                 "give the matrix of these images: K=fx,fy,cx,cy",
             )
-        other = depth.info
-        if not self.registered and other in infos and other != name:
-            of_depth, _, size = _camera_info(bag, other, depth.rectified)
-            if size[0] and not np.allclose(of_depth, matrix, atol=1.0):
-                text = f"{bag.path}: camera matrices of {name} and {other} differ: depth is not registered to colour"
-                raise InputError(text, _REGISTERED)
-        return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), self.distortion or distortion
+        other = None if self.registered or depth.info == name else stored(depth)
+        if other is not None and other[2][0] and not np.allclose(other[0], matrix, atol=1.0):
+            text = f"{bag.path}: camera matrices of {name} and {depth.info} differ: depth is not registered to colour"
+            raise InputError(text, _REGISTERED)
+        return self.K or (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), self.distortion or distortion
+
+
+def _check_order(path: Path, topic: str, entries: list[Entry]) -> None:
+    """Raise InputError if a stamp of a topic is more than a second earlier than one that was logged before."""
+    latest, at = 0.0, 0
+    for k, entry in enumerate(entries):
+        if 0 < entry.stamp < latest - _ORDER_S:
+            text = (
+                f"{path}: the stamp of message {k} of {topic} is {latest - entry.stamp:.1f} s earlier than that of "
+            )
+            text += f"message {at}, which was logged before: the clock was changed, or the bag has two recordings"
+            raise InputError(
+                text, "cut the bag there; or use the times at which messages were logged: log_times=true"
+            )
+        if entry.stamp > latest:
+            latest, at = entry.stamp, k
+
+
+def _without_stamp(entries: list[Entry]) -> int:
+    """How many messages of a topic have the stamp 0 although 0 is not their time.
+
+    Simulated time may start at 0. Then the first messages alone have this stamp, and the next ones follow as in the
+    log, if the simulation is at most ten times as fast as the clock of the log.
+    """
+    n = sum(entry.stamp == 0 for entry in entries)
+    first = next((k for k, entry in enumerate(entries) if entry.stamp > 0), 0)
+    if n != first or n == 0:
+        return n
+    gap = (entries[first].logged - entries[first - 1].logged) * 1e-9
+    return 0 if entries[first].stamp <= 10 * gap + _ORDER_S else n
 
 
 def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:
@@ -402,7 +475,10 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
     return candidates[0]
 
 
-def _camera_info(bag: BagFile, name: str, rectified: bool) -> tuple[np.ndarray, tuple[float, ...], tuple[int, int]]:
+_Info = tuple[np.ndarray, tuple[float, ...], tuple[int, int]]
+
+
+def _camera_info(bag: BagFile, name: str, rectified: bool) -> _Info:
     """Camera matrix (3, 3), distortion, and width and height of the images."""
     message = bag.first(name)
     D, K, P = (message.d, message.k, message.p) if bag.is_ros2 else (message.D, message.K, message.P)

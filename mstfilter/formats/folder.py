@@ -6,8 +6,9 @@
 >>> save_recording(recording, "recordings/copy")
 
 The page "File formats" of the documentation describes the files. If camera.json has no pose, the support plane at the
-first pause defines the world axes. If camera.json has no workspace, a grid is placed around the visible table. A
-recording is written under a temporary name and renamed when it is complete. If writing fails, no file remains.
+first pause defines the world axes. If the table of a given pose is not at z = 0, the world is shifted. If camera.json
+has no workspace, a grid is placed around the visible table. A recording is written under a temporary name and renamed
+when it is complete. If writing fails, no file remains.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from mstfilter.scene import (
     report_findings,
     rigid_from_matrix,
     truth_reader,
+    world_shift,
     write_image,
 )
 
@@ -367,14 +369,22 @@ class RecordingFolder(RecordingFormat):
             robot = read_optional(path / "robot" / name)
             return Frame(rgb, depth, view, None if robot is None else robot > 0)
 
-        if camera.T_world_camera is None or not isinstance(grid, VoxelGrid):
-            first = marked[0]
-            camera, grid = find_world(read(first, camera.at(poses[first]) if first in poses else camera), grid)
+        truth, true_poses = path / "voxels.npz", path / "poses.json"
+        known = truth.exists() or true_poses.exists()  # the truth is in the world of the files
+        if camera.T_world_camera is None or not isinstance(grid, VoxelGrid) or not known:
+            given = camera.at(poses[marked[0]]) if marked[0] in poses else camera
+            found, grid = find_world(read(marked[0], given), grid)
+            shift = world_shift(given, found)
+            if shift is not None:
+                poses = {index: shift * pose for index, pose in poses.items()}
+            if camera.T_world_camera is None:
+                camera = found
+            elif shift is not None:
+                camera = camera.at(shift * camera.pose)
 
         def read_posed(index: int) -> Frame:
             return read(index, camera.at(poses[index]) if index in poses else camera)
 
-        truth, true_poses = path / "voxels.npz", path / "poses.json"
         true_volumes = _read_voxels(truth, grid, marked) if truth.exists() else lambda t: None
         with naming(str(path / "manifest.json")):
             return Recording(

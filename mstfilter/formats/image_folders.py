@@ -97,6 +97,7 @@ def _objects(frame: Frame, labels: np.ndarray | None) -> np.ndarray | None:
 _ON_PLANE = 2.0  # disparity in 1/8 pixels of a Kinect: 6 mm at 1 m
 _COLOUR, _SUFFIXES = ("color", "image", "rgb", "colour"), (".png", ".jpg", ".jpeg")
 _DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
+_ALIGNED = re.compile(r"depth.*(align|regist|(to|2)_?(colou?r|rgb))|(align|regist).*depth")
 _STILL = "remove the file if the camera stands still"
 _POLL_S = 0.02
 _WRITTEN_S = 0.3  # age of the last files after which they are complete
@@ -104,6 +105,10 @@ _PARTNER_S = 2.0  # how long a pair waits for its second image, or to become rea
 INTRINSICS = ("intrinsic.json", "camera_intrinsic.json", "intrinsics.json", "camera.json")
 _ENTRIES = INTRINSICS, "fps", "depth_scale"
 _READ = ("K", "fx", "fy", "cx", "cy", "intrinsic_matrix", "distortion", "width", "height")
+_OF_PYREALSENSE = {"ppx": "cx", "ppy": "cy", "coeffs": "distortion"}  # names of pyrealsense2, which has `model` too
+#: Distortion models, as text or number of pyrealsense2, whose coefficients are those of OpenCV. The library projects
+#: by the same formula for all of them.
+_MODELS = re.compile(r"brown|plumb_bob|rational|opencv|none|^$|^[0124]$")
 #: Entries of the recorders of Open3D, and of info.json, that say nothing about the images.
 _NOTES = {"device_name", "serial_number", "serial_number_", "stream_length_usec", "color_format", "depth_format"}
 _NOTES |= {"color_mode", "depth_mode", "class_name", "version_major", "version_minor", "frames", "classes", "source"}
@@ -115,11 +120,11 @@ class Redwood(VideoFormat):
     """Folders rgb/ (or color/, colour/, image/) and depth/ with intrinsics, as in Redwood and Open3D.
 
     Intrinsics are read from a file in the same folder, or given as ``K``. ``intrinsics.json`` or ``camera.json``
-    holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3). ``intrinsic.json`` or ``camera_intrinsic.json`` holds
-    Open3D's ``intrinsic_matrix`` in column-major order. Colour and depth images are paired by the last number in
-    their names, or by time if the numbers are time stamps. Depth files are 16-bit PNG or TIFF, or floating-point in
-    metres (.npy, .tif). An optional robot mask robot/NAME.png has the name of its colour image. The camera must not
-    move. Format: http://redwood-data.org/indoor/fileformat.html.
+    holds ``fx``, ``fy``, ``cx``, ``cy``, or ``K`` (3 x 3), or the entries of pyrealsense2. ``intrinsic.json`` or
+    ``camera_intrinsic.json`` holds Open3D's ``intrinsic_matrix`` in column-major order. Colour and depth images are
+    paired by the last number in their names, or by time if the numbers are time stamps. Depth files are 16-bit PNG or
+    TIFF, or floating-point in metres (.npy, .tif). An optional robot mask robot/NAME.png has the name of its colour
+    image. The camera must not move. Format: http://redwood-data.org/indoor/fileformat.html.
 
     Further parameters: `VideoFormat`.
 
@@ -188,6 +193,8 @@ class Redwood(VideoFormat):
     def _files(self, path: Path, known: Collection[str] = ()) -> tuple[list[Path], list[Path]]:
         """Files of colour images and of depth images, except files with names in `known`."""
         folder = next((path / name for name in _COLOUR if (path / name).is_dir()), path / _COLOUR[0])
+        if not known:
+            _check_aligned(path, {"depth"}, "rename depth/ to raw/, and {name}/ to depth/")
         return _images(folder, _SUFFIXES, known), _images(path / "depth", _DEPTH_SUFFIXES, known)
 
     def _rate(self, file: Path | None, stored: dict[str, Any]) -> float:
@@ -197,7 +204,7 @@ class Redwood(VideoFormat):
     def _video(self, path: Path, colour: list[Path], depth: list[Path]) -> Video:
         pairs, stamps = _paired(path, colour, depth, self.tolerance_s)
         file, stored = _read_intrinsics(path, *_ENTRIES)
-        scale = self.depth_scale or 1 / _stored(file, stored, "depth_scale", 1000)
+        scale = self.depth_scale or _stored_scale(file, stored)
         times = stamps or tuple(k / self._rate(file, stored) for k in range(len(pairs)))
         files = [(rgb, image, _mask(path, rgb)) for rgb, image in pairs]
         return _calibrated(self, path, (file, stored), path.resolve().name, times, files, scale)
@@ -230,6 +237,15 @@ def _check_masks(path: Path, colour: Iterable[Path]) -> None:
     if other := sorted({*path.glob("robot/[!.]*")} - {_mask(path, file) for file in colour}):
         text = f"{path / 'robot'}: {len(other)} masks of no colour image are not read, for example {other[0].name}"
         warn_user(text, "name a robot mask as its colour image: robot/000000.png for rgb/000000.jpg")
+
+
+def _check_aligned(path: Path, used: Collection[str], hint: str) -> None:
+    """Raise InputError if a folder beside the `used` folders of depth images is named as one of aligned depth."""
+    folders = sorted(p.name for p in path.iterdir() if p.is_dir()) if path.is_dir() else []
+    aligned = [name for name in folders if _ALIGNED.search(name.lower())]
+    if aligned and not set(aligned) & set(used):
+        text = f"{path}: {', '.join(sorted(used))}/ would be read, but {aligned[0]}/ is there: depth must be aligned"
+        raise InputError(text, hint.format(name=aligned[0]), f"or, if they are no depth images: rename {aligned[0]}/")
 
 
 def is_recording(path: Path) -> bool:
@@ -362,17 +378,28 @@ def _read_intrinsics(path: Path, names: Iterable[str], *more: str) -> _Source:
         stored = read_json(file, kind)
         if not isinstance(stored, dict):
             raise TypeError(f"it holds a {type(stored).__name__}, expected an object with the entry K")
+        stored = {**{ours: stored[name] for name, ours in _OF_PYREALSENSE.items() if name in stored}, **stored}
         stored["distortion"] = np.ravel(stored.get("distortion", ())).astype(float).tolist()
-    warn_of_unread(file, stored, (*_READ, *more), _NOTES)
+    model = str(stored.get("model", ""))
+    if any(stored["distortion"]) and not _MODELS.search(model.lower()):
+        text = f"{file}: the distortion model is {model!r}, which is not supported"
+        raise InputError(text, "rectify the images, and store the coefficients 0, 0, 0, 0")
+    warn_of_unread(file, stored, (*_READ, *more), {*_NOTES, *_OF_PYREALSENSE, "model"})
     return file, stored
 
 
 def _stored(file: Path | None, stored: dict[str, Any], name: str, default: float) -> float:
     """The number `name` in the intrinsics file (at least 1), or `default`."""
     value = stored.get(name, default)
-    hints = ("the file has units per metre, the option metres per unit",) if name == "depth_scale" else ()
-    check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", *hints, at_least=1)
+    check_number(f"{file}: {name}", value, f"give it: {name}=VALUE", at_least=1)
     return float(value)
+
+
+def _stored_scale(file: Path | None, stored: dict[str, Any]) -> float:
+    """Metres per unit of integer depth. In the file, values from 1 on are units per metre, as Open3D writes them."""
+    value = stored.get("depth_scale", 0.001)
+    check_number(f"{file}: depth_scale", value, "give it in metres per unit: depth_scale=0.001", above=0)
+    return float(value) if value < 1 else 1 / float(value)
 
 
 def _stored_matrix(path: Path, file: Path | None, stored: dict[str, Any]) -> tuple[float, ...]:
@@ -432,6 +459,8 @@ class Tum(VideoFormat):
         outside = [row[1] for row in (*colour, *depth) if Path(row[1]).is_absolute() or ".." in Path(row[1]).parts]
         if outside:
             raise InputError(f"{path}: image {outside[0]} is outside the folder", "names are relative to the folder")
+        used = {(*Path(row[1]).parent.parts, ".")[0] for row in depth}
+        _check_aligned(path, used, "name the files of {name}/ in depth.txt")
         stamps = [[_stamp(row[0]) for row in table] for table in (colour, depth)]
         pairs = pair_stamps(stamps[0], stamps[1], self.tolerance_s, str(path))
         times = tuple(stamps[0][i] for i, _ in pairs)

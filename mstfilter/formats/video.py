@@ -39,10 +39,12 @@ from mstfilter.scene import (
     VoxelGrid,
     check_depth,
     find_world,
+    pauses_with_depth,
     read_depth,
     read_labels,
     read_rgb,
     rigid_from_matrix,
+    world_shift,
 )
 
 
@@ -203,9 +205,13 @@ class Video:
         # A stream of the same frames finds the pauses in these images.
         changed = bool(self.distortion) or camera.width != stored.width
         found = pauses.find(self.times, (lambda k: read(k, camera).rgb) if changed else self.read_rgb)
+        has_depth = lambda k: bool(np.isfinite(self.read_depth(k)).any())  # noqa: E731
+        found = pauses_with_depth(found, self.times, has_depth, str(self.path))
         first_pause = found[0]
         camera = camera if world.pose is None else camera.at(world.pose)
-        camera, grid = find_world(read(first_pause, camera), world.grid)
+        given = camera
+        camera, grid = find_world(read(first_pause, given), world.grid)
+        world_shift(given, camera)  # notes that the world is not that of the given pose
         cameras: dict[int, Camera] = {}
 
         def camera_at(index: int) -> Camera:

@@ -36,7 +36,7 @@ def filter_folder(
     """Filter the images of a folder while they arrive, and return the run folder.
 
     The files of each pause, except wall times, are identical to those of a run on the complete folder with the same
-    pause rule. An interrupted live run cannot be resumed.
+    pause rule, if every frame has depth: a stream drops the others. An interrupted live run cannot be resumed.
 
     Parameters
     ----------

@@ -49,6 +49,7 @@ from mstfilter.scene import (
     report_findings,
     rigid_from_matrix,
     scene_cache,
+    world_shift,
 )
 from mstfilter.smc import Info, ParticleFilter, State
 from mstfilter.tracking import DenseFlow
@@ -94,8 +95,8 @@ class Stream:
 
     Parameters
     ----------
-    camera : Camera or (3, 3) array
-        The camera, or its intrinsics in pixels.
+    camera : Camera, (3, 3) array or four numbers
+        The camera, or its intrinsics in pixels: the matrix, or fx, fy, cx, cy.
     filter : ParticleFilter or str
         The filter, or the name of a preset.
     pauses : Settled or None
@@ -146,6 +147,7 @@ class Stream:
         self._state, self._on_pause = self._filter.start(seed), on_pause
         self._max, self._threads, self._max_pixels = max_frames, threads, max_pixels
         self._world: Camera | None = None  # the camera of the first pause
+        self._shift: RigidTransform | None = None  # of the world of given poses, so that its table is at z = 0
         self._first: Look | None = None  # what the first pause shows
         self._reported: set[tuple[str, ...]] = set()
         self._doubts: list[Finding] = []  # about the hypotheses
@@ -368,8 +370,12 @@ class Stream:
                     self._step = self._pool.submit(self._load, item.frame, self._state)
                 return
             self._world, self._grid = find_world(item.frame, self._grid)
-        if item.frame.camera.T_world_camera is None:
+            self._shift = world_shift(item.frame.camera, self._world)
+        camera = item.frame.camera
+        if camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
+        elif self._shift is not None:
+            item = replace(item, frame=replace(item.frame, camera=camera.at(self._shift * camera.pose)))
         if rests and not self._clip:
             self._examine(item, [item.time])  # an error ends the stream before the first step
         self._clip.append(item)

@@ -64,7 +64,9 @@ from mstfilter.scene.recording import (
     Recording as Recording,
     UsesFiles as UsesFiles,
     find_world as find_world,
+    pauses_with_depth as pauses_with_depth,
     truth_reader as truth_reader,
+    world_shift as world_shift,
 )
 from mstfilter.scene.rendering import (
     Rendering as Rendering,

@@ -29,8 +29,8 @@ class Camera:
 
     Parameters
     ----------
-    K : (3, 3) array
-        Intrinsics in pixels: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
+    K : (3, 3) array, or four numbers
+        Intrinsics in pixels: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``, or fx, fy, cx, cy. The field is the matrix.
     width, height : int
         Image size in pixels.
     T_world_camera : scipy RigidTransform, optional
@@ -51,11 +51,11 @@ class Camera:
             K = np.asarray(self.K, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"camera matrix K is not numeric: {self.K!r}") from error
+        if K.shape == (4,):
+            fx, fy, cx, cy = K
+            K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise InputError(
-                f"camera matrix K is {K.tolist()}, expected 3 x 3 finite numbers",
-                "from four numbers: Camera.from_intrinsics(fx, fy, cx, cy, width, height)",
-            )
+            raise InputError(f"camera matrix K is {K.tolist()}, expected 3 x 3 finite numbers, or fx, fy, cx, cy")
         if K[0, 0] <= 0 or K[1, 1] <= 0 or abs(np.linalg.det(K)) < 1e-9:
             raise InputError(
                 f"camera matrix K is not invertible: {K.tolist()}",

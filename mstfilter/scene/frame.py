@@ -129,15 +129,10 @@ _IN_METRES = "floating-point depth is read in metres, whatever the depth scale i
 
 
 def check_depth(depth: np.ndarray, where: str, hint: str = _IN_METRES) -> None:
-    """Raise InputError if a depth image (H, W) has no reading, or if its median is not plausible in metres."""
+    """Raise InputError if the median of a depth image (H, W) is not plausible in metres. It may have no reading."""
     with np.errstate(invalid="ignore"):
         metres = depth[np.isfinite(depth) & (depth > 0)]
-    if metres.size == 0:
-        raise InputError(
-            f"{where} has no reading at all",
-            "0 and NaN are no reading; leave such frames out, for a video with start_s or stop_s",
-        )
-    median = float(np.median(metres))
+    median = float(np.median(metres)) if metres.size else 1.0
     if not 0.05 < median < 30:
         raise InputError(f"{where} has a median of {median:g} m, expected between 0.05 and 30 m", hint)
 
@@ -202,6 +197,11 @@ def write_image(path: Path, image: np.ndarray) -> None:
     path.write_bytes(encoded.tobytes())
 
 
+def without_alpha(rgb: np.ndarray) -> np.ndarray:
+    """Colour images (..., 3), from those or from images with an alpha channel (..., 4)."""
+    return np.ascontiguousarray(rgb[..., :3]) if rgb.ndim > 2 and rgb.shape[-1] == 4 else rgb
+
+
 _BLOCKS_ACROSS = 80
 
 
@@ -220,7 +220,7 @@ class Frame:
     Parameters
     ----------
     rgb : (H, W, 3) uint8
-        Colour image.
+        Colour image. A fourth channel (alpha) is dropped.
     depth : (H, W) float
         z-depth in metres. A value that is not positive and finite (NaN, 0) means that the pixel has no reading.
     camera : Camera
@@ -242,7 +242,7 @@ class Frame:
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
-        rgb, depth = np.asarray(self.rgb), np.ma.filled(self.depth, 0)
+        rgb, depth = without_alpha(np.asarray(self.rgb)), np.ma.filled(self.depth, 0)
         if rgb.shape != (*shape, 3) or rgb.dtype != np.uint8:
             raise InputError(
                 f"colour image has shape {rgb.shape} and type {rgb.dtype}, expected {(*shape, 3)} uint8",
@@ -258,8 +258,7 @@ class Frame:
         depth = depth.astype(np.float32, copy=True)
         with np.errstate(invalid="ignore"):
             depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
-        if np.isfinite(some := depth[::4, ::4]).any():
-            check_depth(some, "depth image of the frame")
+        check_depth(depth[::4, ::4], "depth image of the frame")
         object.__setattr__(self, "rgb", frozen(rgb))
         object.__setattr__(self, "depth", read_only(depth))
         for name in ("robot_mask", "estimated"):

@@ -284,26 +284,38 @@ class Edges:
         inner = slice(_SHIFTS, -_SHIFTS)
         margin[inner, inner] = self.depth[inner, inner]
         self.depth = margin
-        rgb = cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.float32)
-        across, down = np.abs(np.diff(rgb, axis=1, append=rgb[:, -1:])), np.abs(np.diff(rgb, axis=0, append=rgb[-1:]))
-        gradient = np.maximum(across, down).max(axis=2)
-        levels = np.sort(gradient, axis=None)
-        self.rank = (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
+        self.rgb = frame.rgb
+        self.rank = _gradient_ranks(cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.float32))
 
-    def under(self, other: Edges) -> np.ndarray:
-        """(33, 33): sum of the colour ranks of `other` at the depth edges, for each shift of -16 to 16 pixels."""
+    def smoothed_rank(self, sigma: float) -> np.ndarray:
+        """(H, W): ranks of the gradients of the colour image, smoothed by `sigma` pixels; 0 gives `rank`."""
+        import cv2
+
+        return _gradient_ranks(cv2.GaussianBlur(self.rgb.astype(np.float32), (0, 0), sigma)) if sigma else self.rank
+
+    def under(self, rank: np.ndarray) -> np.ndarray:
+        """(33, 33): sum of colour ranks (H, W) at the depth edges, for each shift of -16 to 16 pixels."""
         import cv2
 
         inner = slice(_SHIFTS, -_SHIFTS)
-        return np.asarray(cv2.matchTemplate(other.rank, self.depth[inner, inner], cv2.TM_CCORR))
+        return np.asarray(cv2.matchTemplate(rank, self.depth[inner, inner], cv2.TM_CCORR))
 
 
-def edge_agreement(edges: Sequence[Edges]) -> tuple[float, float, tuple[int, int], float]:
+def _gradient_ranks(rgb: np.ndarray) -> np.ndarray:
+    """Ranks (H, W) float32 of the gradients of a colour image (H, W, 3), 0 to 1."""
+    across, down = np.abs(np.diff(rgb, axis=1, append=rgb[:, -1:])), np.abs(np.diff(rgb, axis=0, append=rgb[-1:]))
+    gradient = np.maximum(across, down).max(axis=2)
+    levels = np.sort(gradient, axis=None)
+    return (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
+
+
+def edge_agreement(edges: Sequence[Edges], sigma: float = 0.0) -> tuple[float, float, tuple[int, int], float]:
     """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
 
     The first two values are the best agreement minus the median over all shifts, and its relative loss without a
     shift. The third is the best shift (rows, columns) in pixels of an image with 320 columns. The fourth is the
-    increase of the agreement if the depth images of different pauses are exchanged.
+    increase of the agreement if the depth images of different pauses are exchanged. If `sigma` is not 0, the colour
+    images are smoothed with this standard deviation in pixels, so that finer texture has no effect.
     """
     edges = [edge for edge in edges if min(edge.depth.shape) >= 4 * _SHIFTS]
     count = sum(float(edge.depth.sum()) for edge in edges)
@@ -311,11 +323,12 @@ def edge_agreement(edges: Sequence[Edges]) -> tuple[float, float, tuple[int, int
         return 0.0, 0.0, (0, 0), 0.0
 
     def agreement(order: Sequence[int]) -> np.ndarray:
-        return np.sum([edges[i].under(edges[j]) for i, j in enumerate(order)], axis=0) / count
+        return np.sum([edges[i].under(ranks[j]) for i, j in enumerate(order)], axis=0) / count
 
     def unshifted(scores: np.ndarray) -> float:
         return float(scores[_SHIFTS - 1 : _SHIFTS + 2, _SHIFTS - 1 : _SHIFTS + 2].max())
 
+    ranks = [edge.smoothed_rank(sigma) for edge in edges]
     n, scores = len(edges), agreement(range(len(edges)))
     row, column = np.unravel_index(scores.argmax(), scores.shape)
     base, top = float(np.median(scores)), float(scores.max())

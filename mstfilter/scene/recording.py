@@ -28,11 +28,12 @@ from mstfilter.fields import Bounded
 from mstfilter.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
-from mstfilter.scene.frame import Clip, Frame, check_depth
+from mstfilter.scene.frame import Clip, Frame, check_depth, without_alpha
 from mstfilter.scene.geometry import fit_support_plane, workspace
-from mstfilter.scene.plausibility import examine, report_findings, unreadable
+from mstfilter.scene.plausibility import examine, report_findings, table_height, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
+_NEAR_S = 0.25  # half of the time that the rule `still` demands of a pause
 _LONG = 20  # frames; more are probably not one clip
 
 
@@ -157,18 +158,19 @@ class Recording:
         Parameters
         ----------
         rgb : (H, W, 3) or (T, H, W, 3) uint8
-            One image or a video.
+            One image or a video. A fourth channel (alpha) is dropped.
         depth : (H, W) or (T, H, W) float
             Depth in metres; NaN or 0 means no reading.
-        K : (3, 3) array
-            Intrinsics in pixels.
+        K : (3, 3) array, or four numbers
+            Intrinsics in pixels: the camera matrix, or fx, fy, cx, cy.
         pauses : sequence of int, str or PauseRule, optional
             Frames at which nothing moves. The filter estimates hypotheses at each pause. A `PauseRule`, or a text
             such as "still", "ends", "every" or "0s,4.2s", selects the pauses. The default rule is "still" if `times`
             are given for more than two frames, else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
-            Pose of the camera, or one pose per frame if the camera moves. The table must be at z = 0. The default
-            pose is computed from the support plane at the first pause.
+            Pose of the camera, or one pose per frame if the camera moves. z of the world must point up. A world
+            whose table is not at z = 0 is shifted. The default pose is computed from the support plane at the first
+            pause.
         grid : VoxelGrid or float
             Workspace, or the voxel size in metres of one that covers the table (sides of 1 to 2 m, height 0.5 m).
         robot_masks : (T, H, W) bool, or T of (H, W) bool or None, optional
@@ -190,6 +192,7 @@ class Recording:
             )
         depth = [np.ma.filled(d, 0) for d in depth] if isinstance(depth, list | tuple) else np.ma.filled(depth, 0)
         rgb, depth = _stacked(rgb, f"colour images of {name}"), _stacked(depth, f"depth images of {name}")
+        rgb = without_alpha(rgb)
         if rgb.ndim == 3 and depth.ndim == 2:
             rgb, depth = rgb[None], depth[None]
             robot_masks = None if robot_masks is None else np.asarray(robot_masks)[None]
@@ -230,15 +233,21 @@ class Recording:
         chosen = tuple(int(p) for p in listed)
         if not chosen or max(chosen) >= n:
             raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
+        chosen = pauses_with_depth(
+            chosen, stamps, lambda k: bool(np.any(np.isfinite(depth[k]) & (depth[k] > 0))), name
+        )
         some: Any = [None] * n if robot_masks is None else robot_masks
         if len(some) != n:
             shape = getattr(robot_masks, "shape", (len(some),))
             raise InputError(f"robot_masks has shape {shape}, expected {depth.shape} of {name}")
         masks = [None if mask is None else np.asarray(mask, dtype=bool) for mask in some]
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
-        posed, grid = find_world(frames[chosen[0]], grid)
+        first = frames[chosen[0]]
+        posed, grid = find_world(first, grid)
         if T_world_camera is None:
             frames = [replace(frame, camera=posed) for frame in frames]
+        elif (shift := world_shift(first.camera, posed)) is not None:
+            frames = [replace(frame, camera=frame.camera.at(shift * frame.camera.pose)) for frame in frames]
         made = cls(frames, grid, chosen, stamps, name)
         made._examined  # noqa: B018
         return made
@@ -353,15 +362,60 @@ def _stacked(images: Any, what: str) -> np.ndarray:
         raise InputError(f"{what} have different shapes: {', '.join(map(str, shapes))}") from error
 
 
+def pauses_with_depth(
+    pauses: tuple[int, ...], times: Sequence[float], has_depth: Callable[[int], bool], name: str
+) -> tuple[int, ...]:
+    """The pauses, with frames that have depth readings at most a quarter of a second away instead of those without.
+
+    Cameras miss single depth images. A pause without such a frame remains, and is refused when it is examined.
+    """
+    chosen = list(pauses)
+    for k, pause in enumerate(pauses):
+        near = [i for i, t in enumerate(times) if abs(t - times[pause]) <= _NEAR_S and i not in chosen]
+        if near and not has_depth(pause):
+            near = [i for i in sorted(near, key=lambda i: round(abs(times[i] - times[pause]), 6)) if has_depth(i)]
+            if near:
+                chosen[k] = near[0]
+                text = f"frame {pause} of {name} has no depth reading: the pause is at frame {near[0]} instead"
+                warn_user(text, "the two are at most 0.25 s apart; list other pauses if the scene moves there")
+    return tuple(sorted(chosen))
+
+
 def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid]:
-    """The camera with a pose, and the workspace. What is missing is computed from the `first` frame."""
+    """The camera with a pose, and the workspace. What is missing is computed from the `first` frame.
+
+    The table of the returned world is at z = 0. If it is not in the world of the given pose, as in the world of a
+    robot's base, the world is shifted along z (`world_shift`).
+    """
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
     camera = first.camera
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
+    elif height := table_height(first):
+        shift = np.array([0.0, 0.0, -height])
+        camera = camera.at(RigidTransform.from_translation(shift) * camera.pose)
+        if isinstance(grid, VoxelGrid) and abs(grid.origin[2]) > abs(grid.origin[2] - height):  # not yet on the table
+            grid = VoxelGrid(grid.origin + shift, grid.voxel_size, grid.shape)
     if not isinstance(grid, VoxelGrid):
         grid = workspace(Frame(first.rgb, first.depth, camera, first.robot_mask), 0.01 if grid is None else grid)
     return camera, grid
+
+
+def world_shift(given: Camera, found: Camera) -> RigidTransform | None:
+    """The motion from the world of a `given` camera to the world of the camera that `find_world` returns.
+
+    None if the world did not move, or the given camera has no pose. A warning notes a motion.
+    """
+    if given.T_world_camera is None or np.array_equal(given.position, found.position):
+        return None
+    shift = found.pose * given.pose.inv()
+    height = -shift.translation[2]
+    warn_user(
+        f"the table is at z = {height:.3f} m in the world of the given pose: the world is shifted, so z = 0 there",
+        f"results are in the shifted world: add {height:.3f} m to z for the world of the given pose",
+        "if the table is at z = 0 in the world of the pose: check the pose, and the depth scale",
+    )
+    return shift
 
 
 def truth_reader(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+import warnings
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from mstfilter.formats.bag import Bag, colour_image, depth_image
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.pauses import Ends
 from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, png, scene_messages, topic_info, write
-from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, video
+from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, units, video
 from tests.formats.test_layouts import WORLD, same_frames
 
 pytest.importorskip("rosbags", reason="rosbags absent: pip install -e '.[bags]'")
@@ -230,3 +231,98 @@ def test_the_orientation_of_a_compressed_image_is_ignored():
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)[0, 0, 0] < 50
     message = Messages(False).compressed(0, turned, "jpeg")[1]
     assert colour_image(message, True, "m")[0, 0, 0] > 150
+
+
+def stamped(change, kind="db3", **more):
+    """The scene whose headers have other stamps: ``change(stamp)`` of each image, in the order of the log."""
+
+    def make(path, shifts=SHIFTS):
+        messages = scene_messages(kind == "bag", shifts, **more)
+        for topic, t, (_, message) in messages:
+            stamp = change(topic, t) if "info" not in topic else t
+            message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round((stamp % 1) * 1e9)
+        return write(path, kind, messages)
+
+    return make
+
+
+START = 1700000000.0
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3"])
+@pytest.mark.parametrize("which", [COLOUR, DEPTH])
+@pytest.mark.parametrize("k", [0, 4, len(SHIFTS) - 1])
+def test_a_header_without_a_stamp_gives_all_images_the_times_of_the_log(tmp_path, kind, which, k):
+    missing = START + k / FPS + (0.003 if which == DEPTH else 0.0)
+    make = stamped(lambda topic, t: 0.0 if (topic, t) == (which, missing) else t, kind)
+    with pytest.warns(InputWarning, match=f"1 of 17 messages of {which} have no time stamp"):
+        recording = Bag(world=WORLD).open(make(tmp_path / "s"))
+    same_frames(recording, SHIFTS)
+    np.testing.assert_allclose(recording.times, np.arange(len(SHIFTS)) / FPS, atol=1e-6)
+    assert recording.pauses == PAUSES
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0, 4.0])
+def test_simulated_time_may_start_at_zero(tmp_path, speed):
+    """The log has the time of the wall clock, and the simulation is slower or faster."""
+    make = stamped(lambda topic, t: speed * (t - START) if topic == COLOUR else speed * max(t - START - 0.003, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = Bag(world=WORLD, pauses=Ends()).open(make(tmp_path / "s"))
+    same_frames(recording, SHIFTS)
+    np.testing.assert_allclose(recording.times, speed * np.arange(len(SHIFTS)) / FPS, atol=1e-6)
+
+
+def test_images_without_any_stamp_have_the_times_of_the_log(tmp_path):
+    recording = Bag(world=WORLD).open(stamped(lambda topic, t: 0.0)(tmp_path / "s"))
+    same_frames(recording, SHIFTS)
+    np.testing.assert_allclose(recording.times, np.arange(len(SHIFTS)) / FPS, atol=1e-6)
+
+
+@pytest.mark.parametrize("start", [START, 0.0])
+def test_stamps_that_jump_back_are_refused(tmp_path, start):
+    """The second half would come first. The times of the log are the way out."""
+    middle = START + 8 / FPS
+    path = stamped(lambda topic, t: start + (t - START) + (5.0 if t < middle else 0.0))(tmp_path / "s")
+    with pytest.raises(
+        InputError, match=r"stamp of message 8 of .* is 4\.9 s earlier than that of message 7"
+    ) as caught:
+        Bag(world=WORLD).open(path)
+    assert "log_times=true" in caught.value.hints[-1]
+    recording = Bag(world=WORLD, log_times=True).open(path)
+    same_frames(recording, SHIFTS)
+    assert recording.pauses == PAUSES
+
+
+def viewer(path, size=(160, 120), frame="0", k=(100.0, 100.0, 80.0, 60.0), matrix=True):
+    """A bag as the RealSense Viewer writes it: raw depth, frame 0 for all images, its own names of topics."""
+    make, messages = Messages(True), []
+    rgb, metres, _ = video((0, 1))
+    of_colour, of_depth = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
+    for j in range(2):
+        t = START + j / FPS
+        if matrix:
+            messages.append((f"{of_colour}/info/camera_info", t, make.info(t)))
+            messages.append((f"{of_depth}/info/camera_info", t, make.info(t, k=k, size=size)))
+        messages.append((f"{of_colour}/image/data", t, make.image(t, rgb[j], "rgb8", frame)))
+        depth = cv2.resize(units(metres[j], 0.001), size, interpolation=cv2.INTER_NEAREST)
+        messages.append((f"{of_depth}/image/data", t, make.image(t, depth, "mono16", frame)))
+    return write(path, "bag", messages)
+
+
+@pytest.mark.parametrize("given", [(), K])
+@pytest.mark.parametrize("change", [{}, {"k": K}, {"matrix": False}, {"size": (212, 120)}])
+def test_depth_of_the_realsense_viewer_is_refused_as_unaligned(tmp_path, given, change):
+    """With images of equal size too, with a given camera matrix, and with equal camera matrices."""
+    with pytest.raises(InputError, match="not registered to colour") as caught:
+        Bag(K=given, world=WORLD).open(viewer(tmp_path / "s", **change))
+    assert any("RSBagReader" in hint for hint in caught.value.hints)
+    if not change:
+        same_frames(Bag(registered=True, pauses=Ends(), world=WORLD).open(tmp_path / "s.bag"), (0, 1))
+
+
+def test_a_given_matrix_does_not_hide_that_the_stored_ones_differ(tmp_path):
+    path = with_info(DEPTH, k=(100.0, 100.0, 80.0, 60.0))(tmp_path / "s")
+    with pytest.raises(InputError, match="camera matrices .* differ"):
+        Bag(K=K, world=WORLD).open(path)
+    same_frames(Bag(K=K, registered=True, pauses=Ends(), world=WORLD).open(path), (0, 1))

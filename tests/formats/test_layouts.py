@@ -248,6 +248,38 @@ def test_rgb_and_depth_without_a_file_of_intrinsics(tmp_path):
             open_recording(path)
 
 
+REALSENSE = {
+    **dict(zip(("fx", "fy", "ppx", "ppy"), K, strict=True)),
+    "width": 160,
+    "height": 120,
+    "model": "distortion.inverse_brown_conrady",
+    "coeffs": [0.0] * 5,
+}
+
+
+@pytest.mark.parametrize("scale", [0.001, 1000])
+@pytest.mark.parametrize("name", ["intrinsics.json", "camera.json"])
+def test_intrinsics_of_pyrealsense2(tmp_path, name, scale):
+    """Its names, and its depth scale in metres per unit, where Open3D has units per metre."""
+    stored = json.dumps({**REALSENSE, "depth_scale": scale, "fps": FPS})
+    path = write_rgb_and_depth(tmp_path / "mine", intrinsics=(name, stored))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = Redwood(world=WORLD).open(path)
+    same_frames(recording, SHIFTS)
+    assert recording.depth_scale == 0.001
+
+
+def test_distortion_of_pyrealsense2_is_read_and_its_fisheye_models_are_refused(tmp_path):
+    bent = {**REALSENSE, "coeffs": [0.3, 0.0, 0.0, 0.0, 0.0]}
+    path = write_rgb_and_depth(tmp_path / "mine", intrinsics=("intrinsics.json", json.dumps(bent)), n=1)
+    assert Redwood().video(path).distortion == (0.3, 0, 0, 0, 0)
+    for model in ("distortion.kannala_brandt4", "distortion.ftheta", 3, 5):
+        (path / "intrinsics.json").write_text(json.dumps({**bent, "model": model}))
+        with pytest.raises(InputError, match="distortion model is"):
+            Redwood().video(path)
+
+
 def edit(file, change):
     data = json.loads(file.read_text())
     change(data)
@@ -306,7 +338,7 @@ FAULTS = {
     ),
     "redwood, other size": (Redwood(), intrinsics(height=240), "images of another height: the images have 120"),
     "redwood, row by row": (Redwood(), ROW_BY_ROW, "expected the rows fx 0 cx"),
-    "redwood, units below 1": (Redwood(), intrinsics(depth_scale=0.00025), "depth_scale is 0.00025, expected"),
+    "redwood, no unit": (Redwood(), intrinsics(depth_scale=0), "depth_scale is 0, expected"),
     "redwood, no depth": (Redwood(), lambda path: shutil.rmtree(path / "depth"), "depth is missing"),
 }
 WRITERS = {"tum": write_tum, "redwood": write_redwood}
@@ -397,13 +429,9 @@ def test_two_camera_matrices_in_one_folder_raise_an_error(tmp_path):
 
 
 def test_a_part_of_a_video(tmp_path):
-    """Frames at the start without depth are omitted, with their poses and times."""
+    """Frames at the start are omitted, with their poses and times."""
     path = write_tum(tmp_path / "tum")
     write_trajectory(path)
-    write_image(first_file(path, "depth"), np.zeros((120, 160), np.uint16))
-    with pytest.raises(InputError, match="no reading at all") as caught:
-        Tum(K=K).open(path)
-    assert "start_s" in caught.value.hints[0]
     recording = Tum(K=K, start_s=0.35, stop_s=1.45, pauses=Ends(), world=WORLD).open(path)
     assert (len(recording), recording.pauses, recording.times[0]) == (11, (0, 10), 0.0)
     np.testing.assert_array_equal(recording.frames[3].rgb, video((SHIFTS[7],))[0][0])
@@ -516,3 +544,40 @@ def test_numbers_are_not_paired_with_seconds(tmp_path):
     )
     with pytest.raises(InputError, match="does not fit depth image"):
         Redwood(world=WORLD).open(path)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("name", ["aligned_depth", "depth_aligned", "depth_registered", "aligned_depth_to_color"])
+def test_raw_depth_is_not_read_beside_aligned_depth(tmp_path, layout, name):
+    """Renamed, or named in depth.txt, the aligned depth is read."""
+    path = WRITERS[layout](tmp_path / "data")
+    shutil.copytree(path / "depth", path / name)
+    reader = Tum(K=K, world=WORLD) if layout == "tum" else Redwood(fps=FPS, world=WORLD)
+    with pytest.raises(InputError, match=f"depth/ would be read, but {name}/ is there") as caught:
+        reader.open(path)
+    assert name in caught.value.hints[0]
+    if layout == "tum":
+        (path / "depth.txt").write_text((path / "depth.txt").read_text().replace("depth/", f"{name}/"))
+    else:
+        (path / "depth").rename(path / "raw")
+        (path / name).rename(path / "depth")
+    same_frames(reader.open(path), SHIFTS)
+
+
+@pytest.mark.parametrize("layout", VIDEOS)
+def test_frames_without_depth_do_not_refuse_a_video(tmp_path, layout):
+    """The first frame, one that moves, and one at a pause, which gives its place to a neighbour."""
+    write, reader = VIDEOS[layout]
+    path, missing = write(tmp_path / "data"), (0, 7, PAUSES[1])
+    for k, file in enumerate(sorted((path / "depth").iterdir())):
+        if k in missing:
+            write_image(file, np.zeros((120, 160), np.uint16))
+    with pytest.warns(InputWarning, match=rf"frame {PAUSES[1]} of .* has no depth reading: the pause is at frame 12"):
+        recording = reader.open(path)
+    assert recording.pauses == (PAUSES[0], 12)
+    recording.check()
+    assert [k for k, frame in enumerate(recording.frames) if not frame.valid.any()] == list(missing)
+    same_on_disk(recording, tmp_path / "out")
+    with pytest.raises(InputError, match="the first pause has no reading at all") as caught:
+        replace(reader, pauses=Ends(), stop_s=0.09, world=KnownWorld()).open(path)
+    assert "another pause" in caught.value.hints[0]

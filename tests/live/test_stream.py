@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 import mstfilter
 from mstfilter.errors import InputError, InputWarning
@@ -257,13 +258,15 @@ def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_p
     monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
     path = write_redwood(tmp_path / "data", (0, 1, 2, 3, 4))
     late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
-    write_image(path / "depth" / "00003.png", np.zeros(DEPTH[0].shape, np.uint16))
+    (path / "depth" / "00003.png").write_bytes(b"no image")
+    write_image(path / "depth" / "00002.png", np.zeros(DEPTH[0].shape, np.uint16))
     threading.Timer(0.2, lambda: late.rename(path / "depth" / "00001.png")).start()
     for file in (path / "color").iterdir():
         file.touch()
-    with pytest.warns(InputWarning, match="00003.png, 00003.png of .* are skipped: .* no reading"):
-        times = [when for when, _ in Redwood(fps=10).arriving(path, idle_s=1.5)]
-    assert times == pytest.approx([0, 0.1, 0.2, 0.4])
+    with pytest.warns(InputWarning, match="00003.png, 00003.png of .* are skipped: .* cannot be decoded"):
+        arrived = list(Redwood(fps=10).arriving(path, idle_s=1.5))
+    assert [when for when, _ in arrived] == pytest.approx([0, 0.1, 0.2, 0.4])
+    assert [frame.valid.any() for _, frame in arrived] == [True, True, False, True]  # a stream drops the third
 
 
 @pytest.mark.parametrize("hours", [-5, 5])
@@ -461,3 +464,17 @@ def test_a_folder_is_filtered_while_it_is_filled(tmp_path):
         filter_folder(growing, Redwood(pauses=RULE, stop_s=2.0), config, tmp_path / "other")
     with pytest.raises(InputError, match="missing|no image"):
         filter_folder(tmp_path, reader, config, tmp_path / "other", idle_s=0.1)
+
+
+def test_a_stream_shifts_the_world_of_given_poses():
+    """The poses of every frame, or that of the camera, in the world of a robot's base."""
+    high = RigidTransform.from_translation([0.2, 0.1, 0.4])
+    for camera, pose in ((CAMERA.K, high * CAMERA.pose), (CAMERA.at(high * CAMERA.pose), None)):
+        shifted = pytest.warns(InputWarning, match="the world is shifted")
+        with shifted, mstfilter.Stream(camera, FAST, pauses=None) as stream:
+            for k in range(2):
+                stream.push(RGB[k], DEPTH[k], float(k), pose=pose, pause=True)
+                stream.wait()
+        for frame in stream.last.clip.frames:
+            np.testing.assert_allclose(frame.camera.position, CAMERA.position + [0.2, 0.1, 0], atol=5e-3)
+        assert stream.last.clip.grid.origin[2] == 0

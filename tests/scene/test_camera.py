@@ -80,7 +80,8 @@ def test_numbers_of_pixels_scale_with_the_image():
     [
         (np.zeros((3, 3)), "not invertible"),
         (np.diag([525.0, 0.0, 1.0]), "not invertible"),
-        (np.array([525.0, 525, 319.5, 239.5]), "expected 3 x 3 finite"),
+        ((525.0, 525, 319.5), "expected 3 x 3 finite numbers, or fx, fy, cx, cy"),
+        ((525.0, 0, 319.5, 239.5), "not invertible"),
         (np.eye(4), "expected 3 x 3 finite"),
         (K.T, "upper triangular"),
         (K * np.nan, "expected 3 x 3 finite"),

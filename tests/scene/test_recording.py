@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, read_depth, render, write_image
+from mstfilter.scene import (
+    TABLE_TOLERANCE,
+    Frame,
+    Hypothesis,
+    check_grid,
+    find_world,
+    read_depth,
+    read_rgb,
+    render,
+    write_image,
+)
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording
@@ -418,3 +429,95 @@ def test_depth_files_of_any_byte_order(tmp_path, kind):
 def test_invalid_bounds_are_one_error(lower, upper, size):
     with pytest.raises(InputError, match="has no voxel"):
         VoxelGrid.from_bounds(lower, upper, size)
+
+
+RAISED = RigidTransform.from_translation([0.3, -0.2, 0.41]) * RigidTransform.from_rotation(
+    Rotation.from_rotvec([0, 0, 0.7])
+)
+
+
+def two_pauses(shifts=(0, 5)):
+    images = [table_scene(shift, np.random.default_rng(shift))[:2] for shift in shifts]
+    return tuple(np.stack(part) for part in zip(*images, strict=True))
+
+
+def check_shifted(recording, world):
+    """Check that the world is `world`, shifted along z so that its table is at z = 0."""
+    expected = (world * CAMERA.pose).as_matrix()
+    expected[2, 3] = CAMERA.position[2]
+    for frame in recording.frames:
+        np.testing.assert_allclose(frame.camera.pose.as_matrix(), expected, atol=2e-3)
+    assert recording.grid.origin[2] == pytest.approx(0, abs=2e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording.clips()
+
+
+@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.parametrize("bounded", [False, True])
+def test_the_world_of_a_robots_base_is_shifted(tmp_path, several, bounded):
+    """Arrays, a recording folder with and without a workspace, with one pose or one of each frame."""
+    rgb, depth = two_pauses()
+    pose = RAISED * CAMERA.pose
+    poses = np.stack([pose.as_matrix()] * 2) if several else pose
+    grid = VoxelGrid((0.0, -0.5, 0.41), 0.01, (60, 60, 30)) if bounded else 0.01
+    with pytest.warns(InputWarning, match=r"the table is at z = 0\.4\d+ m .* the world is shifted"):
+        recording = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=poses, grid=grid)
+    check_shifted(recording, RAISED)
+    if bounded:
+        np.testing.assert_allclose(recording.grid.origin[:2], grid.origin[:2])
+    with RecordingWriter(tmp_path / "r", CAMERA.at(pose), grid if bounded else None) as writer:
+        for k in range(2):
+            more = {"T_world_camera": pose.as_matrix().tolist()} if several else {}
+            writer.add_frame(rgb[k], np.round(depth[k], 3), float(k), "static", **more)
+    with pytest.warns(InputWarning, match="the world is shifted"):
+        check_shifted(open_recording(tmp_path / "r"), RAISED)
+
+
+@pytest.mark.parametrize("height", [0.03, -0.03, 0.06, -0.2])
+def test_a_pose_of_the_wrong_height_is_not_a_moving_camera(height):
+    """The workspace on z = 0 stays there."""
+    rgb, depth = two_pauses()
+    world = RigidTransform.from_translation([0, 0, height])
+    with pytest.warns(InputWarning) as caught:
+        recording = Recording.from_arrays(rgb, depth, CAMERA.K, T_world_camera=world * CAMERA.pose, grid=GRID)
+    assert len(caught) == 1 and f"at z = {height:.2f}" in str(caught[0].message)
+    check_shifted(recording, world)
+    assert recording.grid == GRID
+
+
+def test_the_floor_and_a_tray_do_not_shift_the_world():
+    """The table at z = 0 is smaller than another level plane."""
+    rgb, depth = (part[0] for part in two_pauses())
+    points = CAMERA.unproject(depth)
+    floor = depth * (CAMERA.position[2] + 0.7) / CAMERA.position[2]
+    tray = depth * (CAMERA.position[2] - 0.06) / CAMERA.position[2]
+    for other, inside in ((floor, np.abs(points[..., :2]).max(axis=-1) < 0.25), (tray, points[..., 1] > 0.05)):
+        changed = np.where(inside | (points[..., 2] > 0.02), depth, other).astype(np.float32)
+        camera, _ = find_world(Frame(rgb, changed, CAMERA), GRID)
+        assert camera is CAMERA
+
+
+def test_one_camera_matrix_may_be_four_numbers_and_an_alpha_channel_is_dropped(tmp_path):
+    rgb, depth = two_pauses()
+    expected = Recording.from_arrays(rgb, depth, CAMERA.K)
+    alpha = np.concatenate([rgb, np.full_like(rgb[..., :1], 255)], axis=-1)
+    for four in ((131, 131, 79.5, 59.5), np.array([131, 131, 79.5, 59.5])):
+        assert Recording.from_arrays(alpha, depth, four).key == expected.key
+    assert Recording.from_arrays(alpha[0], depth[0], CAMERA.K).frames[0].rgb.shape == (120, 160, 3)
+    assert Frame(alpha[0], depth[0], CAMERA).key == Frame(rgb[0], depth[0], CAMERA).key
+    cv2.imwrite(str(tmp_path / "a.png"), alpha[0][..., [2, 1, 0, 3]])
+    np.testing.assert_array_equal(read_rgb(tmp_path / "a.png"), rgb[0])
+
+
+def test_a_frame_without_depth_does_not_refuse_arrays():
+    rgb, depth = two_pauses((0, 1, 2, 3, 4))
+    missing = depth.copy()
+    missing[1], missing[4] = np.nan, 0
+    recording = Recording.from_arrays(rgb, missing, CAMERA.K, pauses=[0, 3])
+    assert [frame.valid.any() for frame in recording.frames] == [True, False, True, True, False]
+    with pytest.warns(InputWarning, match="frame 4 of arrays has no depth reading: the pause is at frame 3"):
+        assert Recording.from_arrays(rgb, missing, CAMERA.K, pauses=[0, 4], times=np.arange(5) / 10).pauses == (0, 3)
+    with pytest.raises(InputError, match="frame 4 has no reading at all") as caught:
+        Recording.from_arrays(rgb, missing, CAMERA.K, pauses=[0, 4])
+    assert "another pause" in caught.value.hints[0]
