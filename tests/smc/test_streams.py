@@ -10,7 +10,6 @@ import pytest
 
 from mstfilter.errors import InputError
 from mstfilter.smc import Key, child, key_of
-from mstfilter.smc.streams import RunKeys
 
 GOLDEN = {
     (0, ()): [6483122582865679825, 1579675997288522721],
@@ -73,14 +72,6 @@ def test_neighbouring_streams_are_independent():
     draws = np.stack([Key(1).child("transition", t).generator().standard_normal(2000) for t in range(33)])
     correlations = np.corrcoef(draws)[np.triu_indices(33, 1)]
     assert np.abs(correlations).max() < 5.3 / np.sqrt(2000)
-
-
-def test_generators_of_many_runs_are_those_of_their_keys():
-    keys = [Key(seed) for seed in (0, 1, 2**32, 2**130)]
-    of_runs, some = RunKeys(keys), np.array([3, 0, 1])
-    for t in (0, 15, 16, 1000):
-        for run, rng in zip(some, of_runs.generators("update", t, some), strict=True):
-            np.testing.assert_array_equal(rng.random(3), keys[run].child("update", t).generator().random(3))
 
 
 def test_other_bit_generators_can_be_seeded():
