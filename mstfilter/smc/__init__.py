@@ -17,10 +17,11 @@
 `diverse_resampling`    schemes that keep more distinct particles, with unequal weights
 `wrapped_resampling`    wrappers of schemes: sorted, shuffled, merged, tempered
 `components`            update by a likelihood, branching, triggers, sizes, equality of particles
-`streams`               random streams named by seed, step, slot and index; generators of many runs
+`streams`               random streams named by seed, step, slot and index
 `history`               collectors: quantities of a run, recorded at every step
 `running`               `run_many`: several filters, seeds and data sets
-`batching`              the runs of a filter together, as arrays
+`sweep`                 many runs of a filter at once, as arrays
+`first_steps`           examines the functions of a model at the first steps of a run
 `checkpoint`            storage of the state of a run in a file
 `state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
 `exact`                 linear-Gaussian and finite models with exact posteriors

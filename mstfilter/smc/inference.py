@@ -106,7 +106,7 @@ class _Posterior:
         return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
 
     def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
-        """Log evidences of filters that run as one batch, or one by one if batching is impossible."""
+        """Log evidences of filters that run in one sweep, or one by one if they cannot be swept."""
         if self.batched and self.observations:
             if can_sweep(self._filter(thetas[0])):
                 return self._in_one_sweep(thetas, seeds)
