@@ -101,7 +101,34 @@ def SizeChanging(rng, lw, n):
     return ancestors, lw[ancestors] + np.log((lw > -np.inf).mean())
 
 
-CORRECT = (RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging())
+@selecting
+def ZeroAtTheEdge(rng, lw, n):
+    """Picks a leading weight of zero where the uniform number is exactly 0, and none where it rounds to the end."""
+    return np.searchsorted(np.cumsum(normalise(lw)), (np.arange(n) + rng.random()) / n)
+
+
+def alias_table(weights):
+    """Vose's alias method: which columns keep their particle depends on rounding."""
+    m, share, alias = len(weights), len(weights) * weights, np.arange(len(weights))
+    small, large = list(np.flatnonzero(share < 1)), list(np.flatnonzero(share >= 1))
+    while small and large:
+        light, heavy = small.pop(), large.pop()
+        alias[light] = heavy
+        share[heavy] -= 1 - share[light]
+        (small if share[heavy] < 1 else large).append(heavy)
+    share[small + large] = 1.0
+    return m, share, alias
+
+
+@selecting
+def Alias(rng, lw, n):
+    """Independent draws by the alias method."""
+    m, share, alias = alias_table(normalise(lw))
+    column = rng.integers(m, size=n)
+    return np.where(rng.random(n) < share[column], column, alias[column])
+
+
+CORRECT = (RareHeaps(), RareBlocks(), RandomNumber(), SizeChanging(), Alias(), ZeroAtTheEdge())
 
 _CARRIED, _VALID, _ZERO = "carried_weight", "result_is_valid", "zero_weights_are_never_chosen"
 _SCALE, _PARENTS = "scale_of_weights_is_irrelevant", "keeps_parents"
@@ -121,12 +148,6 @@ def rest_to_the_last(rng, lw, n):
     copies = np.floor(n * normalise(lw)).astype(int)
     copies[-1] += n - copies.sum()
     return np.repeat(np.arange(len(lw)), copies)
-
-
-def zero_at_the_edge(rng, lw, n):
-    """Picks a leading weight of zero where the uniform is exactly 0."""
-    points = (np.arange(n) + rng.random()) / n
-    return np.searchsorted(np.cumsum(normalise(lw)), points, side="left")
 
 
 def first_always_stays(rng, lw, n):
@@ -189,7 +210,6 @@ plant(
     IgnoresN=(_VALID, "asked to make", lambda rng, lw, n: by_weight(rng, lw, len(lw))),
     NoDuplicates=(_VALID, "asked to make", lambda rng, lw, n: np.unique(by_weight(rng, lw, n))),
     PicksZeroWeights=(_ZERO, "weight 0", rest_to_the_last),
-    ZeroAtTheEdge=(_ZERO, "gives 0, of weights (0, 0, 1, 2, 3) it selects particle 0, weight 0", zero_at_the_edge),
     # Counts particles from 1.
     OffByOne=(_VALID, "expected 0 to", lambda rng, lw, n: by_weight(rng, lw, n) + 1),
     AsFloats=(_VALID, "float64, expected integers", lambda rng, lw, n: by_weight(rng, lw, n).astype(float)),

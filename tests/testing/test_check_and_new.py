@@ -122,4 +122,25 @@ def test_contracts_of_numbers_need_numpy_and_scipy_only():
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, timeout=600
     )
-    assert done.stdout.splitlines() == [str([None] * 5), "[]"], done.stderr
+    assert done.stdout.splitlines() == [str([None] * 6), "[]"], done.stderr
+
+
+SLOW = """
+import time
+import numpy as np
+from mstfilter.smc import Multinomial, WeightResampler
+
+class Slow(WeightResampler):
+    def select(self, generator, logarithms, number):
+        time.sleep(2e-3 * number)
+        return Multinomial().select(generator, logarithms, number)
+"""
+
+
+def test_what_is_not_tested_in_time_is_no_pass(tmp_path, capsys):
+    (tmp_path / "slow.py").write_text(SLOW)
+    code, out, _ = call("check", f"{tmp_path / 'slow.py'}:Slow", "--budget", "5", capsys=capsys)
+    assert code == 0
+    assert out.startswith("input    numbers (n,)")
+    assert re.search(r"untested A particle gets .*\n +out of time after \d+ of 22 cases", out)
+    assert re.search(r"Slow: no tested property is broken, \d are not tested in 5 s \(--budget\)", out)

@@ -486,7 +486,7 @@ class RejuvenationContract(ExactContract):
 
     @statistical
     def test_small_populations_are_exact(self) -> None:
-        """Populations of three exact draws stay exact, over many calls."""
+        """Moves of populations of three particles keep the distribution too, over many calls."""
         component = skip_unless_properly_weighted(self.make())
         old, now, observation = self.exact_case(1, 9000)
         previous, fresh, _ = self.exact_case(3, 50_000)
