@@ -2,7 +2,7 @@
 
     python experiments/planted/run.py [--smoke] [--only NAME ...] [--budget SECONDS] [--out FOLDER]
 
-Every component of faults.py and right.py is checked as `mstfilter check` does. The script writes results.csv (one row
+Every component of faults.py and right.py, and every model of models.py, is checked as `mstfilter check` does. The script writes results.csv (one row
 per component) into FOLDER (default: results/), and exits with 1 if a right component is rejected.
 """
 
@@ -15,13 +15,18 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import models
+from entries import Entry
 from faults import FAULTS
 from right import RIGHT
 
 from mstfilter.testing import run_contract
 
 RESULTS = Path(__file__).parent / "results"
-LISTS = {"faults": FAULTS, "right": RIGHT}
+LISTS = {
+    "faults": [*FAULTS, *(Entry(name, "model", name, make) for name, make in models.FAULTY.items())],
+    "right": [*RIGHT, *(Entry(name, "model", name, make) for name, make in models.RIGHT.items())],
+}
 
 
 def checked(which: str, k: int, budget: float) -> dict[str, object]:
