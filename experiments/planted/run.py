@@ -2,8 +2,9 @@
 
     python experiments/planted/run.py [--smoke] [--only NAME ...] [--budget SECONDS] [--out FOLDER]
 
-Every component of faults.py and right.py, and every model of models.py, is checked as `mstfilter check` does. The script writes results.csv (one row
-per component) into FOLDER (default: results/), and exits with 1 if a right component is rejected.
+Every component of faults.py and right.py, and every model of models.py, is checked as `mstfilter check` does. The
+script writes results.csv (one row for each) into FOLDER (default: results/), and exits with 1 if a right one is
+rejected.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-import models
 from entries import Entry
 from faults import FAULTS
 from right import RIGHT
 
+import models
 from mstfilter.testing import run_contract
 
 RESULTS = Path(__file__).parent / "results"
