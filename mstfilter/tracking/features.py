@@ -54,9 +54,7 @@ def matched_colour(frame: Frame, reference: Frame, width: int = 3) -> np.ndarray
 def _exposure(frame: Frame, reference: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Gain (3,) and offset (3,) that map colours of the frame to those of the reference."""
     still = np.flatnonzero(same_depth(reference, frame))
-    if len(still) < scaled_area(
-        _LEAST_STILL, frame.depth.size
-    ):  # without depth: assume that most of the image is still
+    if len(still) < scaled_area(_LEAST_STILL, frame.depth.size):  # without depth: most of the image may be still
         still = np.arange(frame.depth.size)
     still = still[:: max(1, len(still) // _N_EXPOSURE_PIXELS)]
     x_all = smooth_colour(frame).reshape(-1, 3)[still].astype(np.float64)

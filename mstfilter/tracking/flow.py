@@ -30,21 +30,21 @@ from mstfilter.scene import Clip, Frame, depth_sigma, fill_from_nearest, max_of_
 from mstfilter.tracking.features import matched_colour, same_depth, smooth_colour
 
 _PRESETS = ("ultrafast", "fast", "medium")
-# Lengths in pixels are those of an image of 640 columns.
+# Lengths in pixels of an image of 640 columns, scaled by the width of the image.
 _GRID = 2  # pixels between the rows and columns of the followed points
-_ISOLATED = 3  # pixels, side of the smallest square of changed pixels that is not noise
-_VOTE_REACH, _VOTE_UNIT, _VOTE_CAP = 12, 6.0, 4.0  # pixels, see `_vote`
+_ISOLATED = 3  # pixels, side of the smallest square of changed pixels of an object that is not noise
 _N_VOTERS = 5
 #: Frames are skipped until the motion since the last used frame reaches this fraction of the image width: errors
 #: accumulate with the number of frames, but flow fails for long motions.
 _FRAME_MOTION = 0.03
-_ROUND_TRIP = 1.0  # pixels of an image of any size, largest forward-backward error of a track
+# Other lengths in pixels are those of an image of any size: noise, errors of the flow and its patches are per pixel.
+_ROUND_TRIP = 1.0  # pixels, largest forward-backward error of a track
 _DEPTH_JUMP = 0.03  # metres, largest change of depth of a track between consecutive frames
 _COLOUR_JUMP = 30.0  # grey levels per channel, largest change of colour of a track between consecutive frames
 _CHANGE_SIGMAS = 5.7  # smallest change of depth that is motion, in standard deviations of the noise of one reading
 _COLOUR_CHANGE = 12.0  # smallest change of colour that is motion, grey levels in any channel
-#: Pixels of an image of any size, as the patches of DIS. Margin of the box beside the changed pixels. The corners of
-#: the box are multiples of the second number, so that the patches of DIS are those of the whole image.
+#: Pixels. Margin of the box beside the changed pixels. The corners of the box are multiples of the second number, so
+#: that the patches of DIS are those of the whole image.
 _MARGIN, _STEP = 24, 48
 
 
@@ -67,7 +67,7 @@ class ClipTracks:
     @cached_property
     def coherently_unchanged(self) -> np.ndarray:
         """(H, W) bool: `unchanged`, also True at isolated changed pixels, which are treated as noise."""
-        return ~_opened(~self.unchanged, _ISOLATED)
+        return ~_opened(~self.unchanged, max(2, round(scaled_length(_ISOLATED, self.unchanged.shape[1]))))
 
     def points_in(self, mask: np.ndarray) -> np.ndarray:
         """Indices of the points that start inside a mask (H, W) and are valid until the end."""
@@ -225,7 +225,7 @@ def _changed(a: Frame, b: Frame) -> tuple[tuple[slice, slice], np.ndarray]:
     seen = ~(_robot(a) | _robot(b))
     jump, colour = np.abs(b.depth - a.depth), max_of_three(np.abs(smooth_colour(b) - smooth_colour(a)))
     # At edges, depth has more noise than colour.
-    changed = _opened(seen & (jump > _CHANGE_SIGMAS * depth_sigma(a.depth)), _ISOLATED)
+    changed = _opened(seen & (jump > _CHANGE_SIGMAS * depth_sigma(a.depth)), 3)
     changed |= seen & (colour > _COLOUR_CHANGE)
     changed = _opened(changed, 2)
     settled = seen & ~(jump > _DEPTH_JUMP) & (colour <= _COLOUR_JUMP)
@@ -244,16 +244,9 @@ def _changed(a: Frame, b: Frame) -> tuple[tuple[slice, slice], np.ndarray]:
     return (sides[0], sides[1]), settled
 
 
-def _opened(mask: np.ndarray, side: float) -> np.ndarray:
-    """The parts of a mask (H, W) bool that contain a square, whose side is given for an image of 640 columns."""
-    n = max(1, round(scaled_length(side, mask.shape[1])))
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((n, n), np.uint8)) > 0
-
-
-def dilated(mask: np.ndarray, reach: float) -> np.ndarray:
-    """A mask (H, W) bool with the pixels around it, up to a distance that is given for an image of 640 columns."""
-    n = 2 * max(1, round(scaled_length(reach, mask.shape[1]))) + 1
-    return cv2.dilate(mask.astype(np.uint8), np.ones((n, n), np.uint8)) > 0
+def _opened(mask: np.ndarray, side: int) -> np.ndarray:
+    """The parts of a mask (H, W) bool that contain a square of `side` pixels."""
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
 
 def _flow(a: Frame, b: Frame, preset: str, box: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
@@ -332,9 +325,10 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     if not len(uncertain) or not known.any():
         return pull[uncertain]
     # Only valid pixels within 12 pixels of an uncertain one are voters.
-    image = np.zeros((height, width), bool)
-    image.ravel()[uncertain] = True
-    candidates = np.flatnonzero(dilated(image, _VOTE_REACH).ravel() & known)
+    image = np.zeros((height, width), np.uint8)
+    image.ravel()[uncertain] = 1
+    nearby = cv2.dilate(image, np.ones((25, 25), np.uint8)) > 0
+    candidates = np.flatnonzero(nearby.ravel() & known)
     if len(candidates) > 20000:  # every other row and column is sufficient
         rows, columns = np.divmod(candidates, width)
         candidates = candidates[(rows % 2 == 0) & (columns % 2 == 0)]
@@ -348,7 +342,7 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
         rays = frame.camera.rays()[rows, columns] @ pose[:3, :3].T
         place = (rays * depth[rows, columns, None] + pose[:3, 3]) / 0.012
     else:
-        place = np.stack([columns, rows], axis=1) / scaled_length(_VOTE_UNIT, width)
+        place = np.stack([columns, rows], axis=1) / 6.0
     features = np.hstack([place, smooth_colour(frame)[rows, columns] / 20.0])
     tree = cKDTree(features[: len(candidates)], balanced_tree=False, compact_nodes=False)
     _, found = tree.query(features[len(candidates) :], k=min(_N_VOTERS, len(candidates)), eps=0.5)
@@ -359,6 +353,5 @@ def _vote(frame: Frame, pull: np.ndarray, known: np.ndarray, uncertain: np.ndarr
     rows, columns = np.divmod(voters.T, width)
     offsets = list(zip(pull[voters.T, 0] - columns, pull[voters.T, 1] - rows, strict=True))
     # Operations over long axes are several times faster than those over axes of five elements.
-    cap = scaled_length(_VOTE_CAP, width)
-    apart = [sum(np.minimum(np.abs(a - x) + np.abs(b - y), cap) for x, y in offsets) for a, b in offsets]
+    apart = [sum(np.minimum(np.abs(a - x) + np.abs(b - y), 4.0) for x, y in offsets) for a, b in offsets]
     return pull[voters[np.arange(len(uncertain)), np.argmin(apart, axis=0)]]

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mstfilter.scene import Camera, Frame, depth_sigma, memo, scaled_area, scaled_length
+from mstfilter.scene import Camera, Frame, depth_sigma, memo
 from mstfilter.tracking.rigid import invert, move_points
 from mstfilter.tracking.segments import Track
 
@@ -44,9 +44,6 @@ _EXPLAINED = 0.01  # metres from the moved surface to a measured point that it e
 _MIN_COUNTED = 0.3  # smallest fraction of counted points; with fewer the score is infinite
 _N_SCORED, _N_REFINED = 1200, 800  # largest numbers of points of a segment, evenly spaced
 _GATES = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01)  # metres, one per iteration
-_NORMAL_REACH = 2  # pixels of an image of 640 columns around a pixel that determine its normal
-_LEAST_COMPARED = 12  # points of an object in an image of 640 x 480 pixels that determine a step
-_FEWEST_COMPARED = 6  # points of an object in an image of any size: each gives two equations for six unknowns
 _DAMPING = 1e-3  # of the largest eigenvalue; keeps directions that the data do not determine
 
 
@@ -127,21 +124,20 @@ def normals(frame: Frame) -> np.ndarray:
     """World unit normals (H, W, 3) that face the camera, with NaN where they are unknown. Cached by content."""
 
     def compute() -> np.ndarray:
-        h, valid = max(1, round(scaled_length(_NORMAL_REACH, frame.depth.shape[1]))), np.isfinite(frame.depth)
-        side = (2 * h + 1, 2 * h + 1)
+        valid = np.isfinite(frame.depth)
         points = np.where(valid[..., None], frame.points, 0.0).astype(np.float32)
-        weight = cv2.blur(valid.astype(np.float32), side)
+        weight = cv2.blur(valid.astype(np.float32), (5, 5))
         with np.errstate(invalid="ignore", divide="ignore"):
-            smooth = cv2.blur(points, side) / weight[..., None]
+            smooth = cv2.blur(points, (5, 5)) / weight[..., None]
         out = np.full(points.shape, np.nan, np.float32)
-        across = smooth[h:-h, 2 * h :] - smooth[h:-h, : -2 * h]
-        down = smooth[2 * h :, h:-h] - smooth[: -2 * h, h:-h]
+        across = smooth[2:-2, 4:] - smooth[2:-2, :-4]
+        down = smooth[4:, 2:-2] - smooth[:-4, 2:-2]
         normal = np.cross(down, across)
         with np.errstate(invalid="ignore", divide="ignore"):
-            out[h:-h, h:-h] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+            out[2:-2, 2:-2] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         # At a depth edge the difference spans two surfaces.
         jump = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1)) > 0.05
-        out[h:-h, h:-h][jump | ~valid[h:-h, h:-h]] = np.nan
+        out[2:-2, 2:-2][jump | ~valid[2:-2, 2:-2]] = np.nan
         return out
 
     return memo("normals", (frame.key,), compute)
@@ -171,7 +167,7 @@ def refine_motion(track: Track, T: np.ndarray) -> np.ndarray:
 
 
 def _improvement(track: Track, x: np.ndarray, before_grey: np.ndarray, gate: float) -> np.ndarray | None:
-    """The motion (4, 4) of one Gauss-Newton step; None if too few points can be compared.
+    """The motion (4, 4) of one Gauss-Newton step; None if fewer than 12 points can be compared.
 
     `x` (N, 3) are the moved points, `before_grey` (N,) their grey values in the first frame. `gate` is the largest
     distance in metres between a point and the measurement at its pixel.
@@ -187,7 +183,7 @@ def _improvement(track: Track, x: np.ndarray, before_grey: np.ndarray, gate: flo
     with np.errstate(invalid="ignore"):
         distance = np.einsum("ni,ni->n", normal, offset)
         near = after.valid[v, u] & np.isfinite(distance) & (np.linalg.norm(offset, axis=1) < gate)
-    if near.sum() < max(_FEWEST_COMPARED, scaled_area(_LEAST_COMPARED, after.depth.size)):
+    if near.sum() < 12:
         return None
     rows = np.flatnonzero(ok)[near]
     u, v, x, z = u[near], v[near], x[rows], z[rows]

@@ -44,6 +44,7 @@ _MAX_SIFT = 3  # SIFT motions of a segment
 _REST_BONUS = 0.15  # in S of `MotionResidual`; a motion must be better than rest by this much
 _MAX_SHIFT, _MAX_ANGLE = 0.6, 2.6  # metres at the segment's centre, radians
 _SEARCH_RADIUS, _SEARCH_STEP = 0.14, 0.01  # metres
+_FEW_POINTS = 12  # in an image of any size; the best place for fewer points is often wrong, unless it fits well
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +247,8 @@ class MstRule(MotionRule):
         Number of best candidates that are refined against the whole last frame. The refined motions are also used.
     search_above : float
         If every score is larger than this value, the object is searched for around its last position, upright and
-        toppled. A negative value disables the search.
+        toppled. If it has fewer than 12 points, it moves only to a place with a score up to this value. A negative
+        value disables the search.
     max_score : float
         A motion is refuted if its score reaches this value. The default is the score of a motion out of the image.
     registration : Registration
@@ -282,7 +284,8 @@ class MstRule(MotionRule):
             if _admissible(T, centre):
                 moving.append(self._scored(track, best.kind, T, best.support))
         if self.search_above >= 0 and min(c.score for c in [rest, *moving]) > self.search_above:
-            moving.extend(self._search(track, centre))
+            worst = np.inf if len(track.points) >= _FEW_POINTS else self.search_above
+            moving.extend(c for c in self._search(track, centre) if c.score <= worst)
         return (rest, *(c for c in moving if c.score < self.max_score))
 
     def choose(self, rng: np.random.Generator, candidates: tuple[Candidate, ...]) -> Candidate:

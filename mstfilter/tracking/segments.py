@@ -22,15 +22,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.results import Checked, check_array, check_list, returns
-from mstfilter.scene import Clip, Frame, Hypothesis, content_key, read_only, render_hypothesis, scaled_area
+from mstfilter.scene import Clip, Frame, Hypothesis, content_key, read_only, render_hypothesis, scaled_length
 from mstfilter.tracking.features import SiftMatching, matched_colour, smooth_colour
-from mstfilter.tracking.flow import ClipTracks, dilated
+from mstfilter.tracking.flow import ClipTracks
 from mstfilter.tracking.registration import Surface, prepare
 
 _TABLE_HEIGHT = 0.004  # metres; lower points belong to the table
-# Numbers and lengths in pixels are those of an image of 640 x 480 pixels.
-_LEAST_INTERIOR = 60  # pixels off the rim that are used without the rim
-_MATCH_REACH = 5  # pixels between a match and the mask in which it ends
+_LEAST_INTERIOR = 60  # pixels off the rim, in an image of any size, that determine a motion without the rim
+_MATCH_REACH = 5  # pixels of an image of 640 columns between a match and the mask in which it ends
 _MAX_CHANGED = 0.03  # largest fraction of changed pixels, among the comparable ones, of an object at rest
 _MIN_COMPARED = 0.3  # smallest fraction of comparable pixels of an object at rest
 _OCCLUDED_MARGIN = 0.015  # metres; a pixel whose depth decreased by more is occluded and not comparable
@@ -64,7 +63,7 @@ def segments_of(hypothesis: Hypothesis, frame: Frame) -> dict[int, Segment]:
     for label, pixels in _indices_by_label(labels).items():
         support = pixels[agrees.ravel()[pixels]]
         inner = support[interior.ravel()[support]]
-        support = inner if len(inner) >= scaled_area(_LEAST_INTERIOR, labels.size) else support
+        support = inner if len(inner) >= _LEAST_INTERIOR else support
         out[label] = Segment(content_key(pixels, content_key(voxels[label])), pixels, support)
     return out
 
@@ -146,7 +145,8 @@ class Track:
         """World points of SIFT matches that start in the mask and, with `in_target`, end near the target mask."""
         last = None
         if in_target:
-            last = dilated(self.target_mask, _MATCH_REACH)
+            side = 2 * max(1, round(scaled_length(_MATCH_REACH, self.mask.shape[1]))) + 1
+            last = cv2.dilate(self.target_mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         matches = sift.match(self.clip.before, self.clip.after)
         chosen = matches.within(self.mask, last)
         return matches.p[chosen], matches.q[chosen]

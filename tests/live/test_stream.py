@@ -59,7 +59,7 @@ def filtered(**more):
     return [state for state, _ in FAST.iterate(recording.clips(), 4)]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", [1, 2, 4, 8])
 def test_a_stream_has_the_results_of_the_recording(threads):
     states = filtered(pauses=RULE)
     scene_cache.clear()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from mstfilter.scene import Clip, Frame, Hypothesis
+from mstfilter.scene import Clip, Frame, Hypothesis, render
 from mstfilter.smc import Population
 from mstfilter.tracking import (
     AuthorsRule,
@@ -15,7 +15,9 @@ from mstfilter.tracking import (
     TrackingTransition,
     Warp,
 )
+from mstfilter.tracking.segments import segments_of
 from mstfilter.tracking.transition import _tracked_as
+from tests.scene.scenes import CAMERA, GRID as TABLE
 from tests.tracking.scenes import Box, Cylinder, Scene, at, errors, iou, slide
 
 RULES = {"mst": MstRule(), "paper": PaperRule(), "authors": AuthorsRule()}
@@ -167,6 +169,34 @@ def test_an_object_that_leaves_the_view_does_not_affect_others():
     )
     moved = predict(scene.clip(0), scene.hypothesis())
     np.testing.assert_array_equal(moved.particles[0].labels == 2, scene.hypothesis().labels == 2)
+
+
+def small_box(shift, camera):
+    """A box of 2 x 2 x 1 voxels that stands `shift` voxels further right: colour, depth and labels."""
+    labels = np.zeros(TABLE.shape, np.uint16)
+    labels[30 + shift : 32 + shift, 30:32, :1] = 1
+    seen = render(labels, TABLE, camera)
+    directions = camera.rays() @ camera.pose.as_matrix()[:3, :3].T
+    table = -camera.position[2] / np.minimum(directions[..., 2], -1e-6)
+    depth = np.where(seen.labels > 0, seen.depth, table).astype(np.float32)
+    checks = (np.floor((camera.position + depth[..., None] * directions) / 0.03).astype(int).sum(-1) % 2) * 30
+    rgb = np.where(seen.labels[..., None] > 0, [190, 60, 50], 130 + checks[..., None])
+    return rgb.astype(np.uint8), depth, labels
+
+
+@pytest.mark.parametrize("scale", [1, 4])
+@pytest.mark.parametrize("steps", [(0, 0, 0), (0, 1, 2, 3)])
+def test_a_small_object_is_tracked_in_images_of_any_size(scale, steps):
+    """The box has 6 readings in an image of 160 x 120, and 16 times as many, up to the rim, in one of 640 x 480."""
+    camera = CAMERA.scaled(scale)
+    frames = [Frame(*small_box(step, camera)[:2], camera) for step in steps]
+    h = Hypothesis.from_labels(small_box(0, camera)[2], TABLE)
+    (support,) = (segment.support for segment in segments_of(h, frames[0]).values())
+    assert 4 <= len(support) / scale**2 < 12
+    moved = predict(Clip(frames, TABLE, 1, tuple(map(float, steps)) if steps[-1] else (0.0, 1.0, 2.0)), h)
+    assert moved.notes["motions"] == {"search" if steps[-1] else "static": 1}
+    shift = moved.particles[0].record(1).motion.translation
+    np.testing.assert_allclose(shift, (0.01 * steps[-1], 0, 0), atol=0.002)
 
 
 @pytest.mark.parametrize("rule", RULES)
