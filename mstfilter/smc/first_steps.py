@@ -15,7 +15,7 @@ first three observations of a run (`iterate`) until it has seen particles that d
 of the particles. Two of them are processed alone and must get the densities that they have among the others
 (`compare_alone`). Functions that draw are called twice with the same stream and with other company
 (`check_draws`). A guided move must be able to go wherever the model goes (`check_reach`). The results of a run
-do not depend on these calls, which take about as long as one or two steps. ``mstfilter check ./model.py:model``
+do not depend on these calls, which take about as long as one to four steps. ``mstfilter check ./model.py:model``
 examines every step, with more particles.
 """
 
@@ -46,6 +46,7 @@ ALONE = (
     "each particle is processed as if it were alone: reduce over the entries of a particle with axis=1, not over "
     "particles, and give each particle its own noise",
     "arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]",
+    "a move that uses the population on purpose (Liu and West 2001) is a Transition of its own, not a model",
 )
 REPEATED = (
     "draw from the generator that the function gets, not from numpy.random, random or another one",
