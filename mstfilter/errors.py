@@ -58,7 +58,7 @@ class _WithHints(Exception):
 
 def _rebuilt(cls: type[_Error], args: tuple[Any, ...], attributes: dict[str, Any]) -> _Error:
     """An error with the given arguments and attributes, made without its constructor."""
-    new = cls.__new__(cls, *args)
+    new = _WithHints.__new__(cls, *args)  # whatever the constructor of the class takes
     new.__dict__.update(attributes)
     new.args = args
     if notes := attributes.get("__notes__"):
