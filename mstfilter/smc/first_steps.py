@@ -135,10 +135,10 @@ def compare_alone(what: str, function: Callable[..., Any], few: Few, *others: An
         return
     whole = _densities(what, function, columns, len(few), "")
     alone = _densities(what, function, [take(c, few.pair) for c in columns], len(few.pair), " alone")
-    same = close(whole[few.pair], alone, _LOG_DENSITY, 1.0)
+    same = nearly_equal(whole[few.pair], alone, _LOG_DENSITY, 1.0)
     if same.all():
         return
-    if not close(_densities(what, function, columns, len(few), ""), whole, _LOG_DENSITY, 1.0).all():
+    if not nearly_equal(_densities(what, function, columns, len(few), ""), whole, _LOG_DENSITY, 1.0).all():
         raise InputError(f"{what} differs when it is computed again for the same particles", *REPEATED)
     k = int(np.argmin(same))
     raise InputError(
@@ -160,7 +160,7 @@ def _densities(what: str, function: Callable[..., Any], columns: Any, m: int, al
     return found
 
 
-def close(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
+def nearly_equal(a: Any, b: Any, tolerance: float, scale: Any = 0.0) -> np.ndarray:
     """Whether entries are equal up to a relative tolerance; NaN equals NaN."""
     a, b = np.asarray(a), np.asarray(b)
     equal = np.asarray(a == b)
@@ -193,7 +193,7 @@ def first_difference(ours: Any, again: Any, rows: Any = slice(None)) -> str | No
     if ours.shape != again.shape:
         return f"the shapes {ours.shape} and {again.shape}"
     a, b = ours[rows], again[rows]
-    return None if (a == b).all() or close(a, b, _VALUE, spread(ours)).all() else "the particles"
+    return None if (a == b).all() or nearly_equal(a, b, _VALUE, spread(ours)).all() else "the particles"
 
 
 # --- draws ----------------------------------------------------------------------------------------------------------

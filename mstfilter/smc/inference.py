@@ -37,7 +37,7 @@ from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.population import Particles, flat_columns, union
 from mstfilter.smc.state_space import metropolis
 from mstfilter.smc.streams import Key
-from mstfilter.smc.sweep import can_sweep, sweep
+from mstfilter.smc.sweep import can_sweep, sweep_runs
 
 FilterOf = Callable[[np.ndarray], ParticleFilter]
 
@@ -138,7 +138,7 @@ class _Posterior:
             return self.filter_of(np.repeat(thetas[list(runs)], first.n, axis=0).T)
 
         key = Key(int(seeds[0])).child("sweep", *map(int, seeds[1:3]))
-        runs = sweep(
+        runs = sweep_runs(
             first, self.observations, seeds, key, {"z": log_evidence}, lambda runs: made(tuple(runs.tolist()))
         )
         return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])

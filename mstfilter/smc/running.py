@@ -38,7 +38,7 @@ from mstfilter.smc.history import Collector, History, check_collectors, check_on
 from mstfilter.smc.inputs import check_observations
 from mstfilter.smc.interfaces import Info, State
 from mstfilter.smc.streams import Key
-from mstfilter.smc.sweep import Collected, can_sweep, sweep
+from mstfilter.smc.sweep import Collected, can_sweep, sweep_runs
 
 
 def run_many(
@@ -179,7 +179,7 @@ class _Job:
             with suppress(LostRunError):
                 list(islice(filter.iterate(self.ys, seeds[0]), 3))
             key = Key(seeds[0]).child("sweep", sha256(repr(seeds).encode()).hexdigest())
-            runs = sweep(filter, self.ys, seeds, key, self.collectors)
+            runs = sweep_runs(filter, self.ys, seeds, key, self.collectors)
         return {(arm, seed): run for seed, run in zip(seeds, runs, strict=True)}
 
     def single(self, arm: str, seed: int) -> Collected:

@@ -6,7 +6,7 @@ with 20,000 particles instead of 200 calls with 100: a thirtieth of the time.
 
 >>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, log_evidence
 >>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
->>> runs = sweep(bootstrap(model, 100), [0.3, -0.2], [1, 2, 3, 4, 5], Key(0), {"log_evidence": log_evidence})
+>>> runs = sweep_runs(bootstrap(model, 100), [0.3, -0.2], [1, 2, 3, 4, 5], Key(0), {"log_evidence": log_evidence})
 >>> [run.rows["log_evidence"].shape for run in runs]
 [(2,), (2,), (2,), (2,), (2,)]
 
@@ -49,7 +49,7 @@ def can_sweep(filter: ParticleFilter) -> bool:
     return filter.resampler.exact_size and all(c is None or c.alone for c in components)
 
 
-def sweep(
+def sweep_runs(
     filter: ParticleFilter,
     observations: list[Any],
     seeds: list[int],

@@ -22,7 +22,16 @@ import numpy as np
 
 from mstfilter.errors import InputError, describe_error as reason
 from mstfilter.fields import copied
-from mstfilter.smc.first_steps import DRAWS, MOST, Few, check_own_noise, check_reach, close, spread, spread_rows
+from mstfilter.smc.first_steps import (
+    DRAWS,
+    MOST,
+    Few,
+    check_own_noise,
+    check_reach,
+    nearly_equal,
+    spread,
+    spread_rows,
+)
 from mstfilter.smc.population import Population, take
 from mstfilter.smc.programs.handlers import GivenHandler, GuideHandler, ReplayHandler, SampleHandler
 from mstfilter.smc.programs.sites import Call, ProgramRun, recorded
@@ -30,7 +39,7 @@ from mstfilter.smc.streams import child
 
 #: Differences that count as rounding: single-precision networks give other digits for other numbers of rows.
 _LOG_DENSITY, _VALUE = 1e-3, 1e-5
-ALONE = (
+_ALONE = (
     "each particle is processed as if it were alone: reduce over entries with axis=1, not over the particles",
     'previous["x"] has one row for each particle, in a branch of switch as an argument; draw by sample(...) only',
     "arrays (n, 1) and (n,) combine to (n, n): use x[:, 0], or z[:, None]",
@@ -71,7 +80,7 @@ def examine_program(
     except Exception as error:
         hints = error.hints if isinstance(error, InputError) else ()
         message = f"the step fails for {len(rows)} of {n} particles alone: {reason(error)}"
-        raise InputError(message, *hints, *ALONE) from error
+        raise InputError(message, *hints, *_ALONE) from error
     kinds = {type(call.distribution).__module__.split(".")[0] for whole in runs for call in whole.calls or ()}
     if thorough or not kinds <= {"builtins", "mstfilter"}:  # a distribution of the user may draw as it likes
         _check_repeated(runs, step)
@@ -122,7 +131,7 @@ def _first_difference(particles: Mapping[str, np.ndarray], again: Mapping[str, n
     if list(particles) != list(again):
         return f"the names {sorted(set(particles) ^ set(again))}"
     pairs = ((name, np.asarray(a), np.asarray(again[name])) for name, a in particles.items())
-    different = (name for name, a, b in pairs if a.shape != b.shape or not close(a, b, 1e-9).all())
+    different = (name for name, a, b in pairs if a.shape != b.shape or not nearly_equal(a, b, 1e-9).all())
     return next((f"values of {name!r}" for name in different), None)
 
 
@@ -173,13 +182,13 @@ def _check_alone(
     except Exception as error:
         hints = error.hints if isinstance(error, InputError) else ()
         message = f"the step fails for particles {sorted(set(rows.tolist()))} alone: {error}"
-        raise InputError(message, *hints, *ALONE) from error
+        raise InputError(message, *hints, *_ALONE) from error
     alone = {(c.what, c.k): c for c in few.calls or ()}
     for call in whole.calls or ():
         _compare(call, alone.pop((call.what, call.k), None), rows, thorough)
     for call in alone.values():
         if call.size:
-            raise InputError(f"{call.what} is reached by particle {rows[0]} alone only", *ALONE)
+            raise InputError(f"{call.what} is reached by particle {rows[0]} alone only", *_ALONE)
     for name, values in whole.returned.items():
         _compare_returned(name, values, few.returned.get(name, values[rows]), rows)
 
@@ -195,7 +204,7 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray, thorough: bool) -
     if alone is None or list(here) != list(there):
         left_out = np.setdiff1d(here, there)
         if np.setdiff1d(there, here).size or (call.distribution is None and among[position[left_out]].any()):
-            raise InputError(f"{call.what} is not reached by the same particles among the others and alone", *ALONE)
+            raise InputError(f"{call.what} is not reached by the same particles among the others and alone", *_ALONE)
         return
     if not len(here):
         return
@@ -206,27 +215,27 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray, thorough: bool) -
         values = [np.full(c.value.shape, other, c.value.dtype) for c in (call, alone)]
         pairs.append((call.densities(values[0]), alone.densities(values[1])))
     for found, expected in pairs:
-        different = ~close(found[k], expected, _LOG_DENSITY, 1.0)
+        different = ~nearly_equal(found[k], expected, _LOG_DENSITY, 1.0)
         if different.any():
             i = int(np.argmax(different))
             raise InputError(
                 f"{call.what}: particle {rows[here[i]]} has log density {found[k][i]:.6g} among the others, "
                 f"{expected[i]:.6g} alone",
-                *ALONE,
+                *_ALONE,
             )
 
 
 def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np.ndarray) -> None:
     """Raise InputError unless the particles `rows` have the same returned values among all particles and alone."""
     if alone.shape[1:] != values.shape[1:]:
-        raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}", *ALONE)
-    different = ~close(values[rows], alone, _VALUE, spread(values))
+        raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}", *_ALONE)
+    different = ~nearly_equal(values[rows], alone, _VALUE, spread(values))
     if different.any():
         i = tuple(np.argwhere(different)[0])
         raise InputError(
             f"returned {name!r} of particle {rows[i[0]]} is {values[rows][i]} among {len(values)} particles, "
             f"{alone[i]} alone",
-            *ALONE,
+            *_ALONE,
         )
 
 
