@@ -11,6 +11,7 @@ import math
 import subprocess
 import time
 from collections import deque
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -72,15 +73,18 @@ def data(T: int) -> list[float]:
     return ys
 
 
+@dataclass(frozen=True)
 class Box:
     """A particle that is a Python object."""
+
+    weight: int
 
 
 class Boxes(Proposal):
     """Proposes new particles that are Python objects."""
 
     def sample(self, rng, observation, n):
-        return Population(tuple(Box() for _ in range(n)))
+        return Population(tuple(map(Box, range(n))))
 
 
 class Stay(Transition):
@@ -140,7 +144,7 @@ def main() -> None:
     objects = ParticleFilter(
         initial=Boxes(),
         transition=Stay(),
-        update=Reweight(lambda particles, y: np.arange(len(particles)) * 0.1),
+        update=Reweight(lambda particles, y: np.array([0.1 * box.weight for box in particles])),
         trigger=Always(),
         n=5,
     )

@@ -186,6 +186,7 @@ class LargestWeights(WeightResampler):
     """
 
     properly_weighted: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
 
     def select(self, rng: np.random.Generator, log_weights: np.ndarray, n: int) -> tuple[np.ndarray, None]:
         checked_weights(log_weights, n)

@@ -92,7 +92,7 @@ def test_the_first_transition_is_called_with_the_second_step():
 
 def test_batches_smoothing_and_conditional_paths_take_inputs():
     filter = bootstrap(MODEL, 20)
-    runs = run_many(filter, WITH, [3, 4])
+    runs = run_many(filter, WITH, [3, 4], together=False)
     single = [filter.run(WITH, seed)[0] for seed in (3, 4)]
     assert [state.log_evidence for state in single] == runs["log_evidence"][:, -1].tolist()
     path = conditional_path(filter, WITH, 1)

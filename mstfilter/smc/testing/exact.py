@@ -60,12 +60,17 @@ class ExactContract(Contract):
         return n
 
     def compare_small(
-        self, call: Callable[[int], tuple[np.ndarray, np.ndarray]], exact: np.ndarray, exact_lw: np.ndarray
+        self,
+        call: Callable[[int], tuple[np.ndarray, np.ndarray]],
+        exact: np.ndarray,
+        exact_lw: np.ndarray,
+        independent: bool = True,
     ) -> np.ndarray:
         """Compare many calls with three particles with exact draws. Returns the log weights of all calls.
 
         With many particles a fault of order 1 / n does not show, as that of a mean over the population.
-        ``call(k)`` returns the rows of call k, and what their log weights are compared by.
+        ``call(k)`` returns the rows of call k, and what their log weights are compared by. Rows of one call need not
+        be `independent` if they are drawn by strata, sorted or antithetic.
         """
         rows, weights = [], []
         for k in range(_SMALL_CALLS):
@@ -75,7 +80,7 @@ class ExactContract(Contract):
             weights.append(lw)
         self.compare_weighted(np.concatenate(rows), np.concatenate(weights), exact, exact_lw)
         for j in range(exact.shape[1]):
-            if all(len(row) == SMALL for row in rows):
+            if independent and all(len(row) == SMALL for row in rows):
                 pairs = np.array([row[:2, j] for row in rows])
                 check_uncorrelated(
                     pairs[:, 0], pairs[:, 1], 20 * exact.shape[1], f"coordinate {j} of {self.columns} of two of three"
