@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 import numpy as np
-from scipy.stats import ks_2samp
 
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import Population
@@ -107,6 +106,8 @@ class SceneTransitionContract(TransitionContract):
     @statistical
     def test_places_of_hypotheses_are_irrelevant(self) -> None:
         """Copies of one hypothesis move by the same law, whatever their places in the population."""
+        from scipy.stats import ks_2samp
+
         known = known_motions()[0]
         found = self._shifts(known, _CALLS)
         shifts = np.nan_to_num(found).reshape(len(found), _COPIES, -1)
