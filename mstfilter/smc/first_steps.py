@@ -209,7 +209,7 @@ def check_draws(what: str, draw: Draw, few: Few, rng: np.random.Generator) -> Pa
 
     Returns the draws of the `few` particles; None if these are objects or one particle, which are not examined.
     """
-    if len(few) < 2 or not _numeric(few.particles):
+    if len(few) < 2 or not is_numeric(few.particles):
         return None
     rows = np.arange(MOST) % len(few)
     company = few.particles if len(few) == MOST else take(few.particles, rows)
@@ -248,7 +248,7 @@ def check_own_noise(what: str, drawn: Any, draw_again: Callable[[], Any], copies
 
     If copies move independently to two values with probabilities p and q, the false-alarm rate is (p q)^16 < 1e-9.
     """
-    columns = [*_columns(drawn, copies)] if _numeric(drawn) else []
+    columns = [*_columns(drawn, copies)] if is_numeric(drawn) else []
     shared = [j for j, column in enumerate(columns) if len(column) >= 16 and (column == column[0]).all()]
     if not shared:
         return
@@ -280,7 +280,7 @@ def _check_law(what: str, draw: Draw, few: Few, rng: np.random.Generator) -> Non
                     )
 
 
-def _numeric(particles: Any) -> bool:
+def is_numeric(particles: Any) -> bool:
     """Whether particles are an array of numbers, or a mapping of such."""
     arrays = particles.values() if isinstance(particles, Mapping) else (particles,)
     return all(isinstance(a, np.ndarray) and a.dtype != object for a in arrays)

@@ -137,11 +137,11 @@ class _Sweep:
         population, moved, ancestors = self.without_lost(t, population, moved, ancestors)
         lw = population.log_weights.reshape(len(self.runs), -1)
         self.ess, self.log_mean = summaries(lw)
-        fused_ess = self.ess
         if not before:
             population, moved, ancestors = self.select(t, population, None, None)
+            _, self.log_mean = summaries(population.log_weights.reshape(len(self.runs), -1))  # as `State` has it
         self.population = Population.unchecked(population.particles, population.log_weights)
-        self.record(t, fused_ess, moved, ancestors)
+        self.record(t, moved, ancestors)
 
     def rng(self, slot: str, t: int) -> np.random.Generator:
         """The stream of a component in this step, for all runs."""
@@ -226,14 +226,12 @@ class _Sweep:
         return np.stack(index), np.stack(found)
 
     # --- results ----------------------------------------------------------------------------------------------------
-    def record(self, t: int, fused_ess: np.ndarray, moved: np.ndarray, ancestors: np.ndarray) -> None:
+    def record(self, t: int, moved: np.ndarray, ancestors: np.ndarray) -> None:
         """Store the results of the collectors for each run."""
         proper = self.filter.properly_weighted
         log_mean = self.log_mean if proper else np.full(len(self.runs), np.nan)
-        found = {log_evidence: log_mean, ess: fused_ess, resampled: moved}
-        steps = (
-            [self.seen(t, row, fused_ess, moved, ancestors) for row in range(len(self.runs))] if self.traced else []
-        )
+        found = {log_evidence: log_mean, ess: self.ess, resampled: moved}
+        steps = [self.seen(t, row, moved, ancestors) for row in range(len(self.runs))] if self.traced else []
         values = {
             name: found[collector]
             if collector in found
@@ -242,9 +240,7 @@ class _Sweep:
         }
         self.found.append((self.runs, values))
 
-    def seen(
-        self, t: int, row: int, fused_ess: np.ndarray, moved: np.ndarray, ancestors: np.ndarray
-    ) -> tuple[State, Info]:
+    def seen(self, t: int, row: int, moved: np.ndarray, ancestors: np.ndarray) -> tuple[State, Info]:
         """State and `Info` of one run after step t."""
         assert self.population is not None
         n, rows = self.filter.n, slice(row * self.filter.n, (row + 1) * self.filter.n)
@@ -255,7 +251,7 @@ class _Sweep:
         particles = take(self.population.particles, np.arange(rows.start, rows.stop))
         population = Population(particles, self.population.log_weights[rows], parents)
         key = Key(self.seeds[self.runs[row]]).child("sweep")
-        info = Info(t, n, n, float(fused_ess[row]), bool(moved[row]))
+        info = Info(t, n, n, float(self.ess[row]), bool(moved[row]))
         return State(t + 1, population, key, self.filter.properly_weighted), info
 
     def collected(self, collector: Collector, row: int, step: tuple[State, Info]) -> np.ndarray:

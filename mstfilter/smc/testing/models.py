@@ -13,7 +13,7 @@ them, and compares draws with densities. ``mstfilter check ./model.py:model`` ru
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 from unittest import SkipTest
@@ -38,7 +38,7 @@ from mstfilter.smc import (
     normalise,
 )
 from mstfilter.smc.distributions import hypothetical
-from mstfilter.smc.first_steps import Few, compare_alone, unexamined
+from mstfilter.smc.first_steps import Few, compare_alone, is_numeric, unexamined
 from mstfilter.smc.inputs import split_input
 from mstfilter.smc.population import Particles, count_particles, take
 from mstfilter.smc.programs.examination import examine_program
@@ -77,11 +77,9 @@ class ModelContract(ExactContract):
 
     def steps(self) -> Iterator[tuple[ParticleFilter, Population | None, Any, Population, np.random.Generator]]:
         """Each step of a run: its filter, the particles before, the observation, those after, and a generator."""
-        filter, before = self.filter(), None
+        filter, before, ys = self.filter(), None, self.data()
         with unexamined():
-            for t, (given, (state, _)) in enumerate(
-                zip(self.data(), filter.iterate(self.data(), _SEED), strict=False)
-            ):
+            for t, (given, (state, _)) in enumerate(zip(ys, filter.iterate(ys, _SEED), strict=False)):
                 self.check_time()
                 y, u = split_input(given)
                 stream = Key(_SEED).child("transition" if t else "initial", t)  # as the filter made it
@@ -152,7 +150,7 @@ class ModelContract(ExactContract):
         """Copies of a particle move independently, and with the same law at every place in the array."""
         filter, before, y, *_ = self._step(2)
         transition: Any = filter.transition
-        if before is None or transition is None or not _is_numeric(before.particles):
+        if before is None or transition is None or not is_numeric(before.particles):
             raise SkipTest("the particles are objects, whose moves are not compared")
         n = 20_000
         copies = Population(take(before.particles, np.full(n, len(before) // 2)))
@@ -310,14 +308,9 @@ def simulated(filter: ParticleFilter, n_steps: int, seed: int = 0) -> list[Any]:
 def _groups(particles: Particles) -> list[Few]:
     """All particles, with two of middle, of small and of large values."""
     few = Few.of(particles, count_particles(particles))
-    column = as_matrix(few.particles)[:, 0] if _is_numeric(particles) else np.arange(len(few))
+    column = as_matrix(few.particles)[:, 0] if is_numeric(particles) else np.arange(len(few))
     order = np.argsort(column, kind="stable")
     return [few, *(replace(few, pair=pair) for pair in (order[[1, 0]], order[[-1, -2]]))] if len(few) > 3 else [few]
-
-
-def _is_numeric(particles: Any) -> bool:
-    arrays = particles.values() if isinstance(particles, Mapping) else (particles,)
-    return all(isinstance(a, np.ndarray) and a.dtype != object for a in arrays)
 
 
 def _matrix(particles: Particles) -> np.ndarray:
