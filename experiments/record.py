@@ -45,13 +45,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mstfilter.processes import machine
-from mstfilter.reading import read_json
+from mstfilter.base.processes import machine
+from mstfilter.base.reading import read_json
 from mstfilter.runs import library_versions, write_json
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PROGRAM = ("mstfilter", "models")
-NO_RESULTS = tuple(f"mstfilter/{name}/" for name in ("cli", "report", "live", "testing", "smc/testing"))
+NO_RESULTS = tuple(f"mstfilter/{name}/" for name in ("app", "runs/live", "mst/testing", "smc/testing"))
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ these files of all families, in the folder `rows` beside the TOML file.
 
 The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
 scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
-minus the reference in the primary endpoints: unadjusted t interval, studentised bootstrap, both p values, skewness,
-p after Holm over endpoints, families and arms, and the conclusion (see `mstfilter.statistics`). The differences are
-also printed as tables for the README, with a warning if an arm has fewer scenes than the reference. NAME_cases.csv
-has the quality of visible, hidden and never seen objects, averaged over cases (one object at one pause t >= 1).
-NAME_time.csv has the core seconds of steps t >= 1. They differ between the first filter seed, in which an arm may be
-the first to process a recording, and later seeds, which use shared results on disk. With --pooled,
+minus the reference in the primary endpoints: unadjusted t interval, studentised bootstrap, both p values, skewness, p
+after Holm over endpoints, families and arms, and the conclusion (see `mstfilter.scoring.statistics`). The differences
+are also printed as tables for the README, with a warning if an arm has fewer scenes than the reference.
+NAME_cases.csv has the quality of visible, hidden and never seen objects, averaged over cases (one object at one pause
+t >= 1). NAME_time.csv has the core seconds of steps t >= 1. They differ between the first filter seed, in which an
+arm may be the first to process a recording, and later seeds, which use shared results on disk. With --pooled,
 NAME_pooled_differences.csv has the differences over the scenes of all families together, and
 NAME_pooled_described.csv has these differences in further metrics. NAME_pooled_pauses.csv has the means by pause, and
 the change from pause 1 to the last pause with its 95 % interval over scenes.
@@ -34,9 +34,9 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from mstfilter.files import write_csv
-from mstfilter.statistics import interval
-from mstfilter.study import ENDPOINTS, StudyFolder, Summary, cost_columns, load_study, make_plan, summarise
+from mstfilter.base.files import write_csv
+from mstfilter.runs.study import ENDPOINTS, StudyFolder, Summary, cost_columns, load_study, make_plan, summarise
+from mstfilter.scoring.statistics import interval
 
 Row = Mapping[str, Any]
 

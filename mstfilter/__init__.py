@@ -5,13 +5,13 @@
 >>> state, infos = mstfilter.preset("mst").run(recording.clips(), seed=0)
 >>> mstfilter.Belief(state.population).estimate().volumes()
 
-`mstfilter.presets` has assembled filters, `mstfilter.smc` has the particle filter, and `mstfilter.scene` has cameras,
-recordings and hypotheses.
+`mstfilter.runs.presets` has assembled filters, `mstfilter.smc` has the particle filter, and `mstfilter.scene` has
+cameras, recordings and hypotheses.
 """
 
 import logging
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 logging.getLogger("mstfilter").addHandler(logging.NullHandler())  # the application decides what is shown
 __version__ = "0.2.0"

@@ -1,8 +1,8 @@
-from mstfilter.belief import Belief as Belief
-from mstfilter.errors import InputError as InputError
+from mstfilter.base.errors import InputError as InputError
 from mstfilter.formats import open_recording as open_recording
-from mstfilter.live import Stream as Stream
-from mstfilter.presets import preset as preset
+from mstfilter.mst.belief import Belief as Belief
+from mstfilter.runs.live import Stream as Stream
+from mstfilter.runs.presets import preset as preset
 from mstfilter.scene import (
     Camera as Camera,
     Clip as Clip,

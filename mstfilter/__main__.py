@@ -1,5 +1,5 @@
 """Run the command line by ``python -m mstfilter``."""
 
-from mstfilter.cli import main
+from mstfilter.app.cli import main
 
 main()

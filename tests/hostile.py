@@ -25,23 +25,23 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.completion import NetworkCompleter
-from mstfilter.errors import InputError
+from mstfilter.app.report import run_page, write_report, write_study_report
+from mstfilter.base.errors import InputError
+from mstfilter.base.reading import read_bytes
+from mstfilter.base.trained import open_model, write_model
 from mstfilter.formats import RecordingWriter, open_recording
-from mstfilter.frontends import read_masks, write_masks
-from mstfilter.frontends.completions import place_shape, read_shapes
-from mstfilter.presets import build_filter, load_config
-from mstfilter.reading import read_bytes
-from mstfilter.report import run_page, write_report, write_study_report
+from mstfilter.mst.completion import NetworkCompleter
+from mstfilter.mst.frontends import read_masks, write_masks
+from mstfilter.mst.frontends.completions import place_shape, read_shapes
 from mstfilter.runs import RunFolder
+from mstfilter.runs.presets import build_filter, load_config
+from mstfilter.runs.study import StudyFolder, check_arm_names, load_study
 from mstfilter.scene import DiskCache, write_image
 from mstfilter.scoring import NO_COUNTS
 from mstfilter.smc import Key, Population, State, load_state, save_state
-from mstfilter.study import StudyFolder, check_arm_names, load_study
-from mstfilter.trained import open_model, write_model
+from tests.app.report.runs import make_run
+from tests.app.report.test_study_report import make_study
 from tests.formats import bags, layouts
-from tests.report.runs import make_run
-from tests.report.test_study_report import make_study
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
@@ -141,7 +141,7 @@ def _write_weights(path: Path) -> None:
 
 
 def _read_weights(path: Path) -> None:
-    from mstfilter.completion.unet import load_network  # imports torch
+    from mstfilter.mst.completion.unet import load_network  # imports torch
 
     load_network.cache_clear()
     _ = NetworkCompleter(weights=str(path)).network

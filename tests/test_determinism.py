@@ -7,19 +7,19 @@ import json
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.formats import open_recording
-from mstfilter.presets import load_config
 from mstfilter.runs import filter_recording
+from mstfilter.runs.presets import load_config
 from mstfilter.scene import Frame, render, scene_cache
 from tests import hostile
-from tests.report.runs import recording
+from tests.app.report.runs import recording
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
 
 def completed() -> bytes:
     """What the completion network makes of an object."""
-    from mstfilter.completion import NetworkCompleter
+    from mstfilter.mst.completion import NetworkCompleter
 
     rgb, depth, labels = table_scene()
     frame, mask = Frame(rgb, depth, CAMERA), render(labels, GRID, CAMERA).labels == 1
@@ -29,7 +29,7 @@ def completed() -> bytes:
 
 def borders() -> bytes:
     """The output of the border network for an image."""
-    from mstfilter.segmentation.border_network import load_border_network
+    from mstfilter.mst.segmentation.border_network import load_border_network
 
     rgb, depth, _ = table_scene()
     return load_border_network("border").look(Frame(rgb, depth, CAMERA)).border.tobytes()
@@ -39,8 +39,8 @@ def borders() -> bytes:
 def test_networks_use_one_thread_and_restore_the_number(monkeypatch, result):
     import torch
 
-    from mstfilter.completion import NetworkCompleter
-    from mstfilter.segmentation.border_network import load_border_network
+    from mstfilter.mst.completion import NetworkCompleter
+    from mstfilter.mst.segmentation.border_network import load_border_network
 
     network, name = (
         (NetworkCompleter().network, "forward")
@@ -77,7 +77,7 @@ def test_a_run_states_its_machine_and_is_resumed_on_another(tmp_path, monkeypatc
 def test_a_matplotlibrc_of_the_user_does_not_change_a_figure():
     import matplotlib
 
-    from mstfilter.report.figures import quality_figure
+    from mstfilter.app.report.figures import quality_figure
 
     def drawn() -> str:
         return quality_figure(

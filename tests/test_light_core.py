@@ -21,7 +21,7 @@ class Blocked:
 
 sys.meta_path.insert(0, Blocked())
 """
-COMMAND = "from mstfilter.cli import main; main(sys.argv[1:])"
+COMMAND = "from mstfilter.app.cli import main; main(sys.argv[1:])"
 
 
 def light(program, *arguments):
@@ -34,7 +34,7 @@ def test_filters_and_resampling():
     done = light(
         "import numpy as np\n"
         "from mstfilter.smc import *\n"
-        "from mstfilter.presets import REGISTRY\n"
+        "from mstfilter.runs.presets import REGISTRY\n"
         "model = linear_gaussian(np.eye(1), np.eye(1), np.eye(1), np.eye(1), np.zeros(1), np.eye(1))\n"
         "for name in REGISTRY.known('resampler'):\n"
         "    scheme = REGISTRY.find_class('resampler', name)()\n"
@@ -71,7 +71,7 @@ def test_other_commands_say_what_they_need(arguments, tmp_path):
 
 
 def test_a_component_says_which_library_it_needs():
-    done = light("from mstfilter.presets import REGISTRY; REGISTRY.find_class('update', 'partition')")
+    done = light("from mstfilter.runs.presets import REGISTRY; REGISTRY.find_class('update', 'partition')")
     assert "MissingLibraryError: update: component 'partition' needs networkx" in done.stderr
     assert done.stderr.endswith("hint: pip install networkx\n")
 
@@ -81,4 +81,4 @@ def test_storing_a_run_imports_neither_programs_nor_studies():
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=600)
     loaded = done.stdout.split()
     assert "mstfilter.smc.checkpoint" in loaded
-    assert not [name for name in loaded if name.startswith(("mstfilter.smc.programs", "mstfilter.study"))]
+    assert not [name for name in loaded if name.startswith(("mstfilter.smc.models.programs", "mstfilter.runs.study"))]

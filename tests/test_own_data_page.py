@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import mstfilter
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, open_recording
 from mstfilter.scene import (
     Camera,
@@ -31,11 +31,11 @@ from mstfilter.scene import (
     report_findings,
     write_image,
 )
+from tests.app.test_cli import call
 from tests.conftest import REPOSITORY
 from tests.formats import layouts
 from tests.formats.bags import scene_messages, write as write_bag
 from tests.scene.test_recording import write
-from tests.test_cli import call
 from tests.wrong_inputs import WRONG, right
 
 NAMES = ("own-data", "formats", "scores", "real-images", "troubleshooting")

@@ -15,7 +15,8 @@ import mstfilter
 from tests.conftest import REPOSITORY
 
 ASK = (
-    "import mstfilter, pathlib; from mstfilter.presets import load_config; from mstfilter.resources import *; "
+    "import mstfilter, pathlib; from mstfilter.base.resources import *; "
+    "from mstfilter.runs.presets import load_config; "
     "[load_config(n) for n in preset_names()]; "
     "print(pathlib.Path(mstfilter.__file__).parent, models_folder(), *preset_names(), sep='\\n')"
 )
@@ -65,9 +66,11 @@ def test_in_a_wheel(wheel, tmp_path):
     assert {"mstfilter/_models/mst.toml", *programs} <= set(names)
     assert "mstfilter/_examples/resampler.py" in names
     assert "mstfilter/_examples/scenes/transition.py" in names
-    assert {"mstfilter/report/templates/viewer.html", "mstfilter/report/figures.mplstyle"} <= set(names)
+    assert {"mstfilter/app/report/templates/viewer.html", "mstfilter/app/report/figures.mplstyle"} <= set(names)
     assert "mstfilter/py.typed" in names
-    assert any(name.startswith("mstfilter/report/") and name.endswith((".html", ".j2", ".jinja")) for name in names)
+    assert any(
+        name.startswith("mstfilter/app/report/") and name.endswith((".html", ".j2", ".jinja")) for name in names
+    )
     assert not [
         name for name in names if name.startswith(("tests/", "experiments/", "docs/")) or name.endswith(".pyc")
     ]

@@ -18,16 +18,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mstfilter.cli import main
-from mstfilter.errors import InputError, InputWarning
-from mstfilter.files import damaged_files
+from mstfilter.app.cli import main
+from mstfilter.app.report import write_report
+from mstfilter.base.errors import InputError, InputWarning
+from mstfilter.base.files import damaged_files
+from mstfilter.base.reading import read_arrays
+from mstfilter.base.trained import open_model, write_model
 from mstfilter.formats import open_recording
-from mstfilter.reading import read_arrays
-from mstfilter.report import write_report
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import DiskCache, read_rgb
-from mstfilter.simulation import cached_recording
 from mstfilter.smc import run_many
-from mstfilter.trained import open_model, write_model
 from tests import hostile
 from tests.conftest import REPOSITORY
 
@@ -93,7 +93,7 @@ def test_spoiled_inputs_are_read_or_refused(examples, tmp_path, name):
     ],
 )
 def test_a_run_folder_is_checked_before_a_report_is_drawn(examples, tmp_path, file, spoiled, monkeypatch):
-    monkeypatch.setattr("mstfilter.report.run_report.read_numbers", lambda run: pytest.fail("it is drawn"))
+    monkeypatch.setattr("mstfilter.app.report.run_report.read_numbers", lambda run: pytest.fail("it is drawn"))
     for key, value in spoiled.items():
         path = hostile.copy(examples / "run", tmp_path / "trial" / "it")
         data = json.loads((path / file).read_text())
@@ -111,7 +111,7 @@ def test_an_image_is_not_decoded_if_its_header_announces_too_much(tmp_path):
 @pytest.mark.parametrize(("shape", "gigabytes"), [((10**6, 10**6), 0), ((2**23,), 1 / 64)])
 def test_an_array_is_not_unpacked_if_it_is_too_large(tmp_path, monkeypatch, shape, gigabytes):
     """By its header, or by what it contains."""
-    monkeypatch.setattr("mstfilter.reading.MAX_FILE", 2**20)
+    monkeypatch.setattr("mstfilter.base.reading.MAX_FILE", 2**20)
     (tmp_path / "a.npz").write_bytes(hostile.bomb(shape, gigabytes=gigabytes))
     with limits(megabytes=200), pytest.raises(InputError, match="does not fit|at most 1048576 are read"):
         read_arrays(tmp_path / "a.npz", "volumes")
@@ -164,7 +164,9 @@ def test_control_characters_do_not_reach_the_terminal(tmp_path, capsys):
 def test_out_of_memory_and_disk_in_plain_words(monkeypatch, capsys):
     full = OSError(errno.ENOSPC, "No space left on device", "x")
     for error, words in ((MemoryError("x"), "out of memory"), (full, "no space left")):
-        monkeypatch.setattr("mstfilter.study.load_study", lambda *_, error=error, **__: (_ for _ in ()).throw(error))
+        monkeypatch.setattr(
+            "mstfilter.runs.study.load_study", lambda *_, error=error, **__: (_ for _ in ()).throw(error)
+        )
         with pytest.raises(SystemExit) as end:
             main(["study", "x.toml"])
         assert end.value.code == 1
@@ -205,7 +207,7 @@ def start(what: str) -> None:
         model = linear_gaussian(*[[[1.0]]] * 4, m0=[0.0], P0=[[1.0]])
         run_many({"a": bootstrap(model, n=10)}, [[0.0], [1.0]], seeds=[0, 1], workers=2)
     else:
-        from mstfilter.study import Local
+        from mstfilter.runs.study import Local
 
         outcomes = Local(workers=1).run([{"kind": "none"}], print)
         assert outcomes[0].status == "failed" and "kind" not in outcomes[0].error, outcomes

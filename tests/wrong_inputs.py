@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.formats import open_recording
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import Hypothesis, VoxelGrid, look_at
-from mstfilter.simulation import cached_recording
 from tests.scene.scenes import CAMERA, table_scene
 
 

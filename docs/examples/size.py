@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import PositiveFloat, PositiveInt
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import PositiveFloat, PositiveInt
 from mstfilter.smc import Population, Size, bootstrap, linear_gaussian
 
 

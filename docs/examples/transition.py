@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import Population, Transition, bootstrap, linear_gaussian
 
 

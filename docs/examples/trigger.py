@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import Population, Trigger, bootstrap, linear_gaussian
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from speed import HERE, MODEL, RHO, SD0, SIGMA, TAU, data
 
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
 from mstfilter.smc import Dynamics, backward_paths, bootstrap, genealogy, keep
-from mstfilter.smc.exact import kalman_filter
+from mstfilter.smc.models.exact import kalman_filter
 
 #: Ours by name, with the method of `particles` that does the same.
 METHODS = {

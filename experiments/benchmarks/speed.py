@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from loop import bootstrap_loop
 
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
 from mstfilter.smc import (
     Always,
     Killing,

@@ -239,7 +239,9 @@ def main() -> None:
         for process in workers.values():
             process.terminate()
     if options.out is not None:
-        from mstfilter.files import write_csv  # not in the other checkout's workers: older ones have no such module
+        from mstfilter.base.files import (
+            write_csv,  # not in the other checkout's workers: older ones have no such module
+        )
 
         write_csv(options.out, rows)
 

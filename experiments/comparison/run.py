@@ -1,4 +1,4 @@
-"""Error rate and power of a claim by `mstfilter.statistics.compare_arms`, by simulation.
+"""Error rate and power of a claim by `mstfilter.scoring.statistics.compare_arms`, by simulation.
 
     python experiments/comparison/run.py
 
@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
-from mstfilter.files import write_csv
-from mstfilter.statistics import N_RESAMPLES
+from mstfilter.base.files import write_csv
+from mstfilter.scoring.statistics import N_RESAMPLES
 
 HERE = Path(__file__).parent
 UNITS = (10, 20, 30, 60)

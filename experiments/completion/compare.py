@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from hilbert_map import HilbertMap
 
-from mstfilter.completion import Completer, Extrude, Hull, NetworkCompleter, SurfaceOnly
-from mstfilter.files import write_csv
-from mstfilter.resources import training_program
-from mstfilter.statistics import interval
+from mstfilter.base.files import write_csv
+from mstfilter.base.resources import training_program
+from mstfilter.mst.completion import Completer, Extrude, Hull, NetworkCompleter, SurfaceOnly
+from mstfilter.scoring.statistics import interval
 
 HELD_OUT = training_program("shapes").HELD_OUT
 CompletionSamples = training_program("completion_data").CompletionSamples

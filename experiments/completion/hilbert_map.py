@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import expit
 
-from mstfilter.completion import Completer, ObservedBox
+from mstfilter.mst.completion import Completer, ObservedBox
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,13 @@ import numpy as np
 from run import FILTERS, SMALL, in_orders, quality
 
 import mstfilter
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
 from mstfilter.formats import open_recording
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import Clip
 from mstfilter.scoring import ask, leave_one_out, score_belief
-from mstfilter.simulation import cached_recording
+from mstfilter.scoring.statistics import compare
 from mstfilter.smc import ParticleFilter, State
-from mstfilter.statistics import compare
 
 #: Families in turn, so that an unfinished study has all of them. Nothing was tuned or looked at on these seeds.
 SCENES = [(family, seed) for seed in range(140, 150) for family in ("s1", "s2", "s3")]

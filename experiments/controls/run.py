@@ -27,13 +27,13 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
-from mstfilter.files import read_csv, write_csv
+from mstfilter.base.files import read_csv, write_csv
 from mstfilter.formats import open_recording
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import Clip, Hypothesis, Recording
 from mstfilter.scoring import overlap, weighted_coverage
-from mstfilter.simulation import cached_recording
+from mstfilter.scoring.statistics import interval
 from mstfilter.smc import Population, State, Transition
-from mstfilter.statistics import interval
 
 SCENES = [(family, k) for family in ("s1", "s2") for k in range(6)]
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

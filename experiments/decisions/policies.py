@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mstfilter import Belief
-from mstfilter.simulation import FingerPush
+from mstfilter.lab.simulation import FingerPush
 
 TOLERANCE = 50  # voxels: 50 cm^3 of 1 cm voxels
 

@@ -38,12 +38,12 @@ import numpy as np
 from policies import POLICIES
 
 from mstfilter import Belief, ParticleFilter, preset
-from mstfilter.files import write_csv, write_text
+from mstfilter.base.files import write_csv, write_text
+from mstfilter.lab.simulation import FingerPush, PushLoop, scene_family
 from mstfilter.scoring import LOG_LOSS, ask, leave_one_out, overlap, pause_metrics, score_belief
 from mstfilter.scoring.metrics import coverage_of
-from mstfilter.simulation import FingerPush, PushLoop, scene_family
+from mstfilter.scoring.statistics import compare_arms, conclusion
 from mstfilter.smc import State
-from mstfilter.statistics import compare_arms, conclusion
 
 N_PUSHES, N_CANDIDATES = 6, 12
 #: Eight frames a clip instead of fifteen halve the time of the study.
@@ -185,7 +185,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    plt.style.use("mstfilter.report.figures")
+    plt.style.use("mstfilter.app.report.figures")
     titles = {
         "coverage": "coverage of the first objects (higher is better)",
         LOG_LOSS: "log loss (recalibrated), nats (lower is better)",

@@ -20,18 +20,18 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mstfilter.completion import Extrude, arbitrate
-from mstfilter.files import read_csv, write_csv
-from mstfilter.scene import Clip, Frame
-from mstfilter.scoring import weighted_coverage
-from mstfilter.segmentation import OptimalCut, TreeCutProposal, optimal_cut
-from mstfilter.simulation import (
+from mstfilter.base.files import read_csv, write_csv
+from mstfilter.lab.simulation import (
     FIRST_REPORTED_SEED,
     SceneFamily,
     SimulatedScene,
     play_push,
     scene_family,
 )
+from mstfilter.mst.completion import Extrude, arbitrate
+from mstfilter.mst.segmentation import OptimalCut, TreeCutProposal, optimal_cut
+from mstfilter.scene import Clip, Frame
+from mstfilter.scoring import weighted_coverage
 
 FAMILIES = ("s1", "s2", "s3")
 SEEN = 150  # pixels at 640 x 480 from which an object counts as visible
@@ -180,7 +180,7 @@ def picture(folder: Path, small: dict[str, int]) -> None:
         for seed in (0, 1, 2):
             scene = SimulatedScene(replace(scene_family(name), **small), seed)
             shots.append(scene.frame_images(0))
-        from mstfilter.simulation import advance_push
+        from mstfilter.lab.simulation import advance_push
 
         push = scene.choose_push(0)
         advance_push(scene.world, push, 0.0, 0.55 * push.seconds)

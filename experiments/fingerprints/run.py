@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 
 import mstfilter
-from mstfilter.presets import REGISTRY, load_config
-from mstfilter.resources import preset_names
+from mstfilter.base.resources import preset_names
 from mstfilter.runs import filter_recording
+from mstfilter.runs.presets import REGISTRY, load_config
+from mstfilter.runs.study.jobs import write_measures
 from mstfilter.smc import Population, Proposal, Transition, Update
-from mstfilter.study.jobs import write_measures
 
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.
 SCENES = (("demo", 3), ("s1", 7), ("s2", 4))
@@ -141,7 +141,7 @@ def main() -> int:
     found: dict[str, Any] = {"smc": of_smc()}
     with tempfile.TemporaryDirectory() as folder:
         for family, seed in SCENES[: options.scenes]:
-            from mstfilter.cli import main as command
+            from mstfilter.app.cli import main as command
 
             path = Path(folder) / f"{family}-{seed}"
             try:

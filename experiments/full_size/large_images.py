@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import mstfilter
+from mstfilter.lab.simulation import scene_family, simulate_recording
 from mstfilter.scene import WORKING_PIXELS, Clip, Recording
-from mstfilter.simulation import scene_family, simulate_recording
 
 
 def filtered(recording: Recording, seed: int, max_pixels: int) -> tuple[float, float]:

@@ -17,9 +17,9 @@ from pathlib import Path
 import torch
 
 import mstfilter
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import Recording
-from mstfilter.simulation import cached_recording
 
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}
 SEED = 41

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
+from mstfilter.lab.simulation import scene_family, simulate_recording
 from mstfilter.runs import RunFolder
-from mstfilter.simulation import scene_family, simulate_recording
 
 HERE = Path(__file__).resolve().parent
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

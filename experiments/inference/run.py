@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from mstfilter.files import read_csv, write_csv
+from mstfilter.base.files import read_csv, write_csv
 from mstfilter.smc import ParticleFilter, StateSpaceModel, bootstrap, conditional_path, particle_gibbs, pmmh
 
 T, TAU, DRAWS = 15, 0.4, 9

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from mstfilter.files import read_csv
+from mstfilter.base.files import read_csv
 
 COLOURS = {
     "n exact draws": "0.6",
@@ -28,7 +28,7 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    plt.style.use("mstfilter.report.figures")
+    plt.style.use("mstfilter.app.report.figures")
     distances, steps, ranks = (read_csv(out / f"{f}.csv") for f in ("distances", "over_time", "calibration"))
     fig = plt.figure(figsize=(10, 8.6))
     top, bottom = fig.subfigures(2, 1, height_ratios=[1.15, 1])

@@ -25,8 +25,8 @@ from miniature_world import Miniature, Observation
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from mstfilter.completion import Completer, Completion
-from mstfilter.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
+from mstfilter.mst.completion import Completer, Completion
+from mstfilter.mst.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
 from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid, memo
 from mstfilter.scene.support import Foreground
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update

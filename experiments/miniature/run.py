@@ -40,8 +40,8 @@ from miniature_world import Miniature
 from scipy import stats
 
 import mstfilter
-from mstfilter.files import write_csv
-from mstfilter.partition import PairEvidence
+from mstfilter.base.files import write_csv
+from mstfilter.mst.partition import PairEvidence
 from mstfilter.smc import ParticleFilter
 
 HERE = Path(__file__).resolve().parent

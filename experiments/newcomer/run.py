@@ -108,7 +108,7 @@ def commands(page: str) -> list[str]:
 
 def steps(smoke: bool) -> list[Step]:
     """All steps, in order."""
-    from mstfilter.testing import starter_kinds
+    from mstfilter.mst.testing import starter_kinds
 
     def plan(part: str, text: str) -> Step:
         return Step(part, shlex.split(text)[1:], text)
@@ -157,7 +157,7 @@ def play(step: Step, folder: Path) -> tuple[str, str, float]:
 
 def main(out: Path, smoke: bool) -> int:
     """Run all steps; returns the number of failed steps."""
-    from mstfilter.files import write_csv, write_text
+    from mstfilter.base.files import write_csv, write_text
 
     rows, outputs = [], []
     with tempfile.TemporaryDirectory() as name:

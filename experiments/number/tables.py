@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.files import read_csv, write_csv
+from mstfilter.base.files import read_csv, write_csv
 from mstfilter.scoring import LOG_LOSS
-from mstfilter.statistics import compare_arms
+from mstfilter.scoring.statistics import compare_arms
 
 COLUMNS = (LOG_LOSS, "calibration_error", "quality_estimate", "quality", "core_seconds")
 
@@ -62,7 +62,7 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    plt.style.use("mstfilter.report.figures")
+    plt.style.use("mstfilter.app.report.figures")
     figure, axes = plt.subplots(1, 2, figsize=(7, 3.2))
     n = [row["n"] for row in rows]
     panels = ((LOG_LOSS,), ("quality_estimate", "quality"))

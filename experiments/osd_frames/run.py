@@ -24,11 +24,8 @@ import cv2
 import numpy as np
 from measures import segment_f
 
-from mstfilter.files import write_csv
-from mstfilter.forecasts import ForecastTable, Recalibration
-from mstfilter.scene import Camera, Frame, foreground, readings_above_table
-from mstfilter.scoring import weighted_coverage
-from mstfilter.segmentation import (
+from mstfilter.base.files import write_csv
+from mstfilter.mst.segmentation import (
     BorderTree,
     ColourDepthBoundary,
     CutSampler,
@@ -45,8 +42,11 @@ from mstfilter.segmentation import (
     connected_pixels,
     optimal_cut,
 )
-from mstfilter.segmentation.tree import merge_tree, prune
-from mstfilter.statistics import compare
+from mstfilter.mst.segmentation.tree import merge_tree, prune
+from mstfilter.scene import Camera, Frame, foreground, readings_above_table
+from mstfilter.scoring import weighted_coverage
+from mstfilter.scoring.forecasts import ForecastTable, Recalibration
+from mstfilter.scoring.statistics import compare
 
 HERE = Path(__file__).resolve().parent
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared"))

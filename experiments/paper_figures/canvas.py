@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mstfilter.files import write_csv
-from mstfilter.report import Colour, close_up, voxel_picture
+from mstfilter.app.report import Colour, close_up, voxel_picture
+from mstfilter.base.files import write_csv
 from mstfilter.scene import Camera, VoxelGrid
 
 PAPER, INK, MUTED, LINE = "#fcfcfa", "#1d2126", "#646b74", "#e1e2e0"

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import matplotlib.style
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 
 FIGURES = (
     "merging",
@@ -43,7 +43,10 @@ def main() -> None:
     if unknown:
         parser.error(f"no figure is called {unknown[0]!r}; there are {', '.join(FIGURES)}")
     arms = [name.strip() for name in options.arms.split(",") if name.strip()]
-    with matplotlib.style.context("mstfilter.report.figures"), matplotlib.rc_context({"svg.hashsalt": "mstfilter"}):
+    with (
+        matplotlib.style.context("mstfilter.app.report.figures"),
+        matplotlib.rc_context({"svg.hashsalt": "mstfilter"}),
+    ):
         for name in options.figures or FIGURES:
             figure = importlib.import_module(name)
             if name == "quality_over_time":

@@ -17,7 +17,8 @@ from canvas import INK, MUTED, page, save, show, voxels, write_rows
 from matplotlib.axes import Axes
 from r1 import NOTICE, Particles, folder
 
-from mstfilter.crossover import (
+from mstfilter.app.report import Colour, viewpoint
+from mstfilter.mst.crossover import (
     PREDICTED,
     PROPOSED,
     ConflictGraph,
@@ -30,8 +31,7 @@ from mstfilter.crossover import (
     conflict_graph,
     merge_probability,
 )
-from mstfilter.presets import REGISTRY, load_config
-from mstfilter.report import Colour, viewpoint
+from mstfilter.runs.presets import REGISTRY, load_config
 
 SAMPLE, PREDICTION = 2, 2  # the pair with the fewest conflicts of those that the authors' program kept
 SEED = 0

@@ -10,11 +10,11 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import mstfilter.report
-from mstfilter.errors import InputError
-from mstfilter.report import SERIES, colour, figure_groups, hexadecimal, time_figure
+import mstfilter.app.report
+from mstfilter.app.report import SERIES, colour, figure_groups, hexadecimal, time_figure
+from mstfilter.base.errors import InputError
+from mstfilter.runs.study import StudyFolder, title_of
 from mstfilter.scoring import LOG_LOSS
-from mstfilter.study import StudyFolder, title_of
 
 PAGE = 'xmlns="http://www.w3.org/2000/svg" style="background:var(--paper);font-family:sans-serif"'
 
@@ -52,7 +52,7 @@ def make(out: Path, study: Path, chosen: Sequence[str] = ()) -> list[Path]:
 
 def standalone(svg: str) -> str:
     """A figure of a report as a complete SVG file, with the colours of the report's style sheet."""
-    css = (Path(mstfilter.report.__file__).parent / "templates" / "style.css").read_text()
+    css = (Path(mstfilter.app.report.__file__).parent / "templates" / "style.css").read_text()
     light = css[: css.index("}")]
     colours = {f"--s{k}": hexadecimal(colour(k)) for k in range(len(SERIES))}  # also for colours that the sheet lacks
     colours |= dict(re.findall(r"(--[a-z0-9]+): (#[0-9a-f]{3,6})", light))

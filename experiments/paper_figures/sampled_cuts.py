@@ -18,10 +18,10 @@ from matplotlib.collections import LineCollection
 from teaser import FEW
 
 import mstfilter
-from mstfilter.report import UNASSIGNED_COLOUR, Colour, colour, overlay
+from mstfilter.app.report import UNASSIGNED_COLOUR, Colour, colour, overlay
+from mstfilter.lab.simulation import SimulatedScene, scene_family
+from mstfilter.mst.segmentation import Segments, Tree, optimal_cut
 from mstfilter.scene import Frame
-from mstfilter.segmentation import Segments, Tree, optimal_cut
-from mstfilter.simulation import SimulatedScene, scene_family
 
 FAMILY, SEED = "s2", 0
 LEAST = -6.0

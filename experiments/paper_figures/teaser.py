@@ -17,13 +17,13 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from mstfilter.app.report import TRUTH, Identities, assign_identities, order_by_weight, viewpoint
 from mstfilter.formats import open_recording
-from mstfilter.presets import load_config
-from mstfilter.report import TRUTH, Identities, assign_identities, order_by_weight, viewpoint
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.runs import RunFolder, filter_recording
+from mstfilter.runs.presets import load_config
 from mstfilter.scene import Camera, Recording
 from mstfilter.scoring import object_status, overlap
-from mstfilter.simulation import cached_recording
 
 #: The scene of the figure `sampled_cuts`.
 FAMILY, SEED = "s2", 0

@@ -21,11 +21,11 @@ import numpy as np
 from scipy.special import expit, logit
 
 import mstfilter
-from mstfilter.completion import NetworkCompleter
-from mstfilter.files import write_csv
-from mstfilter.forecasts import SOFTENING, ForecastTable
+from mstfilter.base.files import write_csv
+from mstfilter.lab.simulation import cached_recording
+from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.scoring import ask
-from mstfilter.simulation import cached_recording
+from mstfilter.scoring.forecasts import SOFTENING, ForecastTable
 
 LOG_ODDS = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)
 SMALL = {"width": 160, "height": 120, "n_actions": 1}
@@ -77,7 +77,7 @@ def draw(scenes: list[dict[str, np.ndarray]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    plt.style.use("mstfilter.report.figures")
+    plt.style.use("mstfilter.app.report.figures")
     figure, places = plt.subplots(1, 2, figsize=(8, 4.1), sharey=True, layout="constrained")
     default = NetworkCompleter().log_odds
     for k, question in enumerate(("is this voxel occupied?", "do these two belong to one object?")):

@@ -1,4 +1,4 @@
-"""How much do samples and predictions say about two cells? Fits `mstfilter.partition.PairEvidence`.
+"""How much do samples and predictions say about two cells? Fits `mstfilter.mst.partition.PairEvidence`.
 
     python experiments/partition_fit/run.py [--seeds 3] [--smoke --out FOLDER]
 
@@ -24,12 +24,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 import mstfilter
-from mstfilter.completion import SurfaceOnly
-from mstfilter.files import write_csv
-from mstfilter.oracles.truth import RecordingTruth
-from mstfilter.partition import Cells, PairEvidence, PairOdds, PairTerms
+from mstfilter.base.files import write_csv
+from mstfilter.lab.oracles.truth import RecordingTruth
+from mstfilter.lab.simulation import cached_recording
+from mstfilter.mst.completion import SurfaceOnly
+from mstfilter.mst.partition import Cells, PairEvidence, PairOdds, PairTerms
 from mstfilter.scene import Clip
-from mstfilter.simulation import cached_recording
 from mstfilter.smc import Key
 
 SMALL = {"width": 160, "height": 120, "n_actions": 1}

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.mst.testing import scene_example as scene_example
 from mstfilter.smc import Normal, Population
-from mstfilter.testing import scene_example as scene_example
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Components with one fault each. None of these kinds of fault is in tests/testing.
+"""Components with one fault each. None of these kinds of fault is in tests/mst/testing.
 
 `FAULTS` has for each fault the kind of its component, and a function without arguments that makes the component.
 """
@@ -22,9 +22,16 @@ from entries import (
 from scipy import ndimage, stats
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.completion import Completer, Extrude
+from mstfilter.mst.completion import Completer, Extrude
+from mstfilter.mst.segmentation import BoundaryModel, ColourDepthBoundary
+from mstfilter.mst.tracking import (
+    MaskTracker,
+    MstRule,
+    Registration,
+    SmallGicp,
+    TrackingTransition,
+)
 from mstfilter.scene import FreeSpace, Hypothesis
-from mstfilter.segmentation import BoundaryModel, ColourDepthBoundary
 from mstfilter.smc import (
     Codec,
     DensityTransition,
@@ -44,13 +51,6 @@ from mstfilter.smc import (
     log_mean_exp,
     normalise,
     union,
-)
-from mstfilter.tracking import (
-    MaskTracker,
-    MstRule,
-    Registration,
-    SmallGicp,
-    TrackingTransition,
 )
 
 FAULTS = Entries()
@@ -829,7 +829,7 @@ class FromTargetToSource(Registration):
 @planted("tracker", "follows masks against the flow")
 class AgainstTheFlow(MaskTracker):
     def track(self, clip, masks):
-        from mstfilter.tracking import DenseFlow
+        from mstfilter.mst.tracking import DenseFlow
 
         tracks = DenseFlow().track(clip)
         out = []

@@ -26,9 +26,10 @@ from entries import (
 from scipy import ndimage, special, stats
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.completion import Completer
+from mstfilter.mst.completion import Completer
+from mstfilter.mst.segmentation import BoundaryModel
+from mstfilter.mst.tracking import IDENTITY, Candidate, MotionResidual, MotionRule, MstRule, TrackingTransition
 from mstfilter.scene import Evidence, Hypothesis
-from mstfilter.segmentation import BoundaryModel
 from mstfilter.smc import (
     Bins,
     Codec,
@@ -55,7 +56,6 @@ from mstfilter.smc import (
     normalise,
     union,
 )
-from mstfilter.tracking import IDENTITY, Candidate, MotionResidual, MotionRule, MstRule, TrackingTransition
 
 RIGHT = Entries()
 right = RIGHT.add

@@ -21,7 +21,7 @@ from faults import FAULTS
 from right import RIGHT
 
 import models
-from mstfilter.testing import run_contract
+from mstfilter.mst.testing import run_contract
 
 RESULTS = Path(__file__).parent / "results"
 LISTS = {

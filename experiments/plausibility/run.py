@@ -21,13 +21,13 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError
-from mstfilter.files import write_csv
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import write_csv
 from mstfilter.formats import PairedImages, open_recording
+from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import Camera, Frame, Recording, VoxelGrid, examine, find_world
 from mstfilter.scene.geometry import edge_agreement
 from mstfilter.scene.plausibility import Look, drift
-from mstfilter.simulation import cached_recording
 
 HERE = Path(__file__).resolve().parent
 REAL = Path(os.environ.get("MSTFILTER_SHARED", HERE.parents[2] / "shared")) / "real"

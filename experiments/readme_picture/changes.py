@@ -18,12 +18,12 @@ import numpy as np
 from make import SMALL, window
 
 import mstfilter
-from mstfilter.belief import Belief
-from mstfilter.completion import Extrude
-from mstfilter.report import match_objects, overlay, viewpoint, voxel_picture
+from mstfilter.app.report import match_objects, overlay, viewpoint, voxel_picture
+from mstfilter.lab.simulation import scene_family, simulate_recording
+from mstfilter.mst.belief import Belief
+from mstfilter.mst.completion import Extrude
 from mstfilter.scene import Clip, Hypothesis, project
 from mstfilter.scoring import overlap, weighted_coverage
-from mstfilter.simulation import scene_family, simulate_recording
 from mstfilter.smc import Population, Systematic
 
 FOLDER = Path("docs/images")
@@ -44,7 +44,7 @@ def save(rows: Rows, path: Path, size: float = 2.1) -> None:
     from PIL import Image
 
     n_columns = max(map(len, rows.values()))
-    with matplotlib.style.context("mstfilter.report.figures"):
+    with matplotlib.style.context("mstfilter.app.report.figures"):
         figure = Figure((size * n_columns + 0.3, 0.85 * size * len(rows)), layout="constrained")
         canvas = FigureCanvasAgg(figure)
         figure.get_layout_engine().set(w_pad=0.02, h_pad=0.05, wspace=0.01, hspace=0.01)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mstfilter.files import read_csv
-from mstfilter.report import draw_forest
-from mstfilter.statistics import Difference, compare
+from mstfilter.app.report import draw_forest
+from mstfilter.base.files import read_csv
+from mstfilter.scoring.statistics import Difference, compare
 
 EXPERIMENTS = Path(__file__).parents[1]
 TABLE = EXPERIMENTS / "main/results/main_scenes.csv"
@@ -50,7 +50,7 @@ def main(out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with matplotlib.style.context("mstfilter.report.figures"):
+    with matplotlib.style.context("mstfilter.app.report.figures"):
         figure = Figure((8.75, 3.6), layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 2)

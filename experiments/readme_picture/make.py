@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.app.report import TRUTH, Colour, assign_identities, colour, viewpoint, voxel_picture
 from mstfilter.formats import open_recording
-from mstfilter.presets import load_config
-from mstfilter.report import TRUTH, Colour, assign_identities, colour, viewpoint, voxel_picture
+from mstfilter.lab.simulation import scene_family, simulate_recording
 from mstfilter.runs import RunFolder, filter_recording
+from mstfilter.runs.presets import load_config
 from mstfilter.scene import Camera, Recording, VoxelGrid, look_at, render
-from mstfilter.simulation import scene_family, simulate_recording
 
 FAMILY, SEED = "s3", 42
 HIDDEN, SHOWN, VOXELS = 0.2, 0.5, 300  # largest visible share if hidden, least if seen, least volume
@@ -234,7 +234,7 @@ def main(out: Path, work: Path, smoke: bool) -> None:
     runs = {name: filter_recording(recording, load_config(name), work / name, seed=0) for name in METHODS}
     scene = Scene(recording, runs, label, pauses)
     out.mkdir(parents=True, exist_ok=True)
-    with matplotlib.style.context("mstfilter.report.figures"):
+    with matplotlib.style.context("mstfilter.app.report.figures"):
         draw(scene, out / "hidden.png")
         animate(scene, out / "hidden.webp")
     print(f"{recording.name}: object {label}, pauses {pauses}", *sorted(out.glob("hidden.*")))

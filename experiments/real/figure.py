@@ -13,7 +13,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from mstfilter.files import read_csv
+from mstfilter.base.files import read_csv
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt

@@ -19,7 +19,7 @@ import numpy as np
 from scores import FOUND
 from sequences import SHARED, sequences
 
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
 from mstfilter.scene import foreground, readings_above_table
 
 HERE = Path(__file__).resolve().parent

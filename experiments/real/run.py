@@ -25,13 +25,13 @@ from safetensors.numpy import load_file
 from scores import identities, image_scores, kept, witness_scores
 from sequences import FOLDS, SHARED, Sequence, sequences
 
-from mstfilter.files import read_csv, write_csv
-from mstfilter.presets import preset
+from mstfilter.base.files import read_csv, write_csv
+from mstfilter.base.trained import open_model, write_model
+from mstfilter.mst.segmentation import BorderTree
+from mstfilter.runs.presets import preset
 from mstfilter.scene import Clip, Hypothesis, project
-from mstfilter.segmentation import BorderTree
+from mstfilter.scoring.statistics import compare
 from mstfilter.smc import State
-from mstfilter.statistics import compare
-from mstfilter.trained import open_model, write_model
 
 HERE = Path(__file__).resolve().parent
 

@@ -13,17 +13,17 @@ from unittest import mock
 import numpy as np
 from disk import LOSSES as LOSSES, Disk, Stop, content
 
-from mstfilter.cli import running
-from mstfilter.errors import InputError
-from mstfilter.files import damaged_files, sweep
+from mstfilter.app.cli import running
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import damaged_files, sweep
 from mstfilter.formats import open_recording, save_recording
-from mstfilter.frontends import write_masks
-from mstfilter.presets import load_config
+from mstfilter.lab.simulation import cached_recording
+from mstfilter.mst.frontends import write_masks
 from mstfilter.runs import RunFolder, filter_recording
+from mstfilter.runs.presets import load_config
+from mstfilter.runs.study import Executor, run_study, study_of
+from mstfilter.runs.study.jobs import perform
 from mstfilter.scene import Recording
-from mstfilter.simulation import cached_recording
-from mstfilter.study import Executor, run_study, study_of
-from mstfilter.study.jobs import perform
 
 #: Changes to a family: a recording that is made in a second
 TINY = {"width": 80, "height": 60, "n_actions": 1, "frames_per_clip": 3, "fps": 1.0, "supersample": False}
@@ -98,8 +98,8 @@ def flows(recording: Recording) -> list[Flow]:
 def demo(recording: Recording, root: Path, seed: int) -> None:
     """The command `demo` with a copied recording, with a light preset, and without pictures."""
     copied = mock.patch.object(running, "_simulate", lambda family, out, seed: shutil_copy(recording, out, seed))
-    light = mock.patch("mstfilter.presets.load_config", lambda name: load_config(PRESET))
-    page = mock.patch("mstfilter.report.write_report", lambda run, path, numbers: path.write_text("mstfilter"))
+    light = mock.patch("mstfilter.runs.presets.load_config", lambda name: load_config(PRESET))
+    page = mock.patch("mstfilter.app.report.write_report", lambda run, path, numbers: path.write_text("mstfilter"))
     alone = mock.patch("mstfilter.runs.compared_configs", lambda config: {})
     with copied, light, page, alone, contextlib.redirect_stdout(io.StringIO()):
         running.demo(root / "demo", seed)

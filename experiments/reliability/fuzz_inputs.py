@@ -34,7 +34,7 @@ def resident() -> float:
 
 def trial(name: str, seed: int, example: str, folder: str) -> dict[str, object]:
     """Modify a copy of an example in one or two ways, and read it."""
-    from mstfilter.study.jobs import peak_megabytes, reset_peak
+    from mstfilter.runs.study.jobs import peak_megabytes, reset_peak
     from tests.hostile import KINDS, copy, outcome, spoil
 
     rng = np.random.default_rng([seed, *name.encode()])
@@ -59,7 +59,7 @@ def trial(name: str, seed: int, example: str, folder: str) -> dict[str, object]:
 def main() -> None:
     from pebble import ProcessExpired, ProcessPool
 
-    from mstfilter.files import write_csv
+    from mstfilter.base.files import write_csv
     from tests.hostile import KINDS
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -20,7 +20,7 @@ from typing import Any
 from disk import LOSSES, content
 from flows import PRESET, TINY, Flow, flows, reference, small_recording, trial
 
-from mstfilter.files import read_csv, write_csv
+from mstfilter.base.files import read_csv, write_csv
 
 HERE = Path(__file__).resolve().parent
 COLUMNS = ("battery", "flow", "point", "loss", "result")

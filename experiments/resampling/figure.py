@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mstfilter.files import read_csv
+from mstfilter.base.files import read_csv
 
 #: Part, beginning of the setting, measure, title.
 PANELS = (
@@ -37,7 +37,7 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    plt.style.use("mstfilter.report.figures")
+    plt.style.use("mstfilter.app.report.figures")
 
     lines = read_csv(out / "summary.csv")
     fig, axes = plt.subplots(4, 2, figsize=(9, 16))

@@ -20,7 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.errors import check_component
+from mstfilter.base.errors import check_component
 from mstfilter.smc import FearnheadClifford, Gaussian, Population, Resampler, Similarity, log_mean_exp
 from mstfilter.smc.diverse_resampling import checked_similarity
 from mstfilter.smc.resampling import checked_weights

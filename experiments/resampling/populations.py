@@ -13,9 +13,9 @@ import numpy as np
 from schemes import Names, Table, schemes
 from worlds import World
 
-from mstfilter.belief import SameSegmentation, WeightedCoverage
-from mstfilter.errors import InputError
-from mstfilter.presets import REGISTRY, load_config
+from mstfilter.base.errors import InputError
+from mstfilter.mst.belief import SameSegmentation, WeightedCoverage
+from mstfilter.runs.presets import REGISTRY, load_config
 from mstfilter.scene import Camera, Clip, Frame, Hypothesis, NoFreeSpace, VoxelGrid
 from mstfilter.scoring import weighted_coverage
 from mstfilter.smc import ParticleFilter, Population, Resampler, Systematic, WeightResampler, energy_distance

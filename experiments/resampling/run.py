@@ -19,9 +19,9 @@ from populations import Candidates, choose, of_world, real
 from schemes import BASE, schemes
 from worlds import World, branching, plain, worlds
 
-from mstfilter.files import read_csv, write_csv
+from mstfilter.base.files import read_csv, write_csv
+from mstfilter.scoring.statistics import compare_arms, conclusion, interval
 from mstfilter.smc import ExactEquality, Gaussian, Population, log_evidence, run_many
-from mstfilter.statistics import compare_arms, conclusion, interval
 
 HERE = Path(__file__).resolve().parent
 Row = dict[str, object]

@@ -16,7 +16,7 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "miniature"))
 from miniature_filters import bootstrap_filter, exact_filter, state_weights
 from miniature_world import Miniature
 
-from mstfilter.belief import SameSegmentation, WeightedCoverage
+from mstfilter.mst.belief import SameSegmentation, WeightedCoverage
 from mstfilter.smc import (
     Branching,
     Equivalence,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
 from mstfilter.smc import (
     Always,
     EssBelow,

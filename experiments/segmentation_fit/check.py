@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 from scenes import CHECKED, CHECKED_SEEDS, Pause, pauses, small
 
-from mstfilter.completion import Extrude
-from mstfilter.files import write_csv
-from mstfilter.scene import Clip
-from mstfilter.scoring import weighted_coverage
-from mstfilter.segmentation import (
+from mstfilter.base.files import write_csv
+from mstfilter.lab.simulation import SCENE_FAMILIES, SimulatedScene
+from mstfilter.mst.completion import Extrude
+from mstfilter.mst.segmentation import (
     BorderTree,
     LearnedTree,
     MergeLogOdds,
@@ -30,7 +29,8 @@ from mstfilter.segmentation import (
     UcmTree,
     optimal_cut,
 )
-from mstfilter.simulation import SCENE_FAMILIES, SimulatedScene
+from mstfilter.scene import Clip
+from mstfilter.scoring import weighted_coverage
 
 OLD = {"tree": UcmTree(), "value": SceneCutObjectness()}
 NEW = {"tree": LearnedTree(), "value": MergeLogOdds()}
@@ -83,7 +83,7 @@ def main(out: Path, smoke: bool, border: str) -> None:
 
 
 def _true_masks(pause: Pause, volume: np.ndarray) -> tuple[float, ...]:
-    from mstfilter.completion import arbitrate
+    from mstfilter.mst.completion import arbitrate
 
     masks = [pause.image == k for k in range(1, int(pause.image.max()) + 1) if (pause.image == k).any()]
     completions = Extrude().complete(np.random.default_rng(0), pause.frame, masks, pause.grid)

@@ -30,11 +30,11 @@ from safetensors.numpy import save
 from scenes import FITTED, FITTED_SEEDS, Pause, PlainSamples, pauses, small, training_images
 
 from mst_training.border_data import BorderSamples
-from mstfilter.files import atomic_path, write_csv
-from mstfilter.segmentation import BorderTree, PairNetwork, Regions
-from mstfilter.segmentation.border_network import PAIR_TENSORS
-from mstfilter.simulation import SCENE_FAMILIES
-from mstfilter.trained import open_model, write_model
+from mstfilter.base.files import atomic_path, write_csv
+from mstfilter.base.trained import open_model, write_model
+from mstfilter.lab.simulation import SCENE_FAMILIES
+from mstfilter.mst.segmentation import BorderTree, PairNetwork, Regions
+from mstfilter.mst.segmentation.border_network import PAIR_TENSORS
 
 HERE = Path(__file__).resolve().parent
 RESULTS, REAL = HERE / "results", HERE.parent / "real"

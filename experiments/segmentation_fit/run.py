@@ -22,9 +22,10 @@ import numpy as np
 from scenes import FITTED, FITTED_SEEDS, Pause, pauses, small
 from scipy.optimize import minimize
 
-from mstfilter.resources import models_folder
-from mstfilter.scene import foreground
-from mstfilter.segmentation import (
+from mstfilter.base.resources import models_folder
+from mstfilter.base.trained import open_model, write_model
+from mstfilter.lab.simulation import SceneFamily
+from mstfilter.mst.segmentation import (
     FEATURES,
     PAIR_FEATURES,
     REGION,
@@ -38,8 +39,7 @@ from mstfilter.segmentation import (
     pair_features,
     pair_log_odds,
 )
-from mstfilter.simulation import SceneFamily
-from mstfilter.trained import open_model, write_model
+from mstfilter.scene import foreground
 
 ROUNDS = 3
 PURE = 0.8  # smallest share of one object in a region that is used

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mst_training.border_data import BorderSamples
+from mstfilter.lab.simulation import SCENE_FAMILIES, SceneFamily, SimulatedScene
 from mstfilter.scene import Frame, VoxelGrid
-from mstfilter.simulation import SCENE_FAMILIES, SceneFamily, SimulatedScene
 
 _TABLE, _DEMO = SCENE_FAMILIES["table"], SCENE_FAMILIES["demo"]
 

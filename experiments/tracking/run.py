@@ -19,15 +19,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter import open_recording
-from mstfilter.files import write_csv
+from mstfilter.base.files import write_csv
+from mstfilter.lab.simulation import SceneFamily, scene_family, simulate_recording
+from mstfilter.lab.simulation.arrangement import draw_objects
+from mstfilter.lab.simulation.recorder import stream
+from mstfilter.lab.simulation.shapes import Shape
+from mstfilter.mst.tracking import Candidate, MotionRule, MstRule, TrackingTransition
+from mstfilter.mst.tracking.segments import Track, segments_of
 from mstfilter.scene import Hypothesis
-from mstfilter.simulation import SceneFamily, scene_family, simulate_recording
-from mstfilter.simulation.arrangement import draw_objects
-from mstfilter.simulation.recorder import stream
-from mstfilter.simulation.shapes import Shape
 from mstfilter.smc import Population
-from mstfilter.tracking import Candidate, MotionRule, MstRule, TrackingTransition
-from mstfilter.tracking.segments import Track, segments_of
 
 HERE = Path(__file__).resolve().parent
 SMALL = {"width": 160, "height": 120, "n_actions": 1, "frames_per_clip": 8, "voxel_size": 0.02}

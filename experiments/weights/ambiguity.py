@@ -21,16 +21,16 @@ import numpy as np
 from reliability import cells_of, recorded
 
 import mstfilter
-from mstfilter.files import read_csv, write_csv
-from mstfilter.forecasts import ForecastTable
+from mstfilter.base.files import read_csv, write_csv
+from mstfilter.lab.simulation.families import scene_family
+from mstfilter.lab.simulation.renderer import Renderer, visible_texel
+from mstfilter.lab.simulation.sensor import DepthSensor, colour_reading
+from mstfilter.lab.simulation.shapes import TUNING, Shape
+from mstfilter.lab.simulation.solids import box
+from mstfilter.lab.simulation.textures import Skin, draw_room, draw_skin
+from mstfilter.lab.simulation.world import PhysicsWorld
 from mstfilter.scene import Clip, Frame
-from mstfilter.simulation.families import scene_family
-from mstfilter.simulation.renderer import Renderer, visible_texel
-from mstfilter.simulation.sensor import DepthSensor, colour_reading
-from mstfilter.simulation.shapes import TUNING, Shape
-from mstfilter.simulation.solids import box
-from mstfilter.simulation.textures import Skin, draw_room, draw_skin
-from mstfilter.simulation.world import PhysicsWorld
+from mstfilter.scoring.forecasts import ForecastTable
 
 FAMILY = replace(scene_family("demo"), catalogue="tuning")
 OFFSET, TURN = 0.01, 0.07  # standard deviations of the offset and the turn of the second box, metres and radians

@@ -19,11 +19,11 @@ import numpy as np
 from reliability import FAMILIES, SHORT, Question, classes, disagreements, finished, forecasts, recorded
 
 import mstfilter
-from mstfilter.files import write_csv
-from mstfilter.forecasts import SOFTENING
-from mstfilter.oracles.truth import RecordingTruth
-from mstfilter.partition import PairEvidence
-from mstfilter.simulation import cached_recording
+from mstfilter.base.files import write_csv
+from mstfilter.lab.oracles.truth import RecordingTruth
+from mstfilter.lab.simulation import cached_recording
+from mstfilter.mst.partition import PairEvidence
+from mstfilter.scoring.forecasts import SOFTENING
 
 ODDS = {
     "A": PairEvidence(0, 1, 0, 1, 0.62, 0.96),

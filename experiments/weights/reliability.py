@@ -26,17 +26,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
 
 import mstfilter
-from mstfilter.errors import InputError
-from mstfilter.files import write_csv
-from mstfilter.forecasts import SOFTENING, ForecastTable, Reliability
-from mstfilter.oracles.truth import RecordingTruth
-from mstfilter.partition import Cells, PartitionUpdate
-from mstfilter.partition.candidates import Choices, largest_products, tempered
-from mstfilter.partition.cells import Readings
-from mstfilter.partition.update import Prediction
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import write_csv
+from mstfilter.lab.oracles.truth import RecordingTruth
+from mstfilter.lab.simulation import cached_recording
+from mstfilter.mst.partition import Cells, PartitionUpdate
+from mstfilter.mst.partition.candidates import Choices, largest_products, tempered
+from mstfilter.mst.partition.cells import Readings
+from mstfilter.mst.partition.update import Prediction
 from mstfilter.scene import Clip, canonical
 from mstfilter.scoring import pairwise_quality, weighted_coverage
-from mstfilter.simulation import cached_recording
+from mstfilter.scoring.forecasts import SOFTENING, ForecastTable, Reliability
 from mstfilter.smc import ParticleFilter, Population, Systematic
 
 SHORT = {
@@ -357,7 +357,7 @@ def draw(diagrams: dict[tuple[str, float], Reliability], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    plt.style.use("mstfilter.report.figures")
+    plt.style.use("mstfilter.app.report.figures")
     figure, places = plt.subplots(1, 2, figsize=(8, 4.1), sharey=True, layout="constrained")
     for place, temperature in zip(places, (1.0, 4.0), strict=True):
         place.plot([0, 1], [0, 1], color=".6", lw=1)

@@ -4,5 +4,5 @@
 `completer.weights=FOLDER` uses. Samples come from the package's own simulation; each follows from the seed. A run of
 the filter needs nothing from here.
 
-`mstfilter.resources.training_program("border")` imports a module of this package from a checkout or from a wheel.
+`mstfilter.base.resources.training_program("border")` imports a module of this package, from a checkout or a wheel.
 """

@@ -22,8 +22,7 @@ from torch.nn import functional
 from mst_training.border_data import BorderSamples, targets
 from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
-from mstfilter.forecasts import ForecastTable
-from mstfilter.segmentation.border_network import (
+from mstfilter.mst.segmentation.border_network import (
     BORDER_ARCHITECTURE,
     CENTRE_UNIT,
     IMAGE_CHANNELS,
@@ -31,7 +30,8 @@ from mstfilter.segmentation.border_network import (
     encode_image,
     near_objects,
 )
-from mstfilter.segmentation.boundary import ColourDepthBoundary
+from mstfilter.mst.segmentation.boundary import ColourDepthBoundary
+from mstfilter.scoring.forecasts import ForecastTable
 
 _FAR = 0.1  # weight of pixels far from everything above the table
 _COLOUR = IMAGE_CHANNELS.index("lightness")

@@ -21,11 +21,11 @@ import cv2
 import numpy as np
 
 from mst_training.scenes import HEIGHT, WIDTH, Samples, View, displaced, draw_camera, on_table
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
+from mstfilter.lab.simulation.sensor import DepthSensor, colour_reading
+from mstfilter.lab.simulation.world import PhysicsWorld
+from mstfilter.mst.segmentation.border_network import CENTRE_UNIT
 from mstfilter.scene import Camera, Frame, fit_support_plane, rigid_from_matrix
-from mstfilter.segmentation.border_network import CENTRE_UNIT
-from mstfilter.simulation.sensor import DepthSensor, colour_reading
-from mstfilter.simulation.world import PhysicsWorld
 
 _DEPTH_UNIT = 1e-4  # metres, of stored depth
 _N_VIEWS = 6

@@ -23,10 +23,10 @@ from mst_training.completion_data import MASK_KINDS, CompletionSamples
 from mst_training.loop import Training, fit_calibration
 from mst_training.scenes import Samples
 from mst_training.shapes import HELD_OUT
-from mstfilter.completion.crops import CHANNELS, LATTICE, channels, extruded
-from mstfilter.completion.unet import ARCHITECTURE, CompletionNet
-from mstfilter.forecasts import ForecastTable
+from mstfilter.mst.completion.crops import CHANNELS, LATTICE, channels, extruded
+from mstfilter.mst.completion.unet import ARCHITECTURE, CompletionNet
 from mstfilter.scene import Seen
+from mstfilter.scoring.forecasts import ForecastTable
 
 _OWN = Seen.SURFACE | Seen.BEHIND  # on or behind the visible surface of the object
 

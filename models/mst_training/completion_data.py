@@ -2,12 +2,12 @@
 
 >>> samples = CompletionSamples.of_scene(seed=0, index=3)          # always the same
 
-A scene has 2 to 12 objects of the kinds in `mst_training.shapes`, side by side, stacked, leaning and hidden, at
-rest under physics. It is seen by three cameras with the noise of the simulated sensor and a small error of the
-camera's pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of
-sampled cuts of the segmentation tree, which also hold parts of objects, and several objects. Half of the samples also
-have one to three earlier views of the whole object (`mstfilter.completion.observed.recall`), like an object that was
-moved: from other cameras, with a small error of the motion since then, and some of them without some other objects.
+A scene has 2 to 12 objects of the kinds in `mst_training.shapes`, side by side, stacked, leaning and hidden, at rest
+under physics. It is seen by three cameras with the noise of the simulated sensor and a small error of the camera's
+pose. The masks are those that a filter meets: the true masks with displaced borders, and the segments of sampled cuts
+of the segmentation tree, which also hold parts of objects, and several objects. Half of the samples also have one to
+three earlier views of the whole object (`mstfilter.mst.completion.observed.recall`), like an object that was moved:
+from other cameras, with a small error of the motion since then, and some of them without some other objects.
 
 The true shape of a mask: each object with visible pixels in the mask contributes the voxels whose nearest visible
 point lies in the mask or within two pixels of it. So a whole object gets all its voxels, also where the border of its
@@ -26,14 +26,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mst_training.scenes import HEIGHT, WIDTH, Samples, View, cast, displaced, draw_camera, on_table, put_away
-from mstfilter.completion import Completer, Extrude, ObservedBox, observed_box
-from mstfilter.completion.crops import EDGE, LATTICE, crop_box
-from mstfilter.completion.observed import decode_signed, encode_box, observed_again
+from mstfilter.lab.simulation.sensor import DepthSensor
+from mstfilter.lab.simulation.shapes import label_voxels
+from mstfilter.lab.simulation.world import PhysicsWorld
+from mstfilter.mst.completion import Completer, Extrude, ObservedBox, observed_box
+from mstfilter.mst.completion.crops import EDGE, LATTICE, crop_box
+from mstfilter.mst.completion.observed import decode_signed, encode_box, observed_again
+from mstfilter.mst.segmentation import MetropolisHastingsCuts, TreeCutProposal
 from mstfilter.scene import Camera, Frame, ObjectView, Seen, VoxelGrid, scene_cache
-from mstfilter.segmentation import MetropolisHastingsCuts, TreeCutProposal
-from mstfilter.simulation.sensor import DepthSensor
-from mstfilter.simulation.shapes import label_voxels
-from mstfilter.simulation.world import PhysicsWorld
 
 _GRID = VoxelGrid(np.array([-0.45, -0.45, 0.0]), LATTICE, (90, 90, 40))
 _N_VIEWS, _N_MASKS = 3, 14  # cameras of a scene, masks of a view

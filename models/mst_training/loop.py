@@ -27,10 +27,10 @@ from torch.nn import functional
 
 from mst_training.scenes import Samples
 from mst_training.shapes import HELD_OUT, TRAINED
-from mstfilter.errors import InputError, check_choice
-from mstfilter.files import atomic_path, read_csv, write_csv, write_text
-from mstfilter.reading import read_text
-from mstfilter.trained import DESCRIPTION, open_model, write_model
+from mstfilter.base.errors import InputError, check_choice
+from mstfilter.base.files import atomic_path, read_csv, write_csv, write_text
+from mstfilter.base.reading import read_text
+from mstfilter.base.trained import DESCRIPTION, open_model, write_model
 
 _STATE = "state.safetensors"
 _SAVE_EVERY = 120.0  # seconds between saved states

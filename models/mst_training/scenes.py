@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mst_training.shapes import TRAINED, draw_kind, draw_training_shape
-from mstfilter.errors import InputError
-from mstfilter.files import atomic_path
-from mstfilter.processes import environment
-from mstfilter.reading import MAX_WEIGHTS, read_arrays
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import atomic_path
+from mstfilter.base.processes import environment
+from mstfilter.base.reading import MAX_WEIGHTS, read_arrays
+from mstfilter.lab.simulation.arrangement import arrange_objects
+from mstfilter.lab.simulation.families import SceneFamily
+from mstfilter.lab.simulation.world import PhysicsWorld
 from mstfilter.scene import Camera, look_at, scene_cache
-from mstfilter.simulation.arrangement import arrange_objects
-from mstfilter.simulation.families import SceneFamily
-from mstfilter.simulation.world import PhysicsWorld
 
 WIDTH, HEIGHT = 320, 240  # pixels of an image
 

@@ -1,6 +1,6 @@
 """Shapes for training: many kinds of objects with sizes over a broad range.
 
-The simulated scenes of the studies draw from a catalogue of household objects (`mstfilter.simulation.shapes`).
+The simulated scenes of the studies draw from a catalogue of household objects (`mstfilter.lab.simulation.shapes`).
 Training draws from these kinds instead, so a network does not learn the catalogue's sizes.
 
 >>> shape = draw_training_shape(np.random.default_rng(0), "cone")
@@ -16,8 +16,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from mstfilter.simulation.shapes import Shape
-from mstfilter.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
+from mstfilter.lab.simulation.shapes import Shape
+from mstfilter.lab.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
 
 _ANY_SIDE = ((1, 1.0), (2, 1.0), (3, 1.0), (-3, 0.5))
 _UPRIGHT = ((3, 0.8), (-3, 0.1), (1, 0.1))

@@ -18,8 +18,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.reading import MAX_WEIGHTS, read_bytes
+from mstfilter.base.errors import InputError
+from mstfilter.base.reading import MAX_WEIGHTS, read_bytes
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
 _MAX_AXES = 32  # Caffe's own limit

@@ -19,13 +19,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, naming
-from mstfilter.fields import NonNegativeFloat, PositiveInt
-from mstfilter.files import weights_file
-from mstfilter.registry import load_file
+from mstfilter.base.errors import InputError, naming
+from mstfilter.base.fields import NonNegativeFloat, PositiveInt
+from mstfilter.base.files import weights_file
+from mstfilter.base.registry import load_file
+from mstfilter.mst.segmentation import BoundaryModel, Tree, TreeBuilder
+from mstfilter.mst.segmentation.tree import linkage_tree, prune
 from mstfilter.scene import Frame, Recording, UsesFiles, memo
-from mstfilter.segmentation import BoundaryModel, Tree, TreeBuilder
-from mstfilter.segmentation.tree import linkage_tree, prune
 
 _HERE = Path(__file__).parent
 _SOURCE = "COB", "https://github.com/kmaninis/COB"

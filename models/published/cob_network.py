@@ -27,7 +27,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 
 N_ORIENTATIONS = 8
 #: Mean of each channel, R G B, subtracted from the input (`cob_detect.m`).

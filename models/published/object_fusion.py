@@ -29,6 +29,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from mstfilter.mst.testing import scene_example
+from mstfilter.mst.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
 from mstfilter.scene import (
     Clip,
     Frame,
@@ -43,8 +45,6 @@ from mstfilter.scene import (
 )
 from mstfilter.scoring import overlap
 from mstfilter.smc import Population, Update, union
-from mstfilter.testing import scene_example
-from mstfilter.tracking import DenseFlow, Segment, Track, move_points, refine_motion, segments_of
 
 #: Truncation of the signed distances in metres. Two voxels are better than three by .01 to .02 of quality on tuning
 #: scenes.

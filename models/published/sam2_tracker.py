@@ -8,7 +8,7 @@ object in these masks instead of the end points of the optical flow (paper, sect
 
 SAM 2: Ravi et al., 2024, https://github.com/facebookresearch/sam2 (Apache-2.0, weights too). EdgeTAM has a package of
 the same name and interface. The user supplies package and checkpoint. The adapter was checked with a stand-in of the
-package, not with the package. For another tracker, inherit `mstfilter.tracking.MaskTracker`.
+package, not with the package. For another tracker, inherit `mstfilter.mst.tracking.MaskTracker`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, MissingLibraryError, describe_error
-from mstfilter.fields import PositiveInt
-from mstfilter.files import weights_file
+from mstfilter.base.errors import InputError, MissingLibraryError, describe_error
+from mstfilter.base.fields import PositiveInt
+from mstfilter.base.files import weights_file
+from mstfilter.mst.tracking import MaskTracker
 from mstfilter.scene import Clip, Recording, UsesFiles
-from mstfilter.tracking import MaskTracker
 
 _SAM2 = "https://github.com/facebookresearch/sam2"
 

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import naming
-from mstfilter.fields import NonNegativeFloat, PositiveInt, Share
-from mstfilter.files import weights_file
-from mstfilter.registry import load_file
+from mstfilter.base.errors import naming
+from mstfilter.base.fields import NonNegativeFloat, PositiveInt, Share
+from mstfilter.base.files import weights_file
+from mstfilter.base.registry import load_file
+from mstfilter.mst.tracking import MaskTracker
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
-from mstfilter.tracking import MaskTracker
 
 _TEMPLATE, _SEARCH = 127, 255  # pixels of the crops
 _STRIDE, _BASE, _POSITIONS = 8, 8, 25

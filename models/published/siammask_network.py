@@ -27,7 +27,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 
 ANCHORS = 5  #: Anchors of each position
 POSITIONS = 25  #: Positions along each side of the search region

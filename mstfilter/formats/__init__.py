@@ -9,7 +9,7 @@ A reader is a `RecordingFormat`: a frozen dataclass with ``detects(path)`` and `
 pauses at which a long video is divided into clips.
 """
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 

@@ -28,10 +28,10 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, missing_library, warn_user
-from mstfilter.files import reading
+from mstfilter.base.errors import InputError, missing_library, warn_user
+from mstfilter.base.files import reading
+from mstfilter.base.reading import MAX_TEXT, open_regular
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
-from mstfilter.reading import MAX_TEXT, open_regular
 from mstfilter.scene import check_depth, decode_image
 
 

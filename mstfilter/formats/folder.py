@@ -24,10 +24,10 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mstfilter.errors import InputError, check_choice, check_number, naming
-from mstfilter.files import atomic_folder, check_output, locked, reading, write_sums, writing
+from mstfilter.base.errors import InputError, check_choice, check_number, naming
+from mstfilter.base.files import atomic_folder, check_output, locked, reading, write_sums, writing
+from mstfilter.base.reading import read_arrays, read_json, read_model
 from mstfilter.formats.video import RecordingFormat, check_images, read_optional, warn_of_unread
-from mstfilter.reading import read_arrays, read_json, read_model
 from mstfilter.scene import (
     Camera,
     Frame,

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, check_number, warn_user
-from mstfilter.fields import NonNegativeFloat
-from mstfilter.files import reading
+from mstfilter.base.errors import InputError, check_number, warn_user
+from mstfilter.base.fields import NonNegativeFloat
+from mstfilter.base.files import reading
+from mstfilter.base.reading import MAX_TEXT, read_bytes, read_json, read_text
 from mstfilter.formats.pauses import EveryNth
 from mstfilter.formats.video import Video, VideoFormat, object_numbers, pair_stamps, read_optional, warn_of_unread
-from mstfilter.reading import MAX_TEXT, read_bytes, read_json, read_text
 from mstfilter.scene import Frame, PauseRule, Recording, table_residual
 
 

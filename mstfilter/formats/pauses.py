@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import NonNegativeFloat, PositiveInt
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import NonNegativeFloat, PositiveInt
 from mstfilter.scene import PauseRule, grey_blocks
 
 

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from mstfilter import formats
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
+from mstfilter.base.registry import Registry, settings
 from mstfilter.formats.image_folders import INTRINSICS, is_recording
 from mstfilter.formats.pauses import pauses_from_text
 from mstfilter.formats.video import RecordingFormat
-from mstfilter.registry import Registry, settings
 from mstfilter.scene import PauseRule, Recording
 
 _REGISTRY = Registry(formats)

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, warn_user
-from mstfilter.fields import Bounded, NonNegativeFloat, NonNegativeInt
+from mstfilter.base.errors import InputError, warn_user
+from mstfilter.base.fields import Bounded, NonNegativeFloat, NonNegativeInt
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
     WORKING_PIXELS,

@@ -1,6 +1,6 @@
 """Runs: `filter_recording` filters a recording and stores the results in a run folder.
 
->>> from mstfilter.presets import load_config
+>>> from mstfilter.runs.presets import load_config
 >>> from mstfilter.runs import filter_recording
 >>> from mstfilter.scoring import read_truth, score_pauses
 >>> recording = mstfilter.open_recording("recordings/mine")                        # any format
@@ -12,6 +12,6 @@ A repeated call resumes an interrupted run from ``pauses/NNN/state.npz`` of the 
 an uninterrupted run have the same result. The module `run` filters, and `run_folder` reads and writes files.
 """
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

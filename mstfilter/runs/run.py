@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import mstfilter
-from mstfilter.errors import InputError
-from mstfilter.files import atomic_folder, check_output, locked
-from mstfilter.lazy import progress_of
-from mstfilter.oracles import bind_truth, uses_truth
-from mstfilter.presets import REGISTRY, build_filter, describe_filter
-from mstfilter.processes import machine, parallel, threads
-from mstfilter.registry import nested_components
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import atomic_folder, check_output, locked
+from mstfilter.base.lazy import progress_of
+from mstfilter.base.processes import machine, parallel, threads
+from mstfilter.base.registry import nested_components
+from mstfilter.lab.oracles import bind_truth, uses_truth
+from mstfilter.runs.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.runs.run_folder import RunFolder, as_json
 from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings, scene_cache
 from mstfilter.scoring import ask
@@ -68,7 +68,7 @@ def filter_recording(
     ----------
     recording : Recording
     config : mapping
-        A configuration from `mstfilter.presets.load_config`.
+        A configuration from `mstfilter.runs.presets.load_config`.
     path : Path
         The run folder. The folder must be new, be empty, or contain the same interrupted run.
     seed : int

@@ -26,8 +26,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, RootModel, model_validator
 
-from mstfilter.errors import InputError, InputWarning
-from mstfilter.files import (
+from mstfilter.base.errors import InputError, InputWarning
+from mstfilter.base.files import (
     SUMS,
     atomic_folder,
     damaged_files,
@@ -38,8 +38,8 @@ from mstfilter.files import (
     write_sums,
     write_text,
 )
+from mstfilter.base.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.formats.folder import CameraFile
-from mstfilter.reading import MAX_FILE, read_arrays, read_model
 from mstfilter.scene import (
     Camera,
     Clip,

@@ -10,7 +10,7 @@ Units are metres, radians and seconds. A rigid motion is a scipy `RigidTransform
 `mstfilter.scene` does not depend on filters or file formats.
 """
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 

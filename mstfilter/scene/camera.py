@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene.arrays import content_key, frozen, read_only
 
 

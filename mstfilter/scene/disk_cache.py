@@ -24,9 +24,9 @@ from typing import Any
 import diskcache
 import numpy as np
 
-from mstfilter.errors import InputWarning
-from mstfilter.files import make_folders
-from mstfilter.reading import check_private, read_bytes, unpack_arrays
+from mstfilter.base.errors import InputWarning
+from mstfilter.base.files import make_folders
+from mstfilter.base.reading import check_private, read_bytes, unpack_arrays
 from mstfilter.scene.arrays import content_key
 
 # CPython 3.11 raises SystemError if two threads parse the headers of arrays at once (python/cpython#106905).

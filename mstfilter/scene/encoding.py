@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene.occupancy import Occupancy
 from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, VoxelGrid
 

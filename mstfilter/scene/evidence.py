@@ -19,9 +19,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import Bounds, NonNegativeFloat
-from mstfilter.results import Checked, check_array, check_list, check_pair, check_type, describe_value, returns
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import Bounds, NonNegativeFloat
+from mstfilter.base.results import Checked, check_array, check_list, check_pair, check_type, describe_value, returns
 from mstfilter.scene.arrays import component_key, read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import scaled_area

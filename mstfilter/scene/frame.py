@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mstfilter.errors import InputError
-from mstfilter.files import reading
-from mstfilter.lazy import late
-from mstfilter.reading import read_arrays, read_bytes
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import reading
+from mstfilter.base.lazy import late
+from mstfilter.base.reading import read_arrays, read_bytes
 from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
@@ -286,7 +286,7 @@ class Frame:
         more += f", {len(self.views)} more views" if self.views else ""
         return f"Frame: {depth}{more}\n  {self.camera!r}"
 
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
     @cached_property
     def key(self) -> bytes:
@@ -368,7 +368,7 @@ class Clip:
         frames = "1 frame" if len(self) == 1 else f"{len(self)} frames"
         return f"Clip {self.index}: {frames}{seconds}\n  {self.grid.text}"
 
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
     @cached_property
     def key(self) -> bytes:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, check_number
+from mstfilter.base.errors import InputError, check_number
 from mstfilter.scene.arrays import read_only
 from mstfilter.scene.cache import memo
 from mstfilter.scene.camera import Camera

@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene.arrays import content_key, read_only
 
 

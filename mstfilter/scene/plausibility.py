@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mstfilter.errors import InputError, warn_user
+from mstfilter.base.errors import InputError, warn_user
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.frame import Frame, depth_sigma, grey_blocks

@@ -23,9 +23,9 @@ from typing import Any, ClassVar, overload
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError, check_integer, warn_user
-from mstfilter.fields import Bounded
-from mstfilter.lazy import late
+from mstfilter.base.errors import InputError, check_integer, warn_user
+from mstfilter.base.fields import Bounded
+from mstfilter.base.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame, check_depth, without_alpha
@@ -136,8 +136,8 @@ class Recording:
         where = "" if self.path is None else f"\n  {str(self.path)[-100:]}"
         return f"Recording {self.name[:60]!r}: {frames}, pauses at {pauses}\n  {self.grid.text}{where}"
 
-    plot = late("mstfilter.report.display:plot_recording", "Images at the pauses, and the time line.")
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    plot = late("mstfilter.app.report.display:plot_recording", "Images at the pauses, and the time line.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
     @classmethod
     def from_arrays(

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError
-from mstfilter.lazy import late
+from mstfilter.base.errors import InputError
+from mstfilter.base.lazy import late
 from mstfilter.scene.arrays import content_key, frozen
 from mstfilter.scene.occupancy import Occupancy
 
@@ -215,7 +215,7 @@ class ObjectView:
     key: str  #: key of the contents
     #: Rigid motion of the object in world metres since the frame.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
-    #: (n,) float32, visible area of each colour (`mstfilter.completion.observed.areas_of_colours`); may be empty.
+    #: (n,) float32, visible area of each colour (`mstfilter.mst.completion.observed.areas_of_colours`); may be empty.
     colours: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def moved(self, T: RigidTransform) -> ObjectView:
@@ -359,8 +359,8 @@ class Hypothesis:
         lines = [f"Hypothesis of {len(volumes)} {'object' if len(volumes) == 1 else 'objects'}", self.grid.text]
         return "\n  ".join([*lines, f"voxels by label: {', '.join(volumes[:12])}{more}"] if volumes else lines)
 
-    show = late("mstfilter.report.viewer:show_hypothesis", "The voxels as a page that can be rotated.")
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    show = late("mstfilter.app.report.viewer:show_hypothesis", "The voxels as a page that can be rotated.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
     @classmethod
     def from_labels(cls, labels: np.ndarray, grid: VoxelGrid, birth: int = 0) -> Hypothesis:
@@ -465,7 +465,7 @@ class Hypothesis:
         self.record(label)
         return self.grid.centre_of(np.argwhere(self.labels == label))
 
-    mesh = late("mstfilter.report.export:object_mesh", "Corners and triangles of the surface of an object.")
+    mesh = late("mstfilter.app.report.export:object_mesh", "Corners and triangles of the surface of an object.")
 
     def pose(self, label: int) -> RigidTransform:
         """Rigid motion of an object in world metres since the object was first proposed.

@@ -10,6 +10,6 @@ good the probabilities of the weighted set are (`questions`, `log_loss`).
 >>> row["quality"], belief.row["brier"]  # doctest: +SKIP
 """
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.forecasts import SOFTENING, ForecastTable, Recalibration
+from mstfilter.base.errors import InputError
 from mstfilter.scene import Hypothesis, read_only
+from mstfilter.scoring.forecasts import SOFTENING, ForecastTable, Recalibration
 from mstfilter.scoring.questions import NOISE_RATES, Questions
 
 LOG_LOSS = "recalibrated_log_loss"  # name of the score in tables

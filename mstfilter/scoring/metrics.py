@@ -27,7 +27,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene import as_labels, common_refinement, occupied_box
 from mstfilter.scoring.quality import (
     FORMS,

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene import Camera, Hypothesis, Recording, VoxelGrid, render
 from mstfilter.scoring.log_loss import check_normalised, score_belief
 from mstfilter.scoring.metrics import diversity, least_loss, pairwise_quality, pause_metrics

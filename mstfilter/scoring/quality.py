@@ -39,7 +39,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene import Recording, as_labels, scaled_area
 
 Form = Literal["objects", "paper", "authors"]

@@ -36,7 +36,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
+from mstfilter.base.errors import InputError, check_integer
 from mstfilter.scene import Frame, Hypothesis, Recording, VoxelGrid, depth_sigma, frame_geometry
 
 N_QUESTIONS = 20_000

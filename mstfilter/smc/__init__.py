@@ -35,7 +35,7 @@
 ======================  ===================================================================================
 """
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)
 

@@ -11,43 +11,13 @@ from mstfilter.smc.components import (
     Reweight as Reweight,
     first_seen as first_seen,
 )
-from mstfilter.smc.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
-from mstfilter.smc.diagnostics import (
-    RunVariance as RunVariance,
-    energy_distance as energy_distance,
-    run_variance as run_variance,
-)
-from mstfilter.smc.distributions import (
-    Bernoulli as Bernoulli,
-    Categorical as Categorical,
-    MultivariateNormal as MultivariateNormal,
-    Normal as Normal,
-    Student as Student,
-    Uniform as Uniform,
-    as_distribution as as_distribution,
-)
 from mstfilter.smc.diverse_resampling import (
     Chopthin as Chopthin,
     ClusterStratified as ClusterStratified,
     FearnheadClifford as FearnheadClifford,
     Gaussian as Gaussian,
 )
-from mstfilter.smc.exact import (
-    Kalman as Kalman,
-    Marginals as Marginals,
-    forward_backward as forward_backward,
-    hidden_markov as hidden_markov,
-    kalman_filter as kalman_filter,
-    linear_gaussian as linear_gaussian,
-)
 from mstfilter.smc.filter import ParticleFilter as ParticleFilter
-from mstfilter.smc.gaussian import (
-    ConditionallyLinear as ConditionallyLinear,
-    Linear as Linear,
-    nonlinear_gaussian as nonlinear_gaussian,
-    rao_blackwellised as rao_blackwellised,
-    ukf_proposal as ukf_proposal,
-)
 from mstfilter.smc.history import (
     History as History,
     collect as collect,
@@ -57,11 +27,24 @@ from mstfilter.smc.history import (
     resampled as resampled,
     unique_ancestors as unique_ancestors,
 )
-from mstfilter.smc.inference import (
+from mstfilter.smc.inference.conditional import conditional_path as conditional_path, path_log_prob as path_log_prob
+from mstfilter.smc.inference.diagnostics import (
+    RunVariance as RunVariance,
+    energy_distance as energy_distance,
+    run_variance as run_variance,
+)
+from mstfilter.smc.inference.parameters import (
     Chains as Chains,
     ensemble as ensemble,
     particle_gibbs as particle_gibbs,
     pmmh as pmmh,
+)
+from mstfilter.smc.inference.smoothing import (
+    Record as Record,
+    backward_paths as backward_paths,
+    fixed_lag as fixed_lag,
+    genealogy as genealogy,
+    keep as keep,
 )
 from mstfilter.smc.inputs import WithInput as WithInput
 from mstfilter.smc.interfaces import (
@@ -84,34 +67,33 @@ from mstfilter.smc.interfaces import (
     Update as Update,
     WeightResampler as WeightResampler,
 )
-from mstfilter.smc.population import (
-    Candidates as Candidates,
-    Population as Population,
-    as_matrix as as_matrix,
-    log_mean_exp as log_mean_exp,
-    normalise as normalise,
-    union as union,
+from mstfilter.smc.models.distributions import (
+    Bernoulli as Bernoulli,
+    Categorical as Categorical,
+    MultivariateNormal as MultivariateNormal,
+    Normal as Normal,
+    Student as Student,
+    Uniform as Uniform,
+    as_distribution as as_distribution,
 )
-from mstfilter.smc.programs.filters import Program as Program
-from mstfilter.smc.programs.sites import observe as observe, sample as sample, switch as switch
-from mstfilter.smc.resampling import (
-    Killing as Killing,
-    LargestWeights as LargestWeights,
-    Multinomial as Multinomial,
-    Residual as Residual,
-    Ssp as Ssp,
-    Stratified as Stratified,
-    Systematic as Systematic,
+from mstfilter.smc.models.exact import (
+    Kalman as Kalman,
+    Marginals as Marginals,
+    forward_backward as forward_backward,
+    hidden_markov as hidden_markov,
+    kalman_filter as kalman_filter,
+    linear_gaussian as linear_gaussian,
 )
-from mstfilter.smc.running import run_many as run_many
-from mstfilter.smc.smoothing import (
-    Record as Record,
-    backward_paths as backward_paths,
-    fixed_lag as fixed_lag,
-    genealogy as genealogy,
-    keep as keep,
+from mstfilter.smc.models.gaussian import (
+    ConditionallyLinear as ConditionallyLinear,
+    Linear as Linear,
+    nonlinear_gaussian as nonlinear_gaussian,
+    rao_blackwellised as rao_blackwellised,
+    ukf_proposal as ukf_proposal,
 )
-from mstfilter.smc.state_space import (
+from mstfilter.smc.models.programs.filters import Program as Program
+from mstfilter.smc.models.programs.sites import observe as observe, sample as sample, switch as switch
+from mstfilter.smc.models.state_space import (
     Dynamics as Dynamics,
     Prior as Prior,
     PriorityLookahead as PriorityLookahead,
@@ -122,6 +104,24 @@ from mstfilter.smc.state_space import (
     guided as guided,
     resample_move as resample_move,
 )
+from mstfilter.smc.population import (
+    Candidates as Candidates,
+    Population as Population,
+    as_matrix as as_matrix,
+    log_mean_exp as log_mean_exp,
+    normalise as normalise,
+    union as union,
+)
+from mstfilter.smc.resampling import (
+    Killing as Killing,
+    LargestWeights as LargestWeights,
+    Multinomial as Multinomial,
+    Residual as Residual,
+    Ssp as Ssp,
+    Stratified as Stratified,
+    Systematic as Systematic,
+)
+from mstfilter.smc.running import run_many as run_many
 from mstfilter.smc.streams import Key as Key, child as child, key_of as key_of
 from mstfilter.smc.wrapped_resampling import (
     Coalesced as Coalesced,

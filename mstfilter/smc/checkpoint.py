@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, reason
-from mstfilter.files import atomic_path, writing
-from mstfilter.reading import read_arrays
+from mstfilter.base.errors import InputError, reason
+from mstfilter.base.files import atomic_path, writing
+from mstfilter.base.reading import read_arrays
 from mstfilter.smc.interfaces import Codec, State
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key

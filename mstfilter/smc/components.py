@@ -27,8 +27,8 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
-from mstfilter.fields import Bounds, PositiveInt
+from mstfilter.base.errors import InputError, check_integer
+from mstfilter.base.fields import Bounds, PositiveInt
 from mstfilter.smc.first_steps import Few, compare_alone
 from mstfilter.smc.interfaces import Equivalence, Size, Transition, Trigger, Update
 from mstfilter.smc.population import Population, as_matrix, union

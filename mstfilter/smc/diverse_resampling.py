@@ -23,8 +23,8 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import Bounds
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import Bounds
 from mstfilter.smc.interfaces import Resampler, Similarity, WeightResampler
 from mstfilter.smc.population import Population, as_matrix, log_mean_exp
 from mstfilter.smc.resampling import Systematic, checked_weights, inverse_cdf, systematic_copies

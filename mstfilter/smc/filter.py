@@ -30,10 +30,10 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer, place_in_user_file
-from mstfilter.fields import NonNegativeInt, PositiveInt
-from mstfilter.lazy import progress_of
-from mstfilter.processes import together
+from mstfilter.base.errors import InputError, check_integer, place_in_user_file
+from mstfilter.base.fields import NonNegativeInt, PositiveInt
+from mstfilter.base.lazy import progress_of
+from mstfilter.base.processes import together
 from mstfilter.smc.components import EssBelow
 from mstfilter.smc.first_steps import Examined
 from mstfilter.smc.inputs import AtStep, check_observations, same_component, split_input, usual_slip

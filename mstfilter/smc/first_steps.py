@@ -8,7 +8,7 @@ global generator. The evidence is then wrong, and nothing looks odd:
 >>> model = StateSpaceModel.of(Normal(0., 1.), lambda x: Normal(.9 * x.mean(), .5), lambda x: Normal(x, 1.))
 >>> bootstrap(model, 100).run([.3, -.2, .8])
 Traceback (most recent call last):
-mstfilter.errors.InputError: step 1, transition: the transition: a particle moves differently among others ...
+mstfilter.base.errors.InputError: step 1, transition: the transition: a particle moves differently among others ...
 
 Hence each component that is made of model functions implements `Component.examine`, and the filter calls it at the
 first three observations of a run (`iterate`) until it has seen particles that differ. An examination takes at most 64
@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, describe_error as reason
+from mstfilter.base.errors import InputError, describe_error as reason
 from mstfilter.smc.population import Particles, count_particles, take
 from mstfilter.smc.streams import child
 

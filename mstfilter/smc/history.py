@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, missing_library
+from mstfilter.base.errors import InputError, missing_library
 from mstfilter.smc.interfaces import Info, State
 from mstfilter.smc.population import flat_columns
 

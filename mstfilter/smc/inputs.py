@@ -25,8 +25,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import Bounded
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import Bounded
 
 
 @dataclass(frozen=True, eq=False)

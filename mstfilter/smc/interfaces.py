@@ -1,8 +1,8 @@
 """Interfaces of the components of a particle filter, `State` and `Info`.
 
 A component is a frozen dataclass. The fields of a component are hyperparameters, with bounds in their annotations
-(see `mstfilter.fields`), and one method defines its behaviour. Methods that draw random numbers take the generator as
-first argument. All methods work on whole populations, so a component can share work between particles.
+(see `mstfilter.base.fields`), and one method defines its behaviour. Methods that draw random numbers take the
+generator as first argument. All methods work on whole populations, so a component can share work between particles.
 
 >>> from dataclasses import dataclass
 >>> import numpy as np
@@ -28,9 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, check_integer
-from mstfilter.fields import Bounded
-from mstfilter.lazy import late, short_repr
+from mstfilter.base.errors import InputError, check_integer
+from mstfilter.base.fields import Bounded
+from mstfilter.base.lazy import late, short_repr
 from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.population import Population
 from mstfilter.smc.streams import Key
@@ -319,7 +319,7 @@ class State:
         particles = "" if self.population is None else f"\n  {self.population!r}"
         return f"State at t = {self.t}, seed {self.key.seed}{evidence}{particles}"
 
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
     @property
     def log_evidence(self) -> float | None:
@@ -374,4 +374,4 @@ class Infos(list[Info]):
         spread = f"ESS {min(ess):.1f} to {max(ess):.1f}"
         return f"Infos: steps {len(self)}, resampled {sum(i.resampled for i in self)}, {spread}, {seconds:.3g} s"
 
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")

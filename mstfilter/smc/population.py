@@ -24,9 +24,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError
-from mstfilter.lazy import late
-from mstfilter.processes import each
+from mstfilter.base.errors import InputError, LostRunError
+from mstfilter.base.lazy import late
+from mstfilter.base.processes import each
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -83,7 +83,7 @@ class Candidates(Sequence[_T], Generic[_T]):
         return self._built[index]
 
     def built(self) -> tuple[_T, ...]:
-        """All candidates in order, built at the same time in a block `mstfilter.processes.parallel`."""
+        """All candidates in order, built at the same time in a block `mstfilter.base.processes.parallel`."""
         _, first = np.unique(self._indices, return_index=True)
         each(self.__getitem__, np.sort(first))
         return tuple(self)
@@ -266,8 +266,8 @@ class Population:
             lines.append(f"parents {', '.join(self.parents)}")
         return "\n  ".join(lines)
 
-    plot = late("mstfilter.report.display:plot_population", "Hypotheses by weight, or weighted histograms.")
-    _repr_html_ = late("mstfilter.report.display:to_html", "What a notebook shows.")
+    plot = late("mstfilter.app.report.display:plot_population", "Hypotheses by weight, or weighted histograms.")
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
 
     def __len__(self) -> int:
         return len(self.log_weights)

@@ -37,7 +37,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc.interfaces import WeightResampler
 
 

@@ -29,9 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import InputError, LostRunError, check_component, check_integer, naming
-from mstfilter.lazy import progress_of
-from mstfilter.processes import environment
+from mstfilter.base.errors import InputError, LostRunError, check_component, check_integer, naming
+from mstfilter.base.lazy import progress_of
+from mstfilter.base.processes import environment
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
 from mstfilter.smc.history import Collector, History, check_collectors, check_one_shape, collect, log_evidence

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.random.bit_generator import ISpawnableSeedSequence
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 
 #: Neighbouring indices whose seeds are computed together: a filter takes one after the other.
 _BLOCK = 16

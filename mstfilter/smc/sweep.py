@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.errors import LostRunError, naming
+from mstfilter.base.errors import LostRunError, naming
 from mstfilter.smc.components import Always, EssBelow, Never
 from mstfilter.smc.filter import ParticleFilter, keep_freed_memory
 from mstfilter.smc.history import Collector, check_one_shape, ess, log_evidence, resampled, stacked

@@ -18,8 +18,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import Share
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import Share
 from mstfilter.smc.components import ExactEquality
 from mstfilter.smc.diverse_resampling import FearnheadClifford
 from mstfilter.smc.interfaces import Equivalence, Resampler

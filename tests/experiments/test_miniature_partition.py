@@ -22,7 +22,7 @@ from miniature_partition import (
 )
 from miniature_world import Miniature, Observation
 
-from mstfilter.partition import Cells, PairEvidence, Readings
+from mstfilter.mst.partition import Cells, PairEvidence, Readings
 from mstfilter.scene import Occupancy
 from mstfilter.smc import Population
 from tests.experiments.test_miniature_world import ids

@@ -6,8 +6,8 @@ import importlib
 from functools import cache
 from xml.etree import ElementTree
 
+from tests.app.report.test_study_report import make_study
 from tests.experiments.scripts import EXPERIMENTS, own_modules, run_script
-from tests.report.test_study_report import make_study
 
 FOLDER = EXPERIMENTS / "paper_figures"
 SIMULATED = ("teaser.png", "sampled_cuts.png")

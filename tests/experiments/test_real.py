@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.files import read_csv
+from mstfilter.base.files import read_csv
 from mstfilter.scene import Camera, Frame, Hypothesis, VoxelGrid
 from tests.experiments.scripts import EXPERIMENTS, own_modules, run_script
 

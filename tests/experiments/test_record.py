@@ -52,7 +52,7 @@ def study(tmp_path, monkeypatch):
     for name, text in {
         "mstfilter/__init__.py": "",
         "mstfilter/a.py": '"""A."""\nx = 1\n',
-        "mstfilter/cli/b.py": "y = 1\n",
+        "mstfilter/app/b.py": "y = 1\n",
         "models/mst.toml": "n = 5\n",
         "experiments/one/run.py": "print(1)\n",
         "experiments/one/results/old.csv": "a\n1\n",
@@ -71,7 +71,7 @@ def study(tmp_path, monkeypatch):
         ("mstfilter/a.py", '"""Another docstring."""\n\n# a comment\nx = 1\n', True),
         ("mstfilter/a.py", '"""A."""\n__version__ = "0.2.0"\nx = 1\n', True),
         ("mstfilter/a.py", '"""A."""\nx = 2\n', False),
-        ("mstfilter/cli/b.py", "y = 2\n", True),
+        ("mstfilter/app/b.py", "y = 2\n", True),
         ("models/mst.toml", "n = 6\n", False),
         ("experiments/one/run.py", "print(2)\n", False),
         ("experiments/one/record.json", "{}", True),

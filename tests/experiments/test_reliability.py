@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import mstfilter.files
+import mstfilter.base.files
 from tests.experiments.scripts import EXPERIMENTS, own_modules
 
 POINTS = {"run": 6, "run --replace": 6, "study": 2, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
@@ -42,6 +42,6 @@ def test_a_stopped_command_is_repeated_to_the_same_bytes(battery, tmp_path, name
 @pytest.mark.parametrize(("function", "name"), [("_sync", "save_recording"), ("sweep", "write_masks")])
 def test_the_battery_notices_faults(battery, tmp_path, monkeypatch, function, name):
     """Without syncing, or without sweeping, a result is lost or litter is left."""
-    monkeypatch.setattr(mstfilter.files, function, lambda *_, **__: None)
+    monkeypatch.setattr(mstfilter.base.files, function, lambda *_, **__: None)
     found = trials(battery, name, tmp_path, POINTS[name])
     assert any(result.startswith("differs") for result in found.values())

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mstfilter import smc
-from mstfilter.files import read_csv
-from mstfilter.resources import models_folder
+from mstfilter.base.files import read_csv
+from mstfilter.base.resources import models_folder
+from mstfilter.base.trained import open_model
+from mstfilter.mst.segmentation import FEATURES, LearnedTree, PairNetwork
 from mstfilter.scene import read_rgb
-from mstfilter.segmentation import FEATURES, LearnedTree, PairNetwork
-from mstfilter.trained import open_model
 from tests.conftest import find_shared
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
 

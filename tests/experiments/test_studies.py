@@ -6,13 +6,13 @@ from unittest import mock
 
 import pytest
 
-from mstfilter.cli import main
-from mstfilter.files import read_csv
+from mstfilter.app.cli import main
+from mstfilter.base.files import read_csv
+from mstfilter.lab.simulation import FIRST_REPORTED_SEED
+from mstfilter.runs.study import load_study, make_plan
 from mstfilter.scoring import LOG_LOSS
-from mstfilter.simulation import FIRST_REPORTED_SEED
-from mstfilter.study import load_study, make_plan
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
-from tests.study.scenes import InProcess
+from tests.runs.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
 
@@ -20,7 +20,7 @@ MAIN = EXPERIMENTS / "main/study.toml"
 def run_small(tmp_path, config, *overrides):
     """The folder of a study in its small form."""
     out = tmp_path / config.stem
-    with mock.patch("mstfilter.study.Local", lambda workers, logs: InProcess()):
+    with mock.patch("mstfilter.runs.study.Local", lambda workers, logs: InProcess()):
         try:
             main(["study", str(config), *overrides, "--smoke", "--out", str(out)])
         except SystemExit as end:
@@ -94,7 +94,10 @@ def test_a_study_by_families_has_the_tables_of_the_whole_study(tmp_path, capsys)
     )
 
     def study(folder, *options):
-        with mock.patch("mstfilter.study.Local", lambda workers, logs: InProcess()), pytest.raises(SystemExit) as end:
+        with (
+            mock.patch("mstfilter.runs.study.Local", lambda workers, logs: InProcess()),
+            pytest.raises(SystemExit) as end,
+        ):
             main(["study", str(config), *options, "--out", str(tmp_path / folder)])
         return end.value.code
 

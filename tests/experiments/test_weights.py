@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from mstfilter.files import read_csv
+from mstfilter.base.files import read_csv
 from tests.experiments.scripts import EXPERIMENTS, import_script, own_modules, run_script
 
 reliability = import_script("weights/reliability.py")

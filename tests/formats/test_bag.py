@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import open_recording
 from mstfilter.formats.bag import Bag, colour_image, depth_image
 from mstfilter.formats.folder import save_recording

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import open_recording
 from mstfilter.formats.folder import RecordingWriter, save_recording
 from mstfilter.formats.image_folders import Redwood, Tum

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats.pauses import At, Ends, EveryNth, Still, grey_blocks, pauses_from_text
 from mstfilter.scene import Recording
 from tests.formats.layouts import PAUSES, video

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats.image_folders import PairedImages, Redwood
 from mstfilter.formats.sources import detect_format, format_settings, open_recording
-from mstfilter.presets import REGISTRY
+from mstfilter.runs.presets import REGISTRY
 from mstfilter.scene import render, write_image
 from tests.formats import layouts
 from tests.scene.scenes import CAMERA, GRID, table_scene

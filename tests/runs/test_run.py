@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.formats import open_recording
-from mstfilter.frontends import ExternalCompletion, write_masks
-from mstfilter.presets import build_filter, describe_filter, load_config
+from mstfilter.mst.frontends import ExternalCompletion, write_masks
+from mstfilter.runs.presets import build_filter, describe_filter, load_config
 from mstfilter.runs.run import component_files, filter_recording
 from mstfilter.runs.run_folder import RunFolder
 from mstfilter.scene import scene_cache
 from mstfilter.scoring import weighted_coverage
-from tests.study.scenes import slide
-from tests.study.test_failures import BROKEN
+from tests.runs.study.scenes import slide
+from tests.runs.study.test_failures import BROKEN
 
 
 @pytest.fixture(scope="module")

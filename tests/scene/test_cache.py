@@ -15,7 +15,7 @@ import diskcache
 import numpy as np
 import pytest
 
-from mstfilter.completion import Extrude
+from mstfilter.mst.completion import Extrude
 from mstfilter.scene import Cache, DiskCache
 from mstfilter.scene.arrays import component_key, content_key
 
@@ -255,7 +255,7 @@ def test_a_folder_that_cannot_be_written_and_a_full_disk_store_nothing(tmp_path,
 CLASS = """
 from dataclasses import dataclass
 from functools import cached_property
-from mstfilter.completion import Extrude
+from mstfilter.mst.completion import Extrude
 
 @dataclass(frozen=True)
 class Mine(Extrude):
@@ -298,7 +298,7 @@ def test_a_class_of_the_user_is_known_by_its_code():
         first, again, other = (key(CLASS + template.format(value)) for value in (a, a, b))
         assert first == again != other, template
     values = [content_key(value) for value in astuple(Extrude())]
-    assert component_key(Extrude()) == content_key("mstfilter.completion.extrude", "Extrude", "", b"", *values)
+    assert component_key(Extrude()) == content_key("mstfilter.mst.completion.extrude", "Extrude", "", b"", *values)
 
 
 def made(k):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene.camera import Camera, look_at, rigid_from_matrix, scaled_area, scaled_length
 from mstfilter.scene.frame import Frame
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.formats import save_recording
 from mstfilter.scene import Camera, Frame, FreeSpace, Hypothesis, NoFreeSpace, Recording
 from tests.scene.free_space_reference import CAMERAS, SMALL, frame_of, observe, shelf, views

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
 from mstfilter.scene import (
     TABLE_TOLERANCE,

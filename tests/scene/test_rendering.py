@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from mstfilter.errors import InputError, MissingLibraryError
-from mstfilter.lazy import import_open3d
+from mstfilter.base.errors import InputError, MissingLibraryError
+from mstfilter.base.lazy import import_open3d
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.rendering import render, render_hypothesis
 from mstfilter.scene.voxels import Hypothesis, VoxelGrid

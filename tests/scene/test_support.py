@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import binary_erosion, label
 
 from mstfilter.scene import Frame, foreground, pixels_above_table, readings_above_table, render
-from tests.segmentation.scenes import GRID, TWO, camera, frame_of
+from tests.mst.segmentation.scenes import GRID, TWO, camera, frame_of
 
 SEEN = render(TWO, GRID, camera(640)).labels
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene.encoding import decode_hypotheses, encode_hypotheses
 from mstfilter.scene.occupancy import Occupancy
 from mstfilter.scene.voxels import Crop, Hypothesis, ObjectRecord, ObjectView, VoxelGrid

@@ -9,7 +9,7 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning
+from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
@@ -17,9 +17,9 @@ from mstfilter.scene.frame import depth_sigma
 from mstfilter.scene.geometry import _without_strips, in_columns, shares_with_depth
 from mstfilter.scene.recording import Recording
 from mstfilter.scene.voxels import VoxelGrid
+from tests.app.test_cli import call
 from tests.formats.layouts import video
 from tests.scene.scenes import CAMERA, GRID, table_scene
-from tests.test_cli import call
 
 
 def arrays(grid, noise=None, **named):

@@ -7,8 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
-from mstfilter.forecasts import ForecastTable
+from mstfilter.base.errors import InputError
 from mstfilter.scoring import (
     NOISE_RATES,
     FittedForecasts,
@@ -18,6 +17,7 @@ from mstfilter.scoring import (
     leave_one_out,
     score_belief,
 )
+from mstfilter.scoring.forecasts import ForecastTable
 
 
 def scene(seed, shape=(16, 12, 8)):

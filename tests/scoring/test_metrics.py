@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scoring import diversity, least_loss, overlap, pairwise_quality, pause_metrics, weighted_coverage
 from mstfilter.scoring.metrics import coverage_of, object_metrics
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene import Recording
 from mstfilter.scoring.quality import object_status
 from tests.scene.scenes import CAMERA, GRID, table_scene

@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.formats import RecordingWriter, open_recording
 from mstfilter.scene import Hypothesis, VoxelGrid, render
 from mstfilter.scoring import PauseEstimate, PauseTruth, read_truth, score_pauses
@@ -90,7 +90,7 @@ def test_instance_images_score_visible_parts(tmp_path):
 
 def test_a_run_scores_as_its_own_metrics_say(tmp_path):
     """Rows equal what the run wrote while it was running."""
-    from mstfilter.presets import load_config
+    from mstfilter.runs.presets import load_config
     from mstfilter.runs.run import filter_recording
 
     recording = open_recording(write_recording(tmp_path / "r"))

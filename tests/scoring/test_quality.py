@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scoring.quality import FORMS, weighted_coverage
 
 

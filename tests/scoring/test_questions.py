@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.scene import Hypothesis, Occupancy, Recording, VoxelGrid
 from mstfilter.scoring import Questions, ask, draw_questions, in_question
 from mstfilter.scoring.questions import DEPTH_BEHIND, REACH

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import (
     Branching,
     Coalesced,

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.special import gammaln, xlogy
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import (
     Bernoulli,
     Categorical,
@@ -19,7 +19,7 @@ from mstfilter.smc import (
     as_distribution,
     bootstrap,
 )
-from mstfilter.smc.distributions import hypothetical
+from mstfilter.smc.models.distributions import hypothetical
 
 COV = np.array([[2.0, 0.6], [0.6, 0.5]])
 CASES = [

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import bootstrap, forward_backward, hidden_markov, kalman_filter
 from tests.smc.models import EMIT, MOVES, START
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import Distribution, Normal, Program, observe, sample
 from mstfilter.smc.testing import ModelContract, check_properties
 from mstfilter.smc.testing.models import check_density

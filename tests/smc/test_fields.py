@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, InputWarning
-from mstfilter.fields import Bounded
+from mstfilter.base.errors import InputError, InputWarning
+from mstfilter.base.fields import Bounded
 from mstfilter.smc import (
     Coalesced,
     EssBelow,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import Normal, StateSpaceModel, bootstrap, guided, nonlinear_gaussian, ukf_proposal
 from tests.smc.models import filterpy_class
 

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import (
     Branching,
     Dynamics,

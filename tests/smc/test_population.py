@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, LostRunError
+from mstfilter.base.errors import InputError, LostRunError
 from mstfilter.smc import Always, Candidates, Population, WeightResampler, bootstrap, log_mean_exp
 from mstfilter.smc.population import take, union
 from tests.smc.models import AR1

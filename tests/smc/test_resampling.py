@@ -1,6 +1,6 @@
 """Resampling: draws by weight, hostile weights for all schemes, and what single schemes promise.
 
-The laws are enumerated in test_exact_laws.py; tests/testing runs the contract on all schemes.
+The laws are enumerated in test_exact_laws.py; tests/mst/testing runs the contract on all schemes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import (
     Always,
     Chopthin,

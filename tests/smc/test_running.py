@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError, MissingLibraryError
+from mstfilter.base.errors import InputError, MissingLibraryError
 from mstfilter.smc import (
     Always,
     Chains,

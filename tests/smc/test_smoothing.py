@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import (
     Always,
     DensityTransition,
@@ -189,7 +189,7 @@ def test_fixed_lag_lies_between_the_filter_and_the_genealogy():
 def test_a_large_run_is_done_in_blocks(monkeypatch):
     record = keep(bootstrap(AR1, 40), YS, 1)
     whole = backward_paths(np.random.default_rng(0), record, Dynamics(AR1), 30)
-    monkeypatch.setattr("mstfilter.smc.smoothing._PAIRS", 100)
+    monkeypatch.setattr("mstfilter.smc.inference.smoothing._PAIRS", 100)
     parts = backward_paths(np.random.default_rng(0), record, Dynamics(AR1), 30)
     for a, b in zip(whole, parts, strict=True):
         np.testing.assert_array_equal(a.particles, b.particles)

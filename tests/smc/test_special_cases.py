@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import Always, ConditionallyLinear, EssBelow, Linear, kalman_filter, rao_blackwellised
 from tests.smc.test_particle_filter import M0, P0, F, H, Q, R, observations
 

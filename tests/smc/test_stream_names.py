@@ -29,7 +29,7 @@ from mstfilter.smc import (
     sample,
 )
 from mstfilter.smc.first_steps import unexamined
-from tests.baselines.scenes import slide
+from tests.lab.baselines.scenes import slide
 from tests.smc.models import AR1, ar1_observations, optimal, predictive
 
 YS = ar1_observations(6)

@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.smc import Key, child, key_of
 
 GOLDEN = {

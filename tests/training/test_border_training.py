@@ -12,8 +12,7 @@ import torch
 from mst_training.border import BorderTraining, Tally, encoded
 from mst_training.border_data import BorderSamples, targets
 from mst_training.loop import run_training
-from mstfilter.scene import Camera, Frame
-from mstfilter.segmentation.border_network import (
+from mstfilter.mst.segmentation.border_network import (
     CENTRE_UNIT,
     IMAGE_CHANNELS,
     BorderNet,
@@ -22,7 +21,8 @@ from mstfilter.segmentation.border_network import (
     near_objects,
     reduced,
 )
-from tests.segmentation.scenes import TWO, frame_of
+from mstfilter.scene import Camera, Frame
+from tests.mst.segmentation.scenes import TWO, frame_of
 
 SMALL = BorderTraining(n_scenes=1, n_validation=1, n_test=1, width=8, steps=16, batch=2, rate=6e-3, average=0.8)
 

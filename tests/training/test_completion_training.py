@@ -16,16 +16,16 @@ from mst_training.completion_data import CompletionSamples
 from mst_training.loop import run_training
 from mst_training.scenes import draw_camera, draw_scene
 from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
-from mstfilter.completion import NetworkCompleter
-from mstfilter.completion.crops import extruded
-from mstfilter.errors import InputError
-from mstfilter.files import read_csv
+from mstfilter.base.errors import InputError
+from mstfilter.base.files import read_csv
+from mstfilter.base.trained import open_model
+from mstfilter.lab.simulation.shapes import label_voxels
+from mstfilter.mst.completion import NetworkCompleter
+from mstfilter.mst.completion.crops import extruded
 from mstfilter.scene import Seen
-from mstfilter.simulation.shapes import label_voxels
-from mstfilter.trained import open_model
-from tests.completion.test_completion import masks_of
 from tests.experiments.scripts import run_script
-from tests.segmentation.scenes import GRID, TWO, frame_of
+from tests.mst.completion.test_completion import masks_of
+from tests.mst.segmentation.scenes import GRID, TWO, frame_of
 
 SMALL = CompletionTraining(
     n_scenes=1, n_validation=1, n_test=1, width=8, n_globals=4, steps=40, batch=8, rate=4e-3, average=0.9
@@ -138,7 +138,7 @@ def test_training_learns_resumes_and_is_used(files, tmp_path):
     lines = [line.split(",") for line in (tmp_path / "a/curves.csv").read_text().split()]
     assert float(lines[-1][lines[0].index("log_loss")]) < loss
     # The test samples are those of one scene. The IoU there changes with rounding: .31 to .36, for .39 to .41.
-    # tests/completion/test_shipped.py compares the weights of the package by IoU.
+    # tests/mst/completion/test_shipped.py compares the weights of the package by IoU.
     assert figures["iou"] > 0.5 * figures["iou_extrude"]
 
     run_script("completion/compare.py", tmp_path / "a", "--most", 6, "--out", tmp_path / "out")

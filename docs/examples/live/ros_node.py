@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.belief import Belief
-from mstfilter.errors import missing_library, warn_user
+from mstfilter.base.errors import missing_library, warn_user
 from mstfilter.formats import Settled
 from mstfilter.formats.bag import colour_image, depth_image
-from mstfilter.live import Pause, Stream
+from mstfilter.mst.belief import Belief
+from mstfilter.runs.live import Pause, Stream
 from mstfilter.scene import project
 
 _WAITING = 30  # images of each topic that wait for a partner

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from mstfilter.completion import CHANNELS, Architecture
-from mstfilter.trained import write_model
+from mstfilter.base.trained import write_model
+from mstfilter.mst.completion import CHANNELS, Architecture
 
 
 @dataclass(frozen=True)

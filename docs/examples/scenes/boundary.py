@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.mst.segmentation import BoundaryModel
 from mstfilter.scene import Frame
-from mstfilter.segmentation import BoundaryModel
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.completion import Completer, ObservedBox
+from mstfilter.mst.completion import Completer, ObservedBox
 
 
 @dataclass(frozen=True)

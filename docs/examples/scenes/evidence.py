@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.mst.testing import scene_example
 from mstfilter.scene import Clip, Evidence, Hypothesis
-from mstfilter.testing import scene_example
 
 
 @dataclass(frozen=True)

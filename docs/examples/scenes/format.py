@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mstfilter.errors import InputError
+from mstfilter.base.errors import InputError
 from mstfilter.formats import Video, VideoFormat
 
 

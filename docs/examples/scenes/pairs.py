@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.partition import Cells, PairOdds
+from mstfilter.mst.partition import Cells, PairOdds
 from mstfilter.scene import Clip
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from mstfilter.mst.testing import scene_example
 from mstfilter.scene import Clip, Hypothesis
 from mstfilter.smc import Population, Proposal
-from mstfilter.testing import scene_example
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mstfilter.tracking import Registration, RegistrationResult, SmallGicp, Surface
+from mstfilter.mst.tracking import Registration, RegistrationResult, SmallGicp, Surface
 
 
 @dataclass(frozen=True)

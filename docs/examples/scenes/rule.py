@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.tracking import Candidate, MotionResidual, MotionRule, Track
+from mstfilter.mst.tracking import Candidate, MotionResidual, MotionRule, Track
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.segmentation import CutSample, CutSampler, Tree, optimal_cut
+from mstfilter.mst.segmentation import CutSample, CutSampler, Tree, optimal_cut
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.mst.testing import scene_example
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import Similarity
-from mstfilter.testing import scene_example
 
 
 @dataclass(frozen=True)

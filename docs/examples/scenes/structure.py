@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 
-from mstfilter.crossover import Structure
+from mstfilter.mst.crossover import Structure
 
 
 @dataclass(frozen=True)

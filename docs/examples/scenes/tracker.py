@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
+from mstfilter.mst.tracking import DenseFlow, MaskTracker
 from mstfilter.scene import Clip
-from mstfilter.tracking import DenseFlow, MaskTracker
 
 
 @dataclass(frozen=True)

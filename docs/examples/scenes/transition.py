@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from mstfilter.mst.testing import scene_example
+from mstfilter.mst.tracking import TrackingTransition
 from mstfilter.smc import Population, Transition, child
-from mstfilter.testing import scene_example
-from mstfilter.tracking import TrackingTransition
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mstfilter.mst.segmentation import Tree, TreeBuilder, UcmTree
 from mstfilter.scene import Frame
-from mstfilter.segmentation import Tree, TreeBuilder, UcmTree
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mstfilter.mst.segmentation import ObjectRule
+from mstfilter.mst.testing import scene_example
 from mstfilter.scene import Clip, project
-from mstfilter.segmentation import ObjectRule
 from mstfilter.smc import Population, Update, union
-from mstfilter.testing import scene_example
 
 
 @dataclass(frozen=True)

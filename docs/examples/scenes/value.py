@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mstfilter.mst.segmentation import CutValue, MergeLogOdds, Tree
 from mstfilter.scene import Frame
-from mstfilter.segmentation import CutValue, MergeLogOdds, Tree
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ Inherit the contract of an interface and define `make`, and ``pytest`` tests you
 >>> for result in check_properties(MyResampler(), WeightResamplerContract):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
-`mstfilter.testing` has contracts for components of scenes, and a check that finds the contract of a component.
+`mstfilter.mst.testing` has contracts for components of scenes, and a check that finds the contract of a component.
 """
 
-from mstfilter.lazy import attach
+from mstfilter.base.lazy import attach
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

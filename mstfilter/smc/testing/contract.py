@@ -29,8 +29,8 @@ from unittest import SkipTest, mock
 
 import numpy as np
 
-from mstfilter.errors import InputError, describe_error
-from mstfilter.fields import copied
+from mstfilter.base.errors import InputError, describe_error
+from mstfilter.base.fields import copied
 from mstfilter.smc import Population, as_matrix
 
 #: Largest probability that a statistical test fails for a correct component.

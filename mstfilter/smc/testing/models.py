@@ -20,8 +20,8 @@ from unittest import SkipTest
 
 import numpy as np
 
-from mstfilter.errors import InputError
-from mstfilter.fields import copied
+from mstfilter.base.errors import InputError
+from mstfilter.base.fields import copied
 from mstfilter.smc import (
     Distribution,
     Dynamics,
@@ -37,14 +37,14 @@ from mstfilter.smc import (
     log_mean_exp,
     normalise,
 )
-from mstfilter.smc.distributions import hypothetical
 from mstfilter.smc.first_steps import Few, compare_alone, is_numeric, unexamined
 from mstfilter.smc.inputs import split_input
+from mstfilter.smc.models.distributions import hypothetical
+from mstfilter.smc.models.programs.examination import examine_program
+from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, program_step, run_once
+from mstfilter.smc.models.programs.handlers import SimulateHandler
+from mstfilter.smc.models.programs.sites import recorded
 from mstfilter.smc.population import Particles, count_particles, take
-from mstfilter.smc.programs.examination import examine_program
-from mstfilter.smc.programs.filters import ProgramInitial, ProgramTransition, program_step, run_once
-from mstfilter.smc.programs.handlers import SimulateHandler
-from mstfilter.smc.programs.sites import recorded
 from mstfilter.smc.testing.contract import FALSE_ALARM, prerequisite, same, seeded, statistical
 from mstfilter.smc.testing.exact import ExactContract, check_same_law
 

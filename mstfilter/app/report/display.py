@@ -1,0 +1,202 @@
+"""Shows the package's objects in a notebook: text, pictures, plots, and scenes that can be rotated.
+
+>>> recording.plot()                        # images, depth and the time line of the pauses
+>>> hypothesis.show()                       # voxels that can be rotated with the mouse, also outside a notebook
+>>> hypothesis.show().save("scene.html")
+>>> state.population.plot()                 # hypotheses by weight, or the distribution of each coordinate
+
+Classes in `mstfilter.scene`, `mstfilter.smc` and `mstfilter.mst.belief` have methods `plot`, `show` and
+`_repr_html_`, which import this module when they are called (`mstfilter.base.lazy.late`). HTML pages load nothing
+from a network.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from functools import singledispatch
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.figure import Figure
+
+from mstfilter.app.report.identities import match_objects, weigh_distinct
+from mstfilter.app.report.page import short_text
+from mstfilter.app.report.pictures import Colour, colour, data_uri, jpeg_bytes, png_bytes, viewpoint, voxel_picture
+from mstfilter.mst.belief import Belief
+from mstfilter.scene import Clip, Frame, Hypothesis, Recording
+from mstfilter.smc import Infos, Population, State, as_matrix
+
+_MOST_PICTURES = 6
+
+
+class Drawing(Figure):
+    """A matplotlib figure that a notebook shows as a picture, with or without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        import io
+
+        file = io.BytesIO()
+        self.savefig(file, format="png", dpi=110, bbox_inches="tight")
+        return file.getvalue()
+
+
+def colours_of(hypothesis: Hypothesis) -> dict[int, Colour]:
+    """Mapping from labels to colours of the palette, in the order of the objects."""
+    return {record.label: colour(k) for k, record in enumerate(hypothesis.objects)}
+
+
+@matplotlib.style.context("mstfilter.app.report.figures")
+def plot_recording(recording: Recording) -> Drawing:
+    """Colour and depth images of at most six pauses, and a time line of all frames with marked pauses."""
+    chosen = _evenly(range(len(recording.pauses)), _MOST_PICTURES)
+    n = len(chosen)
+    figure = Drawing(figsize=(max(4.5, 2.3 * n), 4.6), layout="constrained")
+    axes = figure.subplots(3, n, squeeze=False, gridspec_kw={"height_ratios": [1, 1, 0.22]})
+    frames = [recording.frames[recording.pauses[t]] for t in chosen]
+    known = np.concatenate([frame.depth[frame.valid] for frame in frames])
+    low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
+    for k, (t, frame) in enumerate(zip(chosen, frames, strict=True)):
+        axes[0, k].imshow(frame.rgb)
+        axes[0, k].set_title(f"pause {t}, {recording.times[recording.pauses[t]]:.1f} s")
+        image = axes[1, k].imshow(frame.depth, vmin=low, vmax=high, cmap="viridis_r")
+        for axis in axes[:2, k]:
+            axis.set_axis_off()
+    figure.colorbar(image, ax=axes[1].tolist(), label="depth, m", shrink=0.85)
+    for axis in axes[2]:
+        axis.remove()
+    line = figure.add_subplot(axes[2, 0].get_gridspec()[2, :])
+    line.plot(recording.times, np.zeros(len(recording)), "|", color="0.7")
+    line.plot([recording.times[p] for p in recording.pauses], np.zeros(len(recording.pauses)), "v", color="C1")
+    line.set(yticks=[], xlabel=f"time, s; {len(recording)} frames, pauses marked")
+    line.spines[["left", "right", "top"]].set_visible(False)
+    return figure
+
+
+@matplotlib.style.context("mstfilter.app.report.figures")
+def plot_population(population: Population) -> Drawing:
+    """The six most probable hypotheses; for numeric particles, weighted histograms of the first six coordinates."""
+    population = population.realised()
+    if _are_hypotheses(population):
+        return _plot_hypotheses(population)
+    named = population.particles if isinstance(population.particles, Mapping) else {"x": population.particles}
+    columns = {}
+    for name, values in named.items():
+        rows = as_matrix(np.asarray(values)) if not isinstance(values, tuple) else as_matrix(values)
+        several = rows.shape[1] > 1
+        columns.update({f"{name}[{j}]" if several else name: rows[:, j] for j in range(rows.shape[1])})
+    shown = list(columns)[:_MOST_PICTURES]
+    figure = Drawing(figsize=(2.6 * len(shown) + 0.6, 2.6), layout="constrained")
+    axes = figure.subplots(1, len(shown), squeeze=False)[0]
+    for axis, name in zip(axes, shown, strict=True):
+        axis.hist(columns[name], bins=40, weights=population.weights, color="C0")
+        axis.set(xlabel=name, yticks=[])
+        axis.spines[["left", "right", "top"]].set_visible(False)
+    axes[0].set_ylabel("weight")
+    figure.suptitle(f"{len(population)} particles, ESS {population.ess:.1f}", fontsize=10)
+    return figure
+
+
+def _are_hypotheses(population: Population) -> bool:
+    """Whether the particles are hypotheses; `Candidates` are not built."""
+    return isinstance(population.particles, tuple) and isinstance(population.particles[0], Hypothesis)
+
+
+def _plot_hypotheses(population: Population) -> Drawing:
+    pictures = _voxel_pictures(population)
+    columns = min(3, len(pictures))
+    rows = -(-len(pictures) // columns)
+    figure = Drawing(figsize=(3.2 * columns, 2.6 * rows), layout="constrained")
+    for axis in figure.subplots(rows, columns, squeeze=False).ravel():
+        axis.set_axis_off()
+    for axis, (picture, text) in zip(figure.axes, pictures, strict=False):
+        axis.imshow(picture)
+        axis.set_title(text, fontsize=12)
+    return figure
+
+
+def _voxel_pictures(population: Population) -> list[tuple[np.ndarray, str]]:
+    """Pictures of the most probable distinct hypotheses from one viewpoint, with captions."""
+    particles, groups = population.particles, weigh_distinct(population.particles, population.weights.tolist())
+    weights = [weight for _, weight in groups[:_MOST_PICTURES]]
+    shown = [particles[members[0]] for members, _ in groups[:_MOST_PICTURES]]
+    view = viewpoint(shown, width=420, height=315)
+    return [
+        (voxel_picture(h.labels, h.grid, view, colours), f"weight {weight:.2f}, {h.n_objects} objects")
+        for h, weight, colours in zip(shown, weights, match_objects(shown, weights), strict=True)
+    ]
+
+
+def to_html(value: Any) -> str:
+    """HTML that shows an object of the package in a notebook: text, and pictures or a table of steps."""
+    text = f'<pre style="margin:0">{html.escape(repr(value))}</pre>'
+    style = "display:inline-block;margin:4px 8px 4px 0"
+    cells = [
+        f'<figure style="{style}"><img alt="{html.escape(words)}" height="{height}" src="{uri}">'
+        f"<figcaption>{html.escape(words)}</figcaption></figure>"
+        for uri, words, height in _pictures(value)
+    ]
+    more = _table(value.rows()) if isinstance(value, Infos) else "".join(cells)
+    return f'<div style="max-width:60em">{text}<div style="overflow-x:auto">{more}</div></div>'
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table of rows with the same keys."""
+    lines = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
+    cells = ["".join(f"<td>{html.escape(short_text(v))}</td>" for v in line) for line in lines]
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in cells)}</table>"
+
+
+#: Data URI, caption and height in pixels.
+_Picture = tuple[str, str, int]
+
+
+@singledispatch
+def _pictures(value: Any) -> list[_Picture]:
+    return []
+
+
+def _photo(frame: Frame, text: str) -> _Picture:
+    step = max(1, frame.camera.width // 320)
+    return data_uri(jpeg_bytes(np.ascontiguousarray(frame.rgb[::step, ::step])), "jpeg"), text, 150
+
+
+@_pictures.register
+def _(value: Frame) -> list[_Picture]:
+    return [_photo(value, "colour")]
+
+
+@_pictures.register
+def _(value: Clip) -> list[_Picture]:
+    frames = [(value.before, "before"), (value.after, "after")]
+    return [_photo(*pair) for pair in (frames if len(value) > 1 else frames[1:])]
+
+
+@_pictures.register
+def _(value: Recording) -> list[_Picture]:
+    return [_photo(value.frames[value.pauses[t]], f"pause {t}") for t in _evenly(range(len(value.pauses)), 4)]
+
+
+@_pictures.register
+def _(value: Hypothesis) -> list[_Picture]:
+    view = viewpoint([value], width=480, height=360)
+    picture = voxel_picture(value.labels, value.grid, view, colours_of(value))
+    return [(data_uri(png_bytes(picture)), ".show() can be rotated", 240)]
+
+
+@_pictures.register
+def _(value: Population) -> list[_Picture]:
+    if not _are_hypotheses(value):
+        return []
+    return [(data_uri(png_bytes(picture)), text, 150) for picture, text in _voxel_pictures(value)]
+
+
+@_pictures.register
+def _(value: Belief | State) -> list[_Picture]:
+    return [] if value.population is None else _pictures(value.population)
+
+
+def _evenly(values: Sequence[int], n: int) -> list[int]:
+    """At most `n` evenly spaced values, including the first and the last."""
+    return [values[k] for k in np.linspace(0, len(values) - 1, min(n, len(values))).round().astype(int)]

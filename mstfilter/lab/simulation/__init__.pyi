@@ -1,0 +1,27 @@
+from mstfilter.lab.simulation.families import (
+    FIRST_REPORTED_SEED as FIRST_REPORTED_SEED,
+    GENERATOR_VERSION as GENERATOR_VERSION,
+    SCENE_FAMILIES as SCENE_FAMILIES,
+    SceneFamily as SceneFamily,
+    scene_family as scene_family,
+)
+from mstfilter.lab.simulation.push_loop import LoopState as LoopState, PushLoop as PushLoop
+from mstfilter.lab.simulation.recorder import (
+    POSE_TOLERANCE as POSE_TOLERANCE,
+    SimulatedScene as SimulatedScene,
+    cache_folder as cache_folder,
+    cached_path as cached_path,
+    cached_recording as cached_recording,
+    recipe_key as recipe_key,
+    simulate_recording as simulate_recording,
+)
+from mstfilter.lab.simulation.renderer import Renderer as Renderer
+from mstfilter.lab.simulation.sensor import DepthSensor as DepthSensor, colour_reading as colour_reading
+from mstfilter.lab.simulation.world import (
+    FingerPush as FingerPush,
+    PushEffect as PushEffect,
+    advance_push as advance_push,
+    choose_push as choose_push,
+    finish_push as finish_push,
+    play_push as play_push,
+)

@@ -1,0 +1,262 @@
+"""Placement of objects on the table: clusters, pairs of touching identical objects (twins), stacks, hidden objects.
+
+Each object is moved towards the cluster until the object nearly touches another object. The position is found by
+bisection with MuJoCo's contact test. After placement, the physics runs until all objects are at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from mstfilter.base.errors import InputError
+from mstfilter.lab.simulation.families import SceneFamily
+from mstfilter.lab.simulation.shapes import Pool, Shape, draw_shape
+from mstfilter.lab.simulation.textures import Skin, draw_skin
+from mstfilter.lab.simulation.world import OBJECT_GROUP, PhysicsWorld
+from mstfilter.scene import Camera
+
+_RestPose = Literal["any", "tall", "low"]  # which of its rest poses a shape takes
+
+_TOUCH = 0.0003  # gap between objects put in contact, metres; settling closes it
+_CENTRE = np.array([0.02, 0.02])
+_ATTEMPTS = 30
+_PATIENCE = 4  # attempts with all requirements
+_HIDING_PLACES = 24
+_HIGHEST = 0.30  # top of a stack, metres: still in view
+
+
+@dataclass(frozen=True)
+class SceneObjects:
+    """Shapes and textures of the objects of a scene."""
+
+    shapes: tuple[Shape, ...]
+    skins: tuple[Skin, ...]
+    twin_of: tuple[int, ...]  #: For each object, the index of the object that it copies, or -1
+
+
+def draw_objects(rng: np.random.Generator, family: SceneFamily, pool: Pool) -> SceneObjects:
+    """Draw the shapes and textures of a scene, from all families of objects. Most frequent are cartons and cans."""
+    count = int(rng.integers(family.n_objects_min, family.n_objects_max + 1))
+    names = list(family.shape_families())
+    shapes: list[Shape] = []
+    skins: list[Skin] = []
+    bag: list[str] = []
+    while len(shapes) < count - family.n_twins:
+        if not bag:
+            # Cartons and cans, which are common on tables, are more frequent.
+            extra = [name for name in names for _ in range({"carton": 3, "can": 2}.get(name, 0))]
+            bag = [str(name) for name in rng.permutation(names + extra)]
+        shape = draw_shape(rng, bag.pop(), pool)
+        shapes.append(shape)
+        skins.append(draw_skin(rng, shape, pool))
+    twin_of = [-1] * len(shapes)
+    # Twins have a recognisable texture and stand firmly.
+    fit = [k for k, s in enumerate(shapes) if s.family not in ("bowl", "ball")] or list(range(len(shapes)))
+    for _ in range(family.n_twins):
+        original = fit[int(rng.integers(len(fit)))]
+        shapes.append(shapes[original])
+        skins.append(skins[original])
+        twin_of.append(original)
+    return SceneObjects(tuple(shapes), tuple(skins), tuple(twin_of))
+
+
+def _draw_rest_pose(rng: np.random.Generator, shape: Shape, pose: _RestPose = "any") -> tuple[np.ndarray, float]:
+    """A rest orientation (3, 3) of a shape, and the height of its origin above the support."""
+    from scipy.spatial.transform import Rotation
+
+    weights = np.array([w for _, w in shape.rests])
+    up = shape.rests[int(rng.choice(len(weights), p=weights / weights.sum()))][0]
+    if pose != "any":
+        ordered = sorted((axis for axis, _ in shape.rests), key=lambda axis: shape.half[abs(axis) - 1])
+        up = ordered[-1 if pose == "tall" else 0]
+    axis = abs(up) - 1
+    turn = {0: ("y", -90.0), 1: ("x", 90.0), 2: ("x", 0.0 if up > 0 else 180.0)}[axis]
+    lay = Rotation.from_euler(turn[0], turn[1], degrees=True)
+    yaw = Rotation.from_euler("z", float(rng.uniform(0, 2 * np.pi)))
+    return (yaw * lay).as_matrix(), float(shape.half[axis])
+
+
+def _contact_distance(
+    world: PhysicsWorld, k: int, goal: np.ndarray, angle: float, height: float, rotation: np.ndarray
+) -> float:
+    """Smallest distance in metres from `goal`, in direction `angle`, at which object k overlaps no other object.
+
+    The distance is found by steps inwards until the first overlap, and then by bisection.
+    """
+    direction = np.array([np.cos(angle), np.sin(angle)])
+
+    def free(distance: float) -> bool:
+        world.place(k, (*(goal + distance * direction), height), rotation)
+        world.forward()
+        return not world.overlaps(k)
+
+    out = 0.02
+    while not free(out):
+        out += 0.05
+    inner = out - 0.006
+    while inner > 0 and free(inner):
+        out, inner = inner, inner - 0.006
+    inner = max(inner, 0.0)
+    for _ in range(7):
+        middle = (out + inner) / 2
+        out, inner = (middle, inner) if free(middle) else (out, middle)
+    return out
+
+
+def _put_beside(
+    rng: np.random.Generator,
+    world: PhysicsWorld,
+    k: int,
+    neighbours: list[int],
+    gap: float,
+    towards: np.ndarray | None = None,
+    attempts: int = _ATTEMPTS,
+    pose: _RestPose = "any",
+) -> bool:
+    """Move object k towards one of `neighbours`, up to `gap` metres from the first object on the path.
+
+    `towards` (2,) is the approximate direction from the neighbour, or None for any direction.
+    """
+    table_radius = min(0.32, 0.20 + 0.012 * world.n_objects)
+    start = world.positions()[k]
+    for _ in range(attempts):
+        near = neighbours[int(rng.integers(len(neighbours)))]
+        goal = world.positions()[near, :2]
+        rotation, height = _draw_rest_pose(rng, world.shapes[k], pose)
+        angle = float(rng.uniform(0, 2 * np.pi))
+        if towards is not None:
+            angle = float(np.arctan2(towards[1], towards[0]) + rng.normal(0.0, 0.2))
+        distance = _contact_distance(world, k, goal, angle, height + 0.0002, rotation)
+        place = goal + (distance + gap) * np.array([np.cos(angle), np.sin(angle)])
+        world.place(k, (*place, height + 0.0002), rotation)
+        world.forward()
+        reach = world.shapes[k].radius + world.shapes[near].radius
+        if distance < reach and np.linalg.norm(place - _CENTRE) < table_radius and not world.overlaps(k):
+            return True
+    world.place(k, start, np.eye(3))
+    return False
+
+
+def _put_on_top(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int]) -> bool:
+    """Put object k on top of a flat object if there is room."""
+    start = world.positions()[k]
+    flat = [j for j in placed if world.shapes[j].family in ("carton", "brick", "can", "angle")]
+    for j in rng.permutation(flat) if flat else []:
+        below, top = world.positions()[j], _top(world, j)
+        rotation, height = _draw_rest_pose(rng, world.shapes[k])
+        if top > 0.16 or top + 2 * height > _HIGHEST:
+            continue
+        place = below[:2] + rng.uniform(-0.01, 0.01, 2)
+        world.place(k, (*place, top + height + 0.0005), rotation)
+        world.forward()
+        if not world.overlaps(k):
+            return True
+    world.place(k, start, np.eye(3))
+    return False
+
+
+def _top(world: PhysicsWorld, k: int) -> float:
+    """Height of the top of an object above the table, metres."""
+    pose = world.poses()[k]
+    return float(pose[2, 3] + np.abs(pose[2, :3]) @ world.shapes[k].half)
+
+
+def _visible_pixels(world: PhysicsWorld, camera: Camera) -> np.ndarray:
+    """Number of visible pixels of each object (n,)."""
+    turn = camera.pose.as_matrix()[:3, :3]
+    geom, _, _ = world.cast(np.array(camera.position), camera.rays().reshape(-1, 3) @ turn.T, (OBJECT_GROUP,))
+    return np.bincount(world.geom_object[geom[geom >= 0]], minlength=world.n_objects + 1)[1 : world.n_objects + 1]
+
+
+def _put_behind(rng: np.random.Generator, world: PhysicsWorld, k: int, placed: list[int], camera: Camera) -> bool:
+    """Put object k behind one of the tallest objects, at the tried position with the fewest visible pixels."""
+    start, best = world.positions()[k], None
+    tallest = sorted(placed, key=lambda j: -_top(world, j))[:5]
+    for _ in range(_HIDING_PLACES):
+        near = tallest[int(rng.integers(len(tallest)))]
+        away = world.positions()[near, :2] - np.array(camera.position)[:2]
+        if not _put_beside(rng, world, k, [near], _TOUCH, away, 1, "low"):
+            continue
+        seen = int(_visible_pixels(world, camera)[k])
+        if best is None or seen < best[0]:
+            best = (seen, world.positions()[k], world.rotations()[k])
+        if seen == 0:
+            break
+    world.place(k, *(best[1:] if best else (start, np.eye(3))))
+    world.forward()
+    return best is not None
+
+
+def _try_arrangement(
+    rng: np.random.Generator,
+    world: PhysicsWorld,
+    family: SceneFamily,
+    twin_of: tuple[int, ...],
+    n_touching: int,
+    n_unseen: int,
+) -> bool:
+    """Place all objects once. Returns whether enough twins touch and enough objects are hidden."""
+    originals = [int(k) for k in rng.permutation([k for k, t in enumerate(twin_of) if t < 0])]
+    twins = [k for k, t in enumerate(twin_of) if t >= 0]
+    stacked = originals[len(originals) - min(family.n_stacked, len(originals) - 1) :] if family.n_stacked else []
+    # Hidden objects are small ones without twins; they are placed last, behind the tall ones.
+    lone = [k for k in originals if k not in stacked and k not in twin_of]
+    hidden = sorted(lone, key=lambda k: world.shapes[k].radius)[: min(family.n_hidden, len(lone) - 1)]
+    standing = [k for k in originals if k not in stacked and k not in hidden]
+    heights = [max(shape.half[abs(axis) - 1] for axis, _ in shape.rests) for shape in world.shapes]
+    tall = sorted(standing, key=lambda k: -heights[k])[: len(hidden)]
+    camera = family.camera().scaled(160 / family.width)
+    order = [j for k in standing + stacked for j in (k, *(t for t in twins if twin_of[t] == k))] + hidden
+    placed: list[int] = []
+    for k in order:
+        pose: _RestPose = "tall" if k in tall else "any"
+        if not placed:
+            rotation, height = _draw_rest_pose(rng, world.shapes[k], pose)
+            world.place(k, (*(_CENTRE + rng.uniform(-0.05, 0.05, 2)), height + 0.0002), rotation)
+        elif twin_of[k] >= 0:
+            if not _put_beside(rng, world, k, [twin_of[k]], _TOUCH):
+                return False
+        elif k in hidden:
+            if not (_put_behind(rng, world, k, placed, camera) or _put_beside(rng, world, k, placed, _TOUCH)):
+                return False
+        elif not (k in stacked and _put_on_top(rng, world, k, placed)):
+            gap = _TOUCH if rng.uniform() < family.contact else float(rng.uniform(0.01, 0.04))
+            if not _put_beside(rng, world, k, placed, gap, pose=pose):
+                return False
+        placed.append(k)
+    world.forward()
+    if not world.settle():
+        return False
+    if not family.contains_points(world.positions()).all() or world.deepest_overlap() > 0.0015:
+        return False
+    if family.n_hidden:
+        unseen = int((_visible_pixels(world, camera) == 0).sum())
+        if unseen < n_unseen or unseen > world.n_objects / 3:
+            return False
+    touching = set(world.contacts())
+    return sum((min(k, t), max(k, t)) in touching for k, t in enumerate(twin_of) if t >= 0) >= n_touching
+
+
+def arrange_objects(
+    rng: np.random.Generator, world: PhysicsWorld, family: SceneFamily, twin_of: tuple[int, ...]
+) -> None:
+    """Place all objects, with touching twins and hidden objects, and run the physics until all objects are at rest.
+
+    In a dense heap, the physics may separate twins or reveal hidden objects. After some attempts, fewer touching
+    twins and hidden objects are sufficient. Raises InputError if the objects do not fit on the table.
+    """
+    empty = world.save()
+    twins = sum(t >= 0 for t in twin_of)
+    for attempt in range(_ATTEMPTS):
+        world.restore(empty)
+        n_touching = (twins if twins < 3 else twins - 1) if attempt < _PATIENCE else (twins + 1) // 2
+        n_unseen = (family.n_hidden + 1) // 2 if attempt < 2 * _PATIENCE else 0
+        if _try_arrangement(rng, world, family, twin_of, n_touching, n_unseen):
+            return
+    raise InputError(
+        f"scene family {family.name!r}: {world.n_objects} objects could not be arranged in {_ATTEMPTS} attempts",
+        "use fewer or smaller objects, or fewer twins",
+    )

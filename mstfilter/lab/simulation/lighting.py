@@ -1,0 +1,204 @@
+"""The rendered poses (`Stage`), and the light on the table (`LightMap`) and on bodies (`BodyColours`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mstfilter.lab.simulation.shapes import Shape
+from mstfilter.lab.simulation.textures import Atlas, Room, texture_coordinates
+from mstfilter.lab.simulation.world import FINGER_GROUP, FINGER_ID, OBJECT_GROUP, PhysicsWorld
+
+SHADOW_GROUPS = (OBJECT_GROUP, FINGER_GROUP)  #: Geoms that cast shadows
+
+_LIFT = 0.0012  # metres off the surface, against shadows of a surface on itself
+_MAP_LOW, _MAP_HIGH = np.array([-0.62, -0.55]), np.array([0.62, 0.66])
+_FINGER_COLOUR = np.array([0.09, 0.095, 0.105], np.float32)
+
+
+class Stage:
+    """The poses at which bodies are rendered, without the small vibrations of the simulated poses.
+
+    Soft contacts make bodies at rest move by micrometres between frames. A rendered pose changes only if a point of
+    the body has moved by more than `tolerance` metres. Images, recorded poses and volumes agree exactly, because all
+    use the rendered poses.
+    """
+
+    def __init__(self, world: PhysicsWorld, tolerance: float) -> None:
+        import mujoco
+
+        self.world, self.tolerance = world, tolerance
+        self._mj, self._data = mujoco, mujoco.MjData(world.model)
+        self._radius = np.array([shape.radius for shape in world.shapes])
+        self.poses: np.ndarray = world.poses()  #: T_world_object (n, 4, 4) as rendered
+        self._finger = world.finger_position()
+        self._data.qpos[:] = world.data.qpos
+        mujoco.mj_kinematics(world.model, self._data)
+
+    def follow(self) -> None:
+        """Update the rendered poses of the finger, and of objects that have moved by more than the tolerance."""
+        world = self.world
+        now, finger = world.poses(), world.finger_position()
+        shift = np.linalg.norm(now[:, :3, 3] - self.poses[:, :3, 3], axis=1)
+        turn = np.linalg.norm(now[:, :3, :3] - self.poses[:, :3, :3], axis=(1, 2))
+        moved = shift + turn * self._radius > self.tolerance
+        if not moved.any() and (finger == self._finger).all():
+            return
+        self.poses = np.where(moved[:, None, None], now, self.poses)
+        self._finger = finger
+        index = world.pose_index[moved]
+        self._data.qpos[:3] = finger
+        self._data.qpos[index] = world.data.qpos[index]
+        self._mj.mj_kinematics(world.model, self._data)
+
+    def save(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The rendered poses, as the parameter of `restore`."""
+        return self.poses.copy(), self._finger.copy(), self._data.qpos.copy()
+
+    def restore(self, saved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        """Set the rendered poses to saved poses."""
+        self.poses, self._finger = saved[0].copy(), saved[1].copy()
+        self._data.qpos[:] = saved[2]
+        self._mj.mj_kinematics(self.world.model, self._data)
+
+    def cast(
+        self, origin: ArrayLike, directions: np.ndarray, groups: Sequence[int] = (0, 1, 2)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cast rays as in `PhysicsWorld.cast`, with bodies at the rendered poses."""
+        return self.world.cast(origin, directions, groups, self._data)
+
+
+def _cosine_to_light(stage: Stage, light: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Cosine (n,) float32 of the angle between normal and light direction at points (n, 3), 0 in shadow."""
+    ray = points - light
+    cosine = -_dot(ray, normal) / np.sqrt(_dot(ray, ray))
+    lit = np.flatnonzero(cosine > 0.0)
+    _, distance, _ = stage.cast(light, ray[lit], SHADOW_GROUPS)
+    visible = (distance < 0) | (distance > 1.0 - 1e-6)
+    result = np.zeros(len(points), np.float32)
+    result[lit[visible]] = cosine[lit[visible]]
+    return result
+
+
+class LightMap:
+    """Raster of the light on the table, with points `spacing` metres apart.
+
+    A value is the mean, over the sources `lights` (k, 3), of the cosine of the angle of incidence (0 in shadow).
+    """
+
+    def __init__(self, spacing: float, lights: np.ndarray) -> None:
+        self._spacing, self._lights = spacing, lights
+        nx, ny = (np.ceil((_MAP_HIGH - _MAP_LOW) / spacing).astype(int) + 1).tolist()
+        x, y = _MAP_LOW[0] + spacing * np.arange(nx), _MAP_LOW[1] + spacing * np.arange(ny)
+        grid = np.meshgrid(x, y, indexing="ij")
+        self._shape = (nx, ny)
+        self._rays = np.stack([grid[0].ravel(), grid[1].ravel(), np.full(nx * ny, _LIFT)], axis=1) - lights[:, None]
+        self._cosine = (-self._rays[:, :, 2] / np.linalg.norm(self._rays, axis=2)).astype(np.float32)
+        self._values = np.zeros(nx * ny, np.float32)
+
+    def update(self, stage: Stage) -> None:
+        """Compute the raster from shadow rays at the rendered poses."""
+        self._values[:] = 0
+        for light, rays, cosine in zip(self._lights, self._rays, self._cosine, strict=True):
+            _, distance, _ = stage.cast(light, rays, SHADOW_GROUPS)
+            dark = (distance >= 0) & (distance <= 1.0 - 1e-6)
+            self._values += np.where(dark, np.float32(0), cosine)
+        self._values /= np.float32(len(self._lights))
+
+    def sample(self, xy: np.ndarray) -> np.ndarray:
+        """Interpolated values (n,) at points (n, 2) of the table. Points outside the map take the border value."""
+        place = np.clip((xy - _MAP_LOW) / self._spacing, 0, np.array(self._shape) - 1.001)
+        at = place.astype(np.int64)
+        share = (place - at).astype(np.float32)
+        values, ny = self._values, self._shape[1]
+        corner = at[:, 0] * ny + at[:, 1]
+        low = values[corner] * (1 - share[:, 1]) + values[corner + 1] * share[:, 1]
+        high = values[corner + ny] * (1 - share[:, 1]) + values[corner + ny + 1] * share[:, 1]
+        return low * (1 - share[:, 0]) + high * share[:, 0]
+
+
+class BodyColours:
+    """Colours of points on objects and on the finger, seen from the camera at `eye` (3,)."""
+
+    def __init__(self, stage: Stage, atlas: Atlas, room: Room, eye: np.ndarray) -> None:
+        self._stage, self._atlas, self._room, self._eye = stage, atlas, room, eye
+
+    def at(self, geom: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Linear colours (n, 3) float32 of points (n, 3) with normals (n, 3) on MuJoCo geoms (n,)."""
+        room, instance = self._room, self._stage.world.geom_object[geom]
+        albedo, gloss, smooth = self._materials(instance, geom, points, normal)
+        # Highlight by Blinn and Phong: the normal against the half vector between eye and lamp.
+        middle = _unit(self._eye - points) + _unit(room.lamp.mean(axis=0) - points)
+        highlight = np.clip(_dot(_unit(middle), smooth), 0, 1).astype(np.float32) ** 40
+        # Light reflected by the table reaches surfaces that face down or sideways, less near the table.
+        bounce = ((0.5 - 0.5 * smooth[:, 2]) * np.clip(points[:, 2] / 0.05, 0.35, 1)).astype(np.float32)
+        lamp, sky = self._light(instance, (points + _LIFT * normal).astype(np.float32), smooth.astype(np.float32))
+        reflected = bounce[:, None] * (np.float32(0.55 / 0.6) * room.rim)
+        return albedo * (lamp + sky + room.ambient + reflected) + (gloss * highlight)[:, None] * lamp
+
+    def _materials(
+        self, instance: np.ndarray, geom: np.ndarray, points: np.ndarray, normal: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Albedo (n, 3), gloss (n,) and smooth normal (n, 3) of points."""
+        world, poses = self._stage.world, self._stage.poses
+        albedo = np.empty((len(points), 3), np.float32)
+        albedo[instance == FINGER_ID] = _FINGER_COLOUR
+        gloss = np.full(len(points), 0.25, np.float32)
+        smooth = normal.copy()
+        for k in np.unique(instance[instance != FINGER_ID]) - 1:
+            shape: Shape = world.shapes[k]
+            on = np.flatnonzero(instance == k + 1)
+            turn = poses[k, :3, :3]
+            local = _rotate(points[on] - poses[k, :3, 3], turn.T)
+            facing = _rotate(normal[on], turn.T)
+            plain = np.array([piece.plain for piece in shape.pieces])[world.geom_piece[geom[on]]]
+            chart, place = texture_coordinates(shape, local, facing, plain)
+            albedo[on] = self._atlas.colour(int(k), chart, place)
+            gloss[on] = self._atlas.gloss[k]
+            smooth[on] = _rotate(_round_off(shape, local, facing, plain), turn)
+        return albedo, gloss, smooth
+
+    def _light(self, instance: np.ndarray, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Light (n, 3) from the lamp, and light (n, 3) from the ceiling, at points (n, 3)."""
+        room, finger = self._room, instance == FINGER_ID
+        lamp, sky = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+        for light in room.lamp:
+            lamp += _cosine_to_light(self._stage, light, points.astype(float), normal)
+        for light in room.sky:
+            cosine = np.empty(len(points), np.float32)
+            # Finger and arm are dark: shadows of the ceiling's light on them would be invisible.
+            cosine[finger] = np.maximum(_dot(_unit(light - points[finger]), normal[finger]), 0.0)
+            cosine[~finger] = _cosine_to_light(self._stage, light, points[~finger].astype(float), normal[~finger])
+            sky += cosine
+        lamp, sky = lamp / np.float32(len(room.lamp)), sky / np.float32(len(room.sky))
+        return lamp[:, None] * room.lamp_colour, sky[:, None] * room.sky_colour
+
+
+# Sums are written out: the last bit of a matrix product depends on the number of its rows, and so would the image.
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
+def _unit(a: np.ndarray) -> np.ndarray:
+    return a / np.sqrt(_dot(a, a))[:, None]
+
+
+def _rotate(a: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    return np.stack([a[:, 0] * r[0] + a[:, 1] * r[1] + a[:, 2] * r[2] for r in turn], axis=1)
+
+
+def _round_off(shape: Shape, points: np.ndarray, normal: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """Smooth normals of a solid of revolution made of flat facets. Each normal gets the azimuth of its point."""
+    if shape.print_as != "lathe" or len(shape.pieces) == 1:
+        return normal
+    radius = np.hypot(points[:, 0], points[:, 1])
+    valid = ~plain & (radius > 1e-4)
+    outward = points[valid, :2] / radius[valid, None]
+    flat = np.hypot(normal[valid, 0], normal[valid, 1]) * np.sign((outward * normal[valid, :2]).sum(axis=1))
+    rounded = normal.copy()
+    rounded[valid, :2] = outward * flat[:, None]
+    return rounded

@@ -1,0 +1,299 @@
+"""Household objects made of convex pieces: shapes, sizes and voxels.
+
+`draw_shape(rng, family)` returns a `Shape` with convex pieces in body axes, rest poses, mass and texture layout. The
+origin of the body axes is the middle of the bounding box. In the upright pose, the z axis points up.
+
+>>> import numpy as np
+>>> from mstfilter.lab.simulation.shapes import draw_shape
+>>> shape = draw_shape(np.random.default_rng(0), "can")
+>>> len(shape.pieces), shape.family
+(1, 'can')
+
+Sizes and masses are rounded values of the YCB set (Calli et al., "Benchmarking in manipulation research: the YCB
+object and model set", IEEE Robotics & Automation Magazine 22(3), 2015). The boxes of crackers, sugar, pudding and
+gelatin, cans of soup, tuna and coffee, mug, bowl, banana and ball are from the YCB set. The crisps can is 0.20 m high
+(0.25 m in the YCB set). Each length is scaled at random by up to 10 %. The walls of bowl and mug are 1 cm thick, as a
+thinner wall could lie between the centres of 1 cm voxels.
+
+`label_voxels` returns the true volume: all voxels of each object, visible or not.
+
+>>> from mstfilter.scene import VoxelGrid
+>>> from mstfilter.lab.simulation.shapes import label_voxels
+>>> ball = draw_shape(np.random.default_rng(0), "ball")
+>>> labels = label_voxels([ball], np.eye(4)[None], VoxelGrid((-0.2, -0.2, -0.2), 0.01, (40, 40, 40)))
+>>> bool(abs(labels.sum() * 1e-6 / ball.pieces[0].volume - 1) < 0.1)
+True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from mstfilter.base.errors import InputError
+from mstfilter.lab.simulation.solids import Piece, box, capsule, cylinder, ellipsoid, frustum, hull, ring
+from mstfilter.scene import VoxelGrid
+
+_SMALLEST, _BAND = 0.90, 0.025
+# Bands of sizes from 0.9 to 1.1 in each pool; both have mean 1.
+_SIZE_BANDS = ((0, 3, 4, 7), (1, 2, 5, 6))
+_N_HUES = 12
+_MARGIN = 0.04  # share of a band that is left free at either side
+
+_WALL = 0.010  # thickness of the walls of bowl and mug, metres
+
+# Rest poses: which body axis points up (sign * (axis + 1)).
+_UP_X, _UP_Y, _UP_Z, _DOWN_Z = 1, 2, 3, -3
+
+
+@dataclass(frozen=True)
+class Pool:
+    """A set of sizes, hues and names from which the objects of scenes are drawn.
+
+    Scenes for tuning and scenes for reporting use disjoint pools. Both pools cover the same range of sizes in
+    alternate bands, so that the pools are equally difficult.
+    """
+
+    half: int | None = None  #: {0, 1, None}: which of the two disjoint pools; None for all sizes, hues and names
+
+    def factor(self, rng: np.random.Generator) -> float:
+        """Random factor that scales a length, 0.9 .. 1.1."""
+        u = float(rng.uniform())
+        if self.half is None:
+            return _SMALLEST + 8 * _BAND * u
+        bands = _SIZE_BANDS[self.half]
+        k = int(u * len(bands))
+        return _SMALLEST + _BAND * (bands[k] + _within_band(u * len(bands) - k))
+
+    def hue(self, rng: np.random.Generator) -> float:
+        """A hue, 0 .. 1."""
+        u = float(rng.uniform())
+        if self.half is None:
+            return u
+        k = int(u * _N_HUES / 2)
+        return (2 * k + self.half + _within_band(u * _N_HUES / 2 - k)) / _N_HUES
+
+    def name(self, rng: np.random.Generator, names: Sequence[str]) -> str:
+        """Draw one of the `names` that belong to the pool."""
+        available = names if self.half is None else names[self.half :: 2]
+        return available[int(rng.integers(len(available)))]
+
+
+def _within_band(share: float) -> float:
+    return _MARGIN + (1 - 2 * _MARGIN) * share
+
+
+ANY, TUNING, REPORTED = Pool(), Pool(0), Pool(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A rigid object."""
+
+    family: str  #: one of SHAPE_FAMILIES
+    name: str  #: member of the family
+    #: Convex pieces of the object, moved so that the bounding box of the object is centred on the origin.
+    pieces: Sequence[Piece]
+    mass: float  #: kilograms
+    #: {"box", "lathe"}: layout of the texture: six faces, or side, top, bottom and inside of a turned solid.
+    print_as: str
+    #: tuple of (axis, weight) body axes that can point up at rest, with relative frequencies.
+    rests: tuple[tuple[int, float], ...]
+    finish: tuple[str, ...]  #: styles of texture that suit the object
+    rolling: float = 0.0005  #: rolling friction, metres
+
+    half: np.ndarray = field(init=False)  #: Half edges (3,) of the bounding box, metres
+
+    def __post_init__(self) -> None:
+        bounds = [piece.bounds() for piece in self.pieces]
+        lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+        middle = (lower + upper) / 2
+        moved = tuple(replace(piece, centre=piece.centre - middle) for piece in self.pieces)
+        object.__setattr__(self, "pieces", moved)
+        object.__setattr__(self, "half", (upper - lower) / 2)
+
+    @property
+    def radius(self) -> float:
+        """Radius in metres of a sphere about the origin that contains the object."""
+        return float(np.linalg.norm(self.half))
+
+    @cached_property
+    def density(self) -> float:
+        """Mass divided by the sum of the volumes of the pieces, kg / m^3."""
+        return self.mass / sum(piece.volume for piece in self.pieces)
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """(...) bool: whether points (..., 3) in body axes are in the object."""
+        points = np.asarray(points)
+        found = np.zeros(points.shape[:-1], bool)
+        for piece in self.pieces:
+            lower, upper = piece.bounds()
+            near = ~found & (points >= lower - 1e-6).all(axis=-1) & (points <= upper + 1e-6).all(axis=-1)
+            found[near] = piece.inside(points[near])
+        return found
+
+
+def label_voxels(shapes: Sequence[Shape], poses: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Labels (X, Y, Z) uint16: k + 1 if the centre of the voxel lies in shape k, and 0 for other voxels.
+
+    `poses` (n, 4, 4) are T_world_object. Objects at rest overlap by less than a millimetre. If a voxel centre lies in
+    two objects, the voxel gets the label of the first object.
+    """
+    labels = np.zeros(grid.shape, np.uint16)
+    for k, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
+        reach = np.abs(pose[:3, :3]) @ shape.half + grid.voxel_size
+        low = np.maximum(grid.index_of(pose[:3, 3] - reach), 0)
+        high = np.minimum(grid.index_of(pose[:3, 3] + reach) + 1, grid.shape)
+        if (high <= low).any():
+            continue
+        block = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+        local = (grid.centre_of(index) - pose[:3, 3]) @ pose[:3, :3]
+        free = labels[block] == 0
+        labels[block][free & shape.inside(local)] = k + 1
+    return labels
+
+
+def _choose(rng: np.random.Generator, table: Mapping[str, tuple[float, ...]]) -> tuple[str, tuple[float, ...]]:
+    name = list(table)[int(rng.integers(len(table)))]
+    return name, table[name]
+
+
+def _carton(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    table = {
+        "cracker": (0.060, 0.160, 0.210, 0.41),
+        "sugar": (0.038, 0.089, 0.175, 0.51),
+        "pudding": (0.035, 0.110, 0.089, 0.19),
+        "gelatin": (0.028, 0.085, 0.073, 0.10),
+        "tea": (0.070, 0.125, 0.080, 0.12),
+    }
+    name, (x, y, z, mass) = _choose(rng, table)
+    half = (x * scale() / 2, y * scale() / 2, z * scale() / 2)
+    # On its broad side, on its long narrow side, upright.
+    rests = ((_UP_X, 0.35), (_UP_Y, 0.25), (_UP_Z, 0.40))
+    return Shape("carton", name, [box(half)], mass, "box", rests, ("carton",))
+
+
+def _brick(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    table = {"cube": (0.07, 0.07, 0.07), "brick": (0.05, 0.076, 0.10), "plank": (0.03, 0.09, 0.15)}
+    name, edges = _choose(rng, table)
+    x, y, z = (edge * scale() / 2 for edge in edges)
+    mass = 600.0 * 8.0 * x * y * z
+    rests = ((_UP_X, 0.5), (_UP_Y, 0.3), (_UP_Z, 0.2))
+    return Shape("brick", name, [box((x, y, z))], mass, "box", rests, ("wood", "cloth", "speckle"))
+
+
+def _can(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    table = {
+        "soup": (0.033, 0.101, 0.35),
+        "coffee": (0.051, 0.139, 0.41),
+        "tuna": (0.0425, 0.033, 0.17),
+        "crisps": (0.0375, 0.20, 0.21),
+        "biscuits": (0.075, 0.055, 0.40),
+    }
+    name, (radius, height, mass) = _choose(rng, table)
+    piece = cylinder(radius * scale(), height * scale() / 2)
+    return Shape("can", name, [piece], mass, "lathe", ((_UP_Z, 1.0),), ("label",))
+
+
+def _bottle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    radius, body, neck = 0.034 * scale(), 0.115 * scale(), 0.014 * scale()
+    shoulder, cap = 0.028, 0.030 * scale()
+    knee = (0.80 * radius, body + 0.6 * shoulder)
+    pieces = [
+        cylinder(radius, body / 2, (0, 0, body / 2)),
+        frustum((radius, body), knee),
+        frustum(knee, (neck, body + shoulder)),
+        cylinder(neck, cap / 2, (0, 0, body + shoulder + cap / 2)),
+    ]
+    return Shape("bottle", "bottle", pieces, 0.35, "lathe", ((_UP_Z, 1.0),), ("label",))
+
+
+def _bowl(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    rim, height, foot = 0.0795 * scale(), 0.053 * scale(), 0.042 * scale()
+    knee = foot + 0.68 * (rim - foot)
+    walls = ring([(foot - _WALL, foot, 0.0), (knee - _WALL, knee, 0.45 * height), (rim - _WALL, rim, height)])
+    # The floor's rim lies in the middle of the sloping wall.
+    middle = foot - 0.5 * _WALL
+    floor = frustum((middle, 0.0), (middle + (knee - foot) * _WALL / (0.45 * height), _WALL))
+    return Shape("bowl", "bowl", [floor, *walls], 0.25, "lathe", ((_UP_Z, 0.8), (_DOWN_Z, 0.2)), ("ceramic",))
+
+
+def _mug(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    radius, height = 0.041 * scale(), 0.082 * scale()
+    pieces = ring([(radius - _WALL, radius, 0.0), (radius - _WALL, radius, height)])
+    pieces.append(cylinder(radius - 0.5 * _WALL, _WALL / 2, (0, 0, _WALL / 2)))
+    # Half a torus, as a chain of capsules; its ends reach into the wall.
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 6)
+    reach, tall = 0.032, 0.32 * height
+    path = [(radius - 0.003 + reach * np.cos(a), 0.0, height / 2 + tall * np.sin(a)) for a in turn]
+    pieces += [capsule(a, b, 0.0075, plain=True) for a, b in pairwise(path)]
+    return Shape("mug", "mug", pieces, 0.20, "lathe", ((_UP_Z, 0.85), (_DOWN_Z, 0.15)), ("ceramic",))
+
+
+def _ball(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    radius = 0.036 * scale()
+    piece = ellipsoid((radius, radius, radius))
+    return Shape("ball", "ball", [piece], 0.10, "lathe", ((_UP_Z, 1.0),), ("ceramic", "speckle"), rolling=0.003)
+
+
+def _soap(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    # A superellipsoid |x/a|^e + |y/b|^e + |z/c|^e = 1: a bar of soap or a rounded flask.
+    name, measures = _choose(rng, {"bar": (0.048, 0.032, 0.020), "flask": (0.042, 0.026, 0.075)})
+    half = np.array([h * scale() for h in measures])
+    azimuth, height = np.linspace(-np.pi, np.pi, 24, endpoint=False), np.linspace(-np.pi / 2, np.pi / 2, 13)
+    a, b = np.meshgrid(azimuth, height[1:-1])
+    round_ = np.stack([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)], axis=-1).reshape(-1, 3)
+    round_ = np.concatenate([round_, [[0, 0, 1], [0, 0, -1]]])
+    exponent = 4.0
+    round_ /= (np.abs(round_) ** exponent).sum(axis=1, keepdims=True) ** (1.0 / exponent)
+    # Cut flat where it would rock: real ones do not balance on a point.
+    round_ = np.clip(round_, -0.94, 0.94) / 0.94
+    mass = 800.0 * 6.0 * float(np.prod(half))
+    return Shape("soap", name, [hull(round_ * half)], mass, "box", ((_UP_Y, 0.3), (_UP_Z, 0.7)), ("speckle", "cloth"))
+
+
+def _angle(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    thick, long, wide, deep = 0.035 * scale(), 0.12 * scale(), 0.085 * scale(), 0.05 * scale()
+    pieces = [
+        box((long / 2, thick / 2, deep / 2), (long / 2, thick / 2, 0)),
+        box((thick / 2, (wide - thick) / 2, deep / 2), (thick / 2, (wide + thick) / 2, 0)),
+    ]
+    rests = ((_UP_Z, 0.6), (_UP_Y, 0.4))
+    return Shape("angle", "angle", pieces, 0.22, "box", rests, ("wood", "speckle", "cloth"))
+
+
+def _banana(rng: np.random.Generator, scale: Callable[[], float]) -> Shape:
+    bend, reach = 0.105 * scale(), np.deg2rad(48.0)
+    turn = np.linspace(-reach, reach, 8)
+    path = np.stack([bend * np.sin(turn), bend * (np.cos(turn) - 1.0), 0.0 * turn], axis=1)
+    thick = 0.018 * np.array([0.62, 0.88, 1.0, 1.0, 1.0, 0.88, 0.62])
+    pieces = [capsule(a, b, r) for a, b, r in zip(path, path[1:], thick, strict=False)]
+    return Shape("banana", "banana", pieces, 0.12, "box", ((_UP_Z, 1.0),), ("peel",), rolling=0.002)
+
+
+_MAKERS: dict[str, Callable[[np.random.Generator, Callable[[], float]], Shape]] = {
+    "carton": _carton,
+    "can": _can,
+    "bottle": _bottle,
+    "bowl": _bowl,
+    "mug": _mug,
+    "brick": _brick,
+    "soap": _soap,
+    "angle": _angle,
+    "ball": _ball,
+    "banana": _banana,
+}
+
+SHAPE_FAMILIES: tuple[str, ...] = tuple(_MAKERS)  #: Names of the families of objects
+
+
+def draw_shape(rng: np.random.Generator, family: str, pool: Pool = ANY) -> Shape:
+    """Draw a member of one of `SHAPE_FAMILIES`. Each length is scaled by a random factor from the pool."""
+    if family not in _MAKERS:
+        raise InputError(f"unknown family of shapes {family!r}", f"known: {', '.join(SHAPE_FAMILIES)}")
+    return _MAKERS[family](rng, lambda: pool.factor(rng))

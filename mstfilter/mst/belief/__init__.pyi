@@ -1,0 +1,2 @@
+from mstfilter.mst.belief.queries import Belief as Belief, Border as Border
+from mstfilter.mst.belief.similarity import SameSegmentation as SameSegmentation, WeightedCoverage as WeightedCoverage

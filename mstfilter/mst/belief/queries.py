@@ -1,0 +1,417 @@
+"""Queries of a weighted population of hypotheses, for planners: probabilities, entropies, expected information.
+
+>>> belief = Belief(state.population)
+>>> belief.occupancy()[tuple(belief.voxel([0.1, 0.0, 0.02]))]     # probability that the voxel is occupied
+>>> belief.same_object_at_pixels(camera, (310, 200), (340, 210))  # probability that two pixels show one object
+>>> belief.object_count()                                         # probability of 0, 1, 2, ... objects
+>>> belief.open_borders(camera)[0].one_object                     # probability of "one object" across a border
+>>> max(cameras, key=belief.view_information)                     # the most informative camera
+>>> belief.estimate()                                             # the hypothesis of least expected loss
+>>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
+
+Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so renaming
+the labels of a hypothesis changes no result. Probabilities of voxels also use the occupancy probabilities of each
+hypothesis (`Hypothesis.occupancy`). Queries about segmentations and actions use only the labels. Voxels are integer
+indices (x, y, z); `Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
+shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
+`mstfilter.mst.belief.information` defines the expected information of an action and its `tolerance` (voxels or
+pixels).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from mstfilter.base.errors import InputError, check_component, check_number
+from mstfilter.base.lazy import late
+from mstfilter.mst.belief.information import (
+    binary_entropy,
+    canonical_rows,
+    entropy,
+    hamming,
+    outcome_information,
+    partition_distance,
+)
+from mstfilter.scene import (
+    Camera,
+    CommonRefinement,
+    Hypothesis,
+    VoxelGrid,
+    check_grids,
+    common_refinement,
+    memo,
+    project,
+    render_hypothesis,
+    scaled_area,
+)
+from mstfilter.scoring import least_loss
+from mstfilter.smc import Population, first_seen
+
+Action = TypeVar("Action")
+
+_DEPTH_STEP = 0.01  # voxels: depths are rounded to this step before they are compared
+_LEAST_PART = 200  # pixels of a part beside an open border, in an image of 640 x 480 pixels
+
+
+class Border(NamedTuple):
+    """A border in an image. The hypotheses disagree about whether both sides of the border are one object."""
+
+    one_object: float  #: probability that both sides are one object, if both are objects
+    pixels: np.ndarray  #: (m, 2) pixels (column, row) on the border
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The pixel (2,) of the border that is nearest to the mean of its pixels."""
+        return np.asarray(self.pixels[np.linalg.norm(self.pixels - self.pixels.mean(axis=0), axis=1).argmin()])
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A posterior over scenes, represented by weighted hypotheses.
+
+    Parameters
+    ----------
+    population : Population
+        Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Equal hypotheses are
+        merged, and hypotheses of weight 0 are ignored.
+    """
+
+    population: Population
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.population, Population):
+            raise InputError(
+                f"Belief takes a Population, not a {type(self.population).__name__}", "Belief(state.population)"
+            )
+        particles = self.population.particles
+        if not all(isinstance(h, Hypothesis) for h in particles):
+            raise InputError("the particles of a belief must be hypotheses, not vectors or other objects")
+        check_grids("", particles, self.grid)
+
+    def __repr__(self) -> str:
+        weights = ", ".join(f"{w:.3g}" for w in np.sort(self._mass)[::-1][:8]) + ", ..." * (len(self._mass) > 8)
+        head = f"Belief: {len(self)} hypotheses, {len(self._mass)} distinct"
+        head = "Belief: 1 hypothesis" if len(self) == 1 else head
+        return f"{head}\n  {self.grid.text}\n  weights {weights}"
+
+    _repr_html_ = late("mstfilter.app.report.display:to_html", "What a notebook shows.")
+
+    def __len__(self) -> int:
+        return len(self.population)
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """The n hypotheses of the population."""
+        return tuple(self.population.particles)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(n,) weights w, sum 1."""
+        return self.population.weights
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The grid of all hypotheses."""
+        return self.population.particles[0].grid
+
+    @cached_property
+    def _merged(self) -> tuple[tuple[Hypothesis, ...], np.ndarray]:
+        """Distinct hypotheses of positive weight, and their weights."""
+        which = first_seen(h.key + (h.occupancy.key if h.occupancy else b"") for h in self.hypotheses)
+        mass = np.bincount(which, self.weights)
+        example = np.unique(which, return_index=True)[1]
+        kept = np.flatnonzero(mass > 0)
+        return tuple(self.hypotheses[int(example[k])] for k in kept), mass[kept]
+
+    @property
+    def _mass(self) -> np.ndarray:
+        return self._merged[1]
+
+    @cached_property
+    def _refined(self) -> CommonRefinement:
+        return common_refinement([h.labels for h in self._merged[0]])
+
+    # Voxels and regions ---------------------------------------------------------------------------------------
+
+    def voxel(self, points: Any) -> np.ndarray:
+        """Voxels (..., 3) that contain world points (..., 3) in metres. Points outside the grid raise InputError."""
+        points = np.asarray(points, dtype=np.float64)
+        if points.shape[-1:] != (3,):
+            raise InputError(f"points have shape {points.shape}, expected (..., 3) in metres")
+        index = self.grid.index_of(points)
+        outside = ~self.grid.contains(index)
+        if outside.any():
+            raise InputError(
+                f"point {points[outside][0].tolist()} m lies outside the grid "
+                f"(so do {outside.sum()} of {outside.size} points)",
+                f"the grid extends from {self.grid.origin.tolist()} to {self.grid.upper.tolist()} m",
+            )
+        return index
+
+    # Probabilities --------------------------------------------------------------------------------------------
+
+    def occupancy(self) -> np.ndarray:
+        """Probability (X, Y, Z) that a voxel is occupied: ``p(v) = sum_i w_i o_i(v)``.
+
+        o_i(v) is the probability, in hypothesis i, of the most probable object at voxel v (`Hypothesis.shares`).
+        """
+        shares = [h.shares.probability for h in self._merged[0]]
+        return sum((w * p.astype(np.float64) for w, p in zip(self._mass, shares, strict=True)), np.zeros(()))
+
+    def same_object(self, a: Any, b: Any) -> np.ndarray:
+        """Probability (...) that two voxels belong to the same object.
+
+        ``sum_i w_i [k_i(a) = k_i(b) > 0] min(o_i(a), o_i(b))``, where hypothesis i has the most probable object
+        k_i(v) at voxel v, with probability o_i(v) (`Hypothesis.shares`). If an object is a level set of its
+        probabilities, the minimum is the probability that the object contains both voxels. `a` and `b` (..., 3)
+        are broadcast against each other. If a = b, the result is the occupancy. If b has all voxels, the result is
+        the extent of the object at a.
+        """
+        at_a, at_b = np.broadcast_arrays(_flat_voxels(self.grid, a), _flat_voxels(self.grid, b))
+        found = np.zeros(at_a.shape)
+        for w, (owner, p) in zip(self._mass, self._flat_shares, strict=True):
+            found += w * ((owner[at_a] == owner[at_b]) & (owner[at_a] > 0)) * np.minimum(p[at_a], p[at_b])
+        return found
+
+    @cached_property
+    def _flat_shares(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        shares = [h.shares for h in self._merged[0]]
+        return [(one.owner.ravel(), one.probability.ravel().astype(np.float64)) for one in shares]
+
+    def same_object_at_pixels(self, camera: Camera, a: Any, b: Any) -> np.ndarray:
+        """Probability (...) that two pixels show the same object: ``sum_i w_i [R_i(a) = R_i(b) > 0]``.
+
+        R_i is the label image of hypothesis i. `a` and `b` (..., 2) are pixels (column, row); they are broadcast.
+        """
+        images = self._images(camera)
+        a, b = _rows_and_columns(camera, a), _rows_and_columns(camera, b)
+        same = [(image[a] == image[b]) & (image[a] > 0) for image in images]
+        return np.tensordot(self._mass, np.stack(same), axes=1)
+
+    def object_count(self) -> np.ndarray:
+        """Probability (K + 1,) of k = 0 .. K objects: ``sum_i w_i [hypothesis i has k objects]``."""
+        return np.bincount(np.diff(self._refined.first), self._mass)
+
+    # Boundaries and entropy -----------------------------------------------------------------------------------
+
+    def boundary_entropy(self) -> np.ndarray:
+        """Entropy (X, Y, Z) of the segmentation at a voxel, the largest over its six faces; at most log 2.
+
+        The entropy of a face is ``H(S | B) = P(B) h(P(S | B))`` with ``h(p) = -p log p - (1 - p) log(1 - p)``. B
+        means that both voxels at the face are occupied, and S that one object occupies both voxels. The entropy of
+        occupancy, H(B), is not included: H(B, S) = H(B) + H(S | B).
+        """
+        largest = np.zeros(self.grid.shape)
+        for axis in range(3):
+            out, face = np.moveaxis(largest, axis, 0), self._entropy_of_faces(axis)
+            np.maximum(out[:-1], face, out=out[:-1])
+            np.maximum(out[1:], face, out=out[1:])
+        return largest
+
+    def _entropy_of_faces(self, axis: int) -> np.ndarray:
+        """H(S | B) of the faces between neighbouring voxels along `axis`, which is the first axis of the result."""
+        cells = np.moveaxis(self._refined.cells, axis, 0)
+        lower, upper = cells[:-1], cells[1:]
+        differ = (lower != upper) & (lower > 0) & (upper > 0)  # inside a cell, both are always one object
+        a, b = self._refined.objects[:, lower[differ]], self._refined.objects[:, upper[differ]]
+        both, same = self._mass @ ((a > 0) & (b > 0)), self._mass @ ((a > 0) & (a == b))
+        entropy = np.zeros(differ.shape)
+        entropy[differ] = both * binary_entropy(np.divide(same, both, out=np.zeros_like(same), where=both > 0))
+        return entropy
+
+    def disagreement(self, camera: Camera) -> np.ndarray:
+        """Map (H, W) of the expected Jaccard distance between the objects that two hypotheses show at a pixel.
+
+        Both hypotheses are drawn by weight: ``1 - sum_ij w_i w_j J(A_i, A_j)``, where A_i is the set of pixels of the
+        object that hypothesis i shows at the pixel, and J is the Jaccard index. J is 1 if neither hypothesis shows an
+        object at the pixel, and 0 if only one hypothesis shows an object.
+        """
+        refined = self._refined_image(camera)
+        shared = refined.overlaps()
+        union = np.add.outer(shared.diagonal(), shared.diagonal()) - shared
+        jaccard = np.divide(shared, union, out=np.ones_like(shared), where=union > 0)
+        rows = refined.objects
+        same = sum(
+            w * v * jaccard[a, b]
+            for w, a in zip(self._mass, rows, strict=True)
+            for v, b in zip(self._mass, rows, strict=True)
+        )
+        return np.clip(1 - same, 0, 1)[refined.cells]
+
+    def open_borders(self, camera: Camera, at_least: float = 0.05) -> list[Border]:
+        """Borders in the image that separate two objects in some hypotheses only, the most uncertain first.
+
+        A border is open if the probability that both sides are one object, given that both sides are objects, is
+        between `at_least` and 1 - `at_least`. Both sides must be objects with a probability above `at_least`.
+        Borders separate the parts of the common refinement of all label images. In an image of 640 x 480, parts of
+        fewer than 200 pixels join the nearest larger part, and borders of fewer than 14 pixels are left out. Borders
+        of one object with the same answer in all hypotheses are one border.
+        """
+        check_number("at_least", at_least, at_least=0, at_most=0.5)
+        refined = self._refined_image(camera)
+        least = scaled_area(_LEAST_PART, camera.width * camera.height)
+        small = (refined.sizes < least)[refined.cells]
+        nearest = distance_transform_edt(small, return_distances=False, return_indices=True)
+        a, b, pixels = _neighbours(refined.cells if small.all() else refined.cells[tuple(nearest)])
+        of_a, of_b = refined.objects[:, a], refined.objects[:, b]
+        both, same = (of_a > 0) & (of_b > 0), (of_a > 0) & (of_a == of_b)
+        p_both, p_same = self._mass @ both, self._mass @ same
+        one = np.divide(p_same, p_both, out=np.ones_like(p_same), where=p_both > at_least)
+        borders: dict[bytes, list[int]] = {}  # pixels that ask the same question, about the same object
+        for k in np.flatnonzero((p_both > at_least) & (one >= at_least) & (one <= 1 - at_least)).tolist():
+            borders.setdefault(np.concatenate([both[:, k], same[:, k], of_a[same[:, k], k]]).tobytes(), []).append(k)
+        doubt = {key: p_both[k[0]] * float(binary_entropy(one[k[0]])) for key, k in borders.items()}
+        order = sorted(doubt, key=lambda key: -doubt[key])
+        return [Border(float(one[borders[k][0]]), pixels[borders[k]]) for k in order if len(borders[k]) ** 2 >= least]
+
+    def partition_entropy(self, tolerance: float = 0.0) -> float:
+        """Entropy of the segmentation of the scene, in nats.
+
+        ``-sum_s P(s) log P(s)``, where P(s) is the weight of the hypotheses with segmentation s. The entropy is the
+        expected information of the true segmentation. Without tolerance, the entropy is an upper bound of the
+        information of every outcome that the labels determine. The distance for the tolerance is
+        `information.partition_distance`.
+        """
+        rows = canonical_rows(self._refined.objects)
+        return outcome_information(self._mass, rows, partition_distance, self._refined.sizes, tolerance)
+
+    # Expected information of actions --------------------------------------------------------------------------
+
+    def view_information(self, camera: Camera, tolerance: float = 0.0) -> float:
+        """Information of an image from a camera; `tolerance` in pixels. Use ``camera.scaled(0.25)`` to save time.
+
+        The outcome is the depth image of the objects, rounded to a hundredth of a voxel and without the table.
+        """
+        step = _DEPTH_STEP * self.grid.voxel_size
+        check_component("camera", camera, Camera)
+        depths = (render_hypothesis(h, camera).depth.ravel() for h in self._merged[0])
+        pixels = np.stack([np.nan_to_num(np.round(d / step), nan=-1).astype(np.int32) for d in depths])
+        pixels = pixels[:, (pixels != pixels[0]).any(axis=0)]
+        return outcome_information(self._mass, pixels, hamming, np.ones(pixels.shape[1]), tolerance)
+
+    def push_information(self, region: Any, tolerance: float = 0.0) -> float:
+        """Information of a push at a voxel or a region, if the moved voxels are observed.
+
+        The outcome ``{v | L_i(v) = L_i(u) > 0 for a u in region}`` has all voxels of all objects with a voxel in the
+        region. Other objects that the pushed objects would move are ignored.
+        """
+        cells = np.unique(self._refined.cells.ravel()[_flat_region(self.grid, region)])
+        moved = self._refined.objects_in(cells)[self._refined.objects]
+        return outcome_information(self._mass, moved, hamming, self._refined.sizes, tolerance)
+
+    def push_map(self, tolerance: float = 0.0) -> np.ndarray:
+        """`push_information` (X, Y, Z) of each voxel."""
+        check_number("tolerance", tolerance, at_least=0, unit="number of voxels")
+        refined, mass = self._refined, self._mass
+        overlap = refined.overlaps()
+        volume = overlap.diagonal()
+        distance = volume[:, None] + volume[None, :] - 2 * overlap
+        near = np.exp(-distance / tolerance) if tolerance else (distance == 0).astype(np.float64)
+        information = np.zeros(len(refined.sizes))
+        for w, row in zip(mass, refined.objects, strict=True):
+            same_outcome = sum(v * near[row, other] for v, other in zip(mass, refined.objects, strict=True))
+            information -= w * np.log(same_outcome)
+        return np.maximum(information, 0.0)[refined.cells]
+
+    def most_informative(
+        self, actions: Sequence[Action], information: Callable[[Action], float], at_least: float = 1e-9
+    ) -> Action | None:
+        """The action of largest expected information, or the first of several such actions.
+
+        The result is None if no action has `at_least` nats, for example if the hypotheses agree on all outcomes.
+        """
+        values = [information(action) for action in actions]
+        if np.isnan(values).any():
+            raise InputError(f"the information of action {int(np.isnan(values).argmax())} is NaN")
+        best = int(np.argmax(values)) if values else 0
+        return actions[best] if values and values[best] >= at_least else None
+
+    # Functions of the user ------------------------------------------------------------------------------------
+
+    def information(self, outcome: Callable[[Hypothesis], Hashable]) -> float:
+        """Information of an action whose outcome is determined by the hypothesis.
+
+        The information is ``H(O)`` with ``P(O = o) = sum_i w_i [outcome(h_i) = o]``. The outcome must not contain
+        labels, because labels are arbitrary in each hypothesis.
+        """
+        outcomes = [(outcome(h), w) for w, h in zip(self.weights, self.hypotheses, strict=True) if w > 0]
+        try:
+            which = first_seen(o for o, _ in outcomes)
+        except TypeError as error:
+            raise InputError(f"outcomes cannot be compared ({error})", "for arrays: array.tobytes()") from error
+        if any(isinstance(o, float) and o != o for o, _ in outcomes):
+            raise InputError("an outcome is NaN, which is not equal to itself", "return None, or another constant")
+        return entropy(np.bincount(which, [w for _, w in outcomes]))
+
+    def estimate(self) -> Hypothesis:
+        """The hypothesis of least expected loss: ``argmin_i sum_j w_j loss(h_i, h_j)``.
+
+        The loss is 1 - quality (weighted coverage in the form ``objects``). The result is the best single answer
+        among the hypotheses if the true scene is distributed as the belief.
+        """
+        hypotheses, mass = self._merged
+        return hypotheses[least_loss([h.labels for h in hypotheses], mass)]
+
+    def _refined_image(self, camera: Camera) -> CommonRefinement:
+        """The common refinement of the label images."""
+        images, keys = self._images(camera), [h.key for h in self._merged[0]]
+        return memo("refined image", (camera.key, *keys), lambda: common_refinement(images))
+
+    def _images(self, camera: Camera) -> list[np.ndarray]:
+        check_component("camera", camera, Camera)
+        return [project(h, camera) for h in self._merged[0]]
+
+
+def _check_indices(name: str, index: np.ndarray, shape: tuple[int, ...], hint: str) -> None:
+    """Raise InputError unless `index` (..., k) holds integers that are at least 0 and below `shape` (k,)."""
+    if index.shape[-1:] != (len(shape),) or not np.issubdtype(index.dtype, np.integer):
+        raise InputError(
+            f"{name}s have type {index.dtype} and shape {index.shape}, expected integers (..., {len(shape)})", hint
+        )
+    outside = ((index < 0) | (index >= shape)).any(axis=-1)
+    if outside.any():
+        size = " x ".join(str(n) for n in shape)
+        raise InputError(f"{name} {index[outside][0].tolist()} lies outside the {size} {name}s", hint)
+
+
+def _flat_voxels(grid: VoxelGrid, voxels: Any) -> np.ndarray:
+    """Flat indices (...) of voxels (..., 3)."""
+    index = np.asarray(voxels)
+    _check_indices("voxel", index, grid.shape, "belief.voxel(points) finds the voxels of points in metres")
+    return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), grid.shape)
+
+
+def _flat_region(grid: VoxelGrid, region: Any) -> np.ndarray:
+    """Distinct flat indices (m,) of a region: a bool array of the grid's shape, or voxels (..., 3)."""
+    where = np.asarray(region)
+    if where.dtype != bool:
+        return np.unique(_flat_voxels(grid, where))
+    if where.shape != grid.shape:
+        raise InputError(f"region has shape {where.shape}, the grid is {grid.shape}")
+    return np.flatnonzero(where)
+
+
+def _rows_and_columns(camera: Camera, pixels: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (...) and columns (...) of pixels (..., 2), which are (column, row)."""
+    index = np.asarray(pixels)
+    _check_indices("pixel", index, (camera.width, camera.height), "a pixel is (column, row)")
+    return index[..., 1], index[..., 0]
+
+
+def _neighbours(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cells a < b (m,) of neighbouring pixels in different `cells` (H, W), and one of the two pixels (m, 2)."""
+    found = []
+    for axis in (0, 1):
+        one, next_one = (np.moveaxis(cells, axis, 0)[part] for part in (np.s_[:-1], np.s_[1:]))
+        where = np.argwhere(one != next_one)
+        at = tuple(where.T)
+        pixels = where[:, ::-1] if axis == 0 else where  # (column, row)
+        found.append((np.minimum(one[at], next_one[at]), np.maximum(one[at], next_one[at]), pixels))
+    a, b, pixels = (np.concatenate(column) for column in zip(*found, strict=True))
+    return a, b, pixels

@@ -1,0 +1,143 @@
+"""Completion by a trained network: that of the package (`mstfilter.mst.completion.unet`), or one of your own.
+
+>>> NetworkCompleter().complete(rng, frame, masks, grid)                     # the weights of the package
+>>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
+>>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
+
+The network uses a grid with voxels of 1 cm (the lattice). If the voxels of the workspace have another size, the
+object is completed on the lattice, and the result is interpolated. `Extrude` completes objects larger than 64 cm,
+because the network was trained on smaller objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from mstfilter.base.errors import missing_library
+from mstfilter.base.fields import Bounds, Share
+from mstfilter.mst.completion.completer import Completer, Completion, finish
+from mstfilter.mst.completion.crops import BATCH, EDGE, LARGER, LATTICE, Architecture, crop_box
+from mstfilter.mst.completion.extrude import Extrude
+from mstfilter.mst.completion.observed import ObservedBox, observed_in
+from mstfilter.scene import Frame, ObjectView, Recording, UsesFiles, VoxelGrid
+
+if TYPE_CHECKING:
+    from mstfilter.mst.completion.unet import TrainedNetwork
+
+
+_LAYER = 0.8  # voxels behind the measured surface: the end of the layer that is kept
+_LARGE_SURFACE = 100  # voxels of this layer
+
+
+@dataclass(frozen=True)
+class NetworkCompleter(Completer, UsesFiles):
+    """Completion by a trained network.
+
+    Parameters
+    ----------
+    weights : str
+        Name of a trained model of the package, the folder of a model (`mstfilter.base.trained`), or an ONNX file.
+    least_surface : float
+        If the network keeps less than the share `least_surface` of a large visible surface, the whole surface gets at
+        least probability .5. Walls and plates that are thinner than a voxel contain the centres of few voxels, so the
+        network removes much of their surface. With 0, the network's probabilities are used.
+    log_odds : float
+        Added to the log odds of every voxel with a probability between 0 and 1. The network is calibrated for the
+        masks of its training scenes. The default was fitted to runs of `mst` (`experiments/partition_fit`).
+    architecture : Architecture, optional
+        The architecture of the model in the folder. The default is the architecture of this package's network.
+    """
+
+    weights: str = "completion"
+    least_surface: Share = 2 / 3
+    log_odds: Annotated[float, Bounds()] = 0.2
+    architecture: Architecture | None = None
+
+    @property
+    def network(self) -> TrainedNetwork:
+        """The network with its weights. Raises InputError if weights are missing or invalid."""
+        try:
+            from mstfilter.mst.completion.unet import load_network
+        except ImportError as error:
+            hint = "or complete by a rule: the preset mst_rules"
+            raise missing_library(error, "the completion network", hint, library="torch") from error
+        return load_network(self.weights, self.architecture)
+
+    def check_files(self, recording: Recording) -> None:
+        """Load the network, so that errors are raised before a run."""
+        _ = self.network
+
+    @property
+    def weights_key(self) -> str:
+        return self.network.key
+
+    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+        return crop_box(voxels, grid)
+
+    def complete_each(
+        self,
+        rngs: Sequence[np.random.Generator],
+        frame: Frame,
+        masks: Sequence[np.ndarray],
+        grid: VoxelGrid,
+        views: Sequence[tuple[ObjectView, ...]] | None = None,
+    ) -> list[Completion]:
+        lattice = grid  # of the network, over the workspace; views have boxes of it
+        if abs(grid.voxel_size - LATTICE) >= 1e-6:
+            lattice = VoxelGrid.from_bounds(grid.origin, grid.upper, LATTICE)
+        found = super().complete_each(rngs, frame, masks, lattice, views)
+        if lattice is not grid:
+            found = [self._on_grid(one, frame, m, grid, lattice) for one, m in zip(found, masks, strict=True)]
+        return [one.shifted(self.log_odds).with_surface() for one in found]
+
+    def _on_grid(
+        self, one: Completion, frame: Frame, mask: np.ndarray, grid: VoxelGrid, lattice: VoxelGrid
+    ) -> Completion:
+        """A completion on the lattice, interpolated at the voxels of the grid."""
+        from scipy.ndimage import map_coordinates
+
+        corners = np.array([one.offset, one.offset + one.probability.shape]) * LATTICE / grid.voxel_size
+        low, high = np.floor(corners[0] + 1e-6).astype(np.int64), np.ceil(corners[1] - 1e-6).astype(np.int64)
+        high = np.maximum(np.minimum(high, grid.shape), low)
+        seen = observed_in(frame, np.asarray(mask, dtype=bool), grid, self, low, high)
+        p = np.zeros(seen.surface.shape, np.float32)
+        if p.size:
+            index = np.indices(p.shape).reshape(3, -1).T + low
+            at = (grid.centre_of(index) - np.asarray(lattice.origin)) / LATTICE - 0.5 - one.offset
+            p = map_coordinates(one.probability, at.T, order=1, mode="nearest").reshape(p.shape)
+        return replace(finish(low, seen, p, one.key), views=one.views)
+
+    def fill(self, rng: np.random.Generator, seen: ObservedBox) -> np.ndarray:
+        return self.fill_many([rng], [seen])[0]
+
+    def fill_many(self, rngs: Sequence[np.random.Generator], seen: Sequence[ObservedBox]) -> list[np.ndarray]:
+        results: list[np.ndarray] = [np.zeros(one.surface.shape, np.float32) for one in seen]
+        by_edge: dict[int, list[int]] = {}
+        for k, one in enumerate(seen):
+            if max(one.surface.shape) > LARGER[-1]:
+                results[k] = Extrude().fill(rngs[k], one)
+            elif one.surface.size:
+                edge = next(n for n in (EDGE, *LARGER) if max(one.surface.shape) <= n)
+                by_edge.setdefault(edge, []).append(k)
+        for edge, members in by_edge.items():
+            for start in range(0, len(members), BATCH):
+                chosen = members[start : start + BATCH]
+                p = self.network.probabilities([seen[k] for k in chosen], edge)
+                for k, one in zip(chosen, p, strict=True):
+                    a, b, c = seen[k].surface.shape
+                    results[k] = self._with_surface(one[:a, :b, :c], seen[k])
+        return results
+
+    def _with_surface(self, p: np.ndarray, seen: ObservedBox) -> np.ndarray:
+        """Probabilities (a, b, c), at least .5 on the visible surface if the network removes much of this surface."""
+        with np.errstate(invalid="ignore"):
+            layer = seen.surface & (seen.signed < _LAYER) & binary_dilation(seen.points > 0, np.ones((3, 3, 3)))
+        n = np.count_nonzero(layer)
+        if n < _LARGE_SURFACE or np.count_nonzero(p[layer] >= 0.5) >= self.least_surface * n:
+            return p
+        return np.where(layer, np.maximum(p, np.float32(0.5)), p)

@@ -1,0 +1,281 @@
+"""The input of completion: the observations of an object, in a box of the grid around the object.
+
+>>> offset, seen = observed_box(frame, mask, grid, completer)     # of one frame
+>>> bits, signed = encode_box(seen)                               # packed: the contents of an `ObjectView`
+>>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
+
+**Earlier frames.** When an object moves, the views of the object move with it. Values of a view are read at the
+nearest voxel. A view contributes the surface of the object, the space behind this surface and the free space around
+it. Surfaces of other objects, and the space that they occlude, are ignored, because the other objects may have moved.
+If the latest frame and a view differ about the object's surface, the latest frame takes precedence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from mstfilter.scene import (
+    Frame,
+    ObjectView,
+    Seen,
+    VoxelGrid,
+    depth_sigma,
+    frame_geometry,
+    memo,
+    read_only,
+    scaled_area,
+)
+
+if TYPE_CHECKING:
+    from mstfilter.mst.completion.completer import Completer
+
+_REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
+_SHAPE = Seen.SURFACE | Seen.FREE | Seen.BEHIND  # what is evidence about the object's shape
+
+# Shares at which the latest frame refutes a view: of its surface that is seen free, of the surface seen now that was
+# free in it, and of its surface that is seen now.
+_CLEARED, _PIERCED, _SEEN = 0.2, 0.15, 0.05
+_CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in front of the surface
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedBox:
+    """The observation of a box of the grid around one mask by a frame."""
+
+    points: np.ndarray  #: (a, b, c) int32: readings of the mask in each voxel
+    #: (a, b, c) bool, visible surface of the mask: the pixel of the voxel's centre is in the mask, and the centre
+    #: is at the measured surface or just behind it. If no centre falls into a small mask, the voxel with most
+    #: readings.
+    surface: np.ndarray
+    other_surface: np.ndarray  #: (a, b, c) bool, visible surface outside the mask, by the same rule
+    free: np.ndarray  #: (a, b, c) bool, observed as free
+    #: (a, b, c) bool, the pixel of the centre is in the mask and the centre is behind the measured surface.
+    behind: np.ndarray
+    hidden: np.ndarray  #: (a, b, c) bool, the same for a pixel outside the mask: hidden by something else.
+    #: (a, b, c) float32, voxels behind the measured surface along the optical axis; NaN if it is unknown.
+    signed: np.ndarray
+    height: np.ndarray  #: (c,) height of the voxel centres above the table in metres
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            object.__setattr__(self, f.name, read_only(getattr(self, f.name)))
+
+
+def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
+    """The box of a mask: its offset (3,) in the grid, and the observation of the box by the frame.
+
+    `rule` defines the size of the box, and which voxels are visible surface and free space.
+    """
+    offset, seen, _, _ = observed_again(frame, mask, (), grid, rule)
+    return offset, seen
+
+
+def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """Voxels (k, 3) of the readings of a mask (H, W)."""
+    pixels, voxels = frame_points(frame, grid)
+    return voxels[mask.ravel()[pixels]]
+
+
+def observed_in(
+    frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer, low: np.ndarray, high: np.ndarray
+) -> ObservedBox:
+    """What a frame shows of the object of a mask, in the box from voxel `low` to `high`. The mask may be empty."""
+    box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    shape = tuple(int(n) for n in high - low)
+    mine = mask_voxels(frame, mask, grid)
+    mine = mine[((mine >= low) & (mine < high)).all(axis=1)]
+    flat = np.ravel_multi_index(tuple((mine - low).T), shape)
+    points = np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.int32)
+
+    geometry = frame_geometry(frame, grid)
+    pixel, signed = geometry.pixel[box], geometry.signed[box]
+    inside = (pixel >= 0) & mask.ravel()[np.maximum(pixel, 0)]
+    with np.errstate(invalid="ignore"):
+        surface = (signed >= -rule.in_front * grid.voxel_size) & (signed < rule.depth * grid.voxel_size)
+        behind = signed > 0
+    in_mask = surface & inside
+    free = _free(frame, grid, rule.free_margin, rule.free_sigmas)[box]
+    if len(mine) and not in_mask.any():
+        in_mask[np.unravel_index(points.argmax(), shape)] = True
+        free = free & ~in_mask
+    height = grid.origin[2] + (low[2] + np.arange(shape[2]) + 0.5) * grid.voxel_size
+    other = surface & ~inside & ~in_mask
+    distance = signed / np.float32(grid.voxel_size)
+    return ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)
+
+
+def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices (k,) of the pixels with a reading inside the grid, and the voxels (k, 3) of these readings."""
+
+    def compute() -> tuple[np.ndarray, np.ndarray]:
+        index = grid.index_of(frame.points)
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
+
+    return memo("frame_points", (frame.key, grid.key), compute)
+
+
+def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
+    """Voxels (X, Y, Z) bool at least `margin` voxels and `sigmas` standard deviations in front of the surface.
+
+    The space in front of an estimated depth is not known to be free.
+    """
+
+    def compute() -> np.ndarray:
+        geometry = frame_geometry(frame, grid)
+        distance = np.maximum(margin * grid.voxel_size, sigmas * depth_sigma(geometry.z - geometry.signed))
+        free = geometry.known_free(distance)
+        return read_only(free if frame.estimated is None else free & ~frame.estimated.ravel()[geometry.pixel])
+
+    return memo("seen_free", (frame.key, grid.key, margin, sigmas), compute)
+
+
+def encode_box(seen: ObservedBox) -> tuple[np.ndarray, np.ndarray]:
+    """Packed box: flags of `Seen` (a, b, c) uint8, and signed distances (a, b, c) int8 in units of `_REACH` / 127."""
+    bits = np.zeros(seen.surface.shape, np.uint8)
+    shown = (seen.surface, seen.other_surface, seen.free, seen.behind, seen.hidden)
+    for flag, one in zip(Seen, shown, strict=True):
+        bits |= np.uint8(flag) * one
+    signed = np.clip(np.nan_to_num(seen.signed, nan=0.0) / _REACH, -1, 1)
+    return bits, np.rint(signed * 127).astype(np.int8)
+
+
+def decode_signed(signed: np.ndarray) -> np.ndarray:
+    """Signed distances in voxels, from the values of `encode_box`."""
+    return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
+
+
+_BINS, _LOWEST, _WIDTH = (4, 6, 6), (0.0, -48.0, -48.0), (25.0, 16.0, 16.0)  # of Lab colours
+
+
+def areas_of_colours(frame: Frame, mask: np.ndarray) -> np.ndarray:
+    """Visible area (144,) float32 in square metres of each colour in a mask (H, W) bool of a frame.
+
+    The colours are 4 x 6 x 6 bins of Lab colours. A pixel is divided between the nearest bins. The area is that of a
+    surface that faces the camera.
+    """
+    import cv2
+
+    areas = np.zeros(_BINS)
+    rgb, depth = frame.rgb[mask], frame.depth[mask & frame.valid]
+    if not len(depth):
+        return areas.ravel().astype(np.float32)
+    lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
+    at = np.clip((lab - _LOWEST) / _WIDTH - 0.5, 0, np.array(_BINS) - 1)
+    low = np.minimum(at.astype(np.int64), np.array(_BINS) - 2)
+    for corner in np.ndindex(2, 2, 2):
+        np.add.at(areas, tuple((low + corner).T), np.where(corner, at - low, 1 - (at - low)).prod(axis=1))
+    pixel = float(np.median(depth)) ** 2 / (frame.camera.K[0, 0] * frame.camera.K[1, 1])
+    return (pixel * areas.ravel()).astype(np.float32)
+
+
+def observed_again(
+    frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid, rule: Completer, refute: bool = True
+) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:
+    """The box of a mask and of earlier views of the object. The mask may be empty.
+
+    Returns the offset (3,) of the box, the observation by the frame, the observation by the frame and the views
+    together (`recall`), and the views. If `refute` is true, views that contradict the frame are omitted. The box is
+    empty if no part of the object lies inside the grid.
+    """
+    if views and refute:
+        voxels = _surface_voxels(frame, mask, views, grid)
+        low, high = enclosing_box(voxels, grid, int(np.ceil(rule.depth)))
+        views = _confirmed(observed_in(frame, mask, grid, rule, low, high), low, grid, views)
+    voxels = _surface_voxels(frame, mask, views, grid)
+    low, high = rule.box(voxels, grid) if len(voxels) else (np.zeros(3, np.int64),) * 2
+    now = observed_in(frame, mask, grid, rule, low, high)
+    return low, now, recall(now, low, grid, views), tuple(views)
+
+
+def enclosing_box(voxels: np.ndarray, grid: VoxelGrid, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """First voxel (3,) and end (3,), excluded, of a box around `voxels` (k, 3) that reaches the grid's floor."""
+    if not len(voxels):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    low = np.maximum(voxels.min(axis=0) - margin, 0).astype(np.int64)
+    low[2] = 0
+    return low, np.minimum(voxels.max(axis=0) + 1 + margin, grid.shape).astype(np.int64)
+
+
+def _surface_voxels(frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid) -> np.ndarray:
+    """Voxels (k, 3) of the readings of a mask, and of the surfaces of views.
+
+    Readings are repeated or omitted to give the number in an image of 640 x 480 pixels, so crops do not depend on the
+    image size.
+    """
+    readings = mask_voxels(frame, mask, grid)
+    if not views:
+        return readings
+    share = scaled_area(1, frame.depth.size)
+    readings = readings[:: round(share)] if share > 1 else np.repeat(readings, round(1 / share), axis=0)
+    voxels = np.concatenate([readings, *(view_surface(view, grid) for view in views)])
+    return voxels[grid.contains(voxels)]
+
+
+def recall(seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]) -> ObservedBox:
+    """The observation of a box at `offset` (3,) by a frame and by earlier views of the object."""
+    if not views:
+        return seen
+    shape = seen.surface.shape
+    centres = grid.centre_of(np.indices(shape).reshape(3, -1).T + offset)
+    bits: np.ndarray = np.zeros(len(centres), np.uint8)
+    signed = np.full(len(centres), np.nan, np.float32)
+    for view in views:
+        inside, found, distance = _evidence(view, centres, grid)
+        bits[inside] |= found
+        signed[inside] = np.fmin(signed[inside], distance)
+    bits = bits.reshape(shape)
+    near = binary_dilation(seen.surface)  # an earlier surface there is the same one, seen with noise
+    free = seen.free | (Seen.FREE.among(bits) & ~seen.surface)
+    surface = (seen.surface | (Seen.SURFACE.among(bits) & ~near & ~seen.other_surface)) & ~free
+    behind = (seen.behind | Seen.BEHIND.among(bits)) & ~free
+    other, hidden = seen.other_surface & ~free, seen.hidden & ~free & ~behind
+    return ObservedBox(
+        seen.points, surface, other, free, behind, hidden, np.fmin(seen.signed, signed.reshape(shape)), seen.height
+    )
+
+
+def _evidence(view: ObjectView, centres: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether centres (n, 3) lie in the box of a view (n,) bool, and the observation by the view at these centres.
+
+    The observation consists of flags of `Seen` (k,), and signed distances (k,) in voxels, NaN if unknown.
+    """
+    index = grid.index_of(view.motion.inv().apply(centres)) - view.offset
+    inside = ((index >= 0) & (index < view.bits.shape)).all(axis=1)
+    at = tuple(index[inside].T)
+    distance, found = decode_signed(view.signed[at]), view.bits[at] & np.uint8(_SHAPE)
+    clear = np.where(distance > -_CLEAR, found & np.uint8(Seen.SURFACE | Seen.BEHIND), found)
+    return inside, clear, np.where(found > 0, distance, np.nan)
+
+
+def _confirmed(
+    seen: ObservedBox, offset: np.ndarray, grid: VoxelGrid, views: Sequence[ObjectView]
+) -> tuple[ObjectView, ...]:
+    """The views that the latest frame does not contradict.
+
+    A frame contradicts a view if it observes much of the view's surface as free, or much of the view's free space as
+    surface. A view is also contradicted if little of its surface is near the current surface.
+    """
+    centres = grid.centre_of(np.indices(seen.surface.shape).reshape(3, -1).T + offset)
+    now, near, n_now = seen.surface.ravel(), binary_dilation(seen.surface).ravel(), int(seen.surface.sum())
+    kept = []
+    for view in views:
+        inside, found, _ = _evidence(view, centres, grid)
+        own, free = Seen.SURFACE.among(found), Seen.FREE.among(found)
+        n_own = int(own.sum())
+        cleared = (own & seen.free.ravel()[inside]).sum() > _CLEARED * n_own
+        pierced = (free & now[inside]).sum() > _PIERCED * n_now
+        if not (cleared or pierced or (n_now and (own & near[inside]).sum() < _SEEN * n_own)):
+            kept.append(view)
+    return tuple(kept)
+
+
+def view_surface(view: ObjectView, grid: VoxelGrid) -> np.ndarray:
+    """Voxels (k, 3) of the moved surface of a view, inside and outside the grid."""
+    centres = grid.centre_of(np.argwhere(Seen.SURFACE.among(view.bits)) + view.offset)
+    return grid.index_of(view.motion.apply(centres)) if len(centres) else np.zeros((0, 3), np.int64)

@@ -1,0 +1,33 @@
+"""Segmentation of one image into hypotheses: boundaries -> tree -> cuts -> hypotheses (paper IV-B).
+
+>>> from mstfilter.mst.segmentation import ColourDepthBoundary, LearnedTree, MergeLogOdds, MetropolisHastingsCuts
+>>> boundary = ColourDepthBoundary().boundary(frame)                                  # doctest: +SKIP
+>>> tree = LearnedTree().build(boundary, frame)                                       # doctest: +SKIP
+>>> w = MergeLogOdds().values(tree, frame)                                            # doctest: +SKIP
+>>> cuts = MetropolisHastingsCuts(temperature=1).sample(rng, tree, w, 10).cuts        # doctest: +SKIP
+
+`TreeCutProposal` performs all four steps and completes the segments to 3-D shapes.
+
+================  ====================================================================
+`boundary`        boundary maps from colour and depth
+`tree`            the tree and its helpers; the ultrametric contour map
+`regions`         measurements of regions and of their borders
+`learned_tree`    trees from learned log odds, also with the evidence of a trained network, `border_network`
+`cuts`            node values, the optimal cut, exact samples
+`mh`              Metropolis-Hastings samples
+`proposal`        which regions are objects; the proposal of the filter
+================  ====================================================================
+"""
+
+from mstfilter.base.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)
+
+__interfaces__ = {"boundary": "BoundaryModel", "tree": "TreeBuilder", "value": "CutValue", "sampler": "CutSampler"}
+__components__ = {
+    "proposal": {"tree_cuts": "TreeCutProposal"},
+    "boundary": {"colour_depth": "ColourDepthBoundary"},
+    "tree": {"learned": "LearnedTree", "ucm": "UcmTree", "border": "BorderTree"},
+    "value": {"scenecut": "SceneCutObjectness", "merge_log_odds": "MergeLogOdds"},
+    "sampler": {"mh": "MetropolisHastingsCuts", "exact": "ExactCuts", "optimal": "OptimalCut"},
+}

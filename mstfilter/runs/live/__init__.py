@@ -1,0 +1,12 @@
+"""Live use: a stream takes frames of a camera and returns hypotheses at every pause.
+
+>>> with mstfilter.Stream(K, on_pause=lambda pause: print(pause.hypotheses[0])) as stream:
+...     for rgb, depth in camera:
+...         stream.push(rgb, depth)
+
+Modules: `stream` defines `Stream`, and `folder` filters a folder while another program adds images.
+"""
+
+from mstfilter.base.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -1,0 +1,353 @@
+"""Inference of model parameters by particle Markov chain Monte Carlo.
+
+A model with parameters is a function that returns a filter:
+
+>>> def filter_of(theta):
+...     rho, sigma = theta
+...     return bootstrap(StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(rho * x, sigma), observation), n=200)
+>>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
+>>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
+
+- `pmmh` is a Metropolis chain that uses the filter's unbiased estimate of the likelihood. The estimate for the
+  current parameters is kept until a proposal is accepted, so the chain converges to the exact posterior for any
+  number of particles (Andrieu, Doucet, Holenstein 2010).
+- `ensemble` runs the ensemble sampler emcee with such estimates of the likelihood. It needs no scale of the steps.
+- `particle_gibbs` draws the parameters given the path of states, and then the path by `conditional_path`. Without
+  ancestor sampling the early states of the path hardly change.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from mstfilter.base.errors import InputError, LostRunError, check_integer
+from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.first_steps import unexamined
+from mstfilter.smc.history import log_evidence
+from mstfilter.smc.inference.conditional import conditional_path
+from mstfilter.smc.inputs import check_observations, split_input
+from mstfilter.smc.models.state_space import metropolis
+from mstfilter.smc.population import Particles, flat_columns, union
+from mstfilter.smc.streams import Key
+from mstfilter.smc.sweep import can_sweep, sweep_runs
+
+FilterOf = Callable[[np.ndarray], ParticleFilter]
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Markov chains of parameters."""
+
+    theta: np.ndarray  #: (n_iterations, n_chains, d) parameters after each iteration
+    #: (n_iterations, n_chains) the estimate that belongs to these parameters; NaN in a chain of `particle_gibbs`.
+    log_evidence: np.ndarray
+    log_density: np.ndarray  #: (n_iterations, n_chains) log prior plus `log_evidence`
+    accepted: np.ndarray  #: (n_chains,) share of accepted proposals
+    paths: tuple[Particles, ...] = ()  #: of `particle_gibbs`: the path of states after each iteration
+
+    def __repr__(self) -> str:
+        n_iterations, n_chains, d = self.theta.shape
+        size = f"{n_iterations} iterations of {n_chains} chains, {d} parameters"
+        return f"Chains: {size}, accepted {self.accepted.min():.2f} to {self.accepted.max():.2f}"
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of a table: chain, draw, parameters, log evidence and log density. Rows are sorted by chain."""
+        numbers = np.indices(self.log_density.shape)
+        arrays = {"chain": numbers[1], "draw": numbers[0], "theta": self.theta}
+        arrays |= {"log_evidence": self.log_evidence, "log_density": self.log_density}
+        return flat_columns({name: np.swapaxes(a, 0, 1) for name, a in arrays.items()}, axes=2)
+
+    def autocorrelation_times(self, discard: int = 0) -> np.ndarray:
+        """(d,) integrated autocorrelation times in iterations, without the first `discard` iterations.
+
+        emcee logs a warning if the chains are shorter than 50 times the result, because the result is then too low.
+        """
+        from emcee.autocorr import integrated_time
+
+        return integrated_time(self.theta[discard:], quiet=True)
+
+    def effective_sizes(self, discard: int = 0) -> np.ndarray:
+        """(d,) effective sample sizes of the chains without the first `discard` iterations."""
+        n_iterations, n_chains, _ = self.theta[discard:].shape
+        return n_iterations * n_chains / self.autocorrelation_times(discard)
+
+
+#: Number of estimates of the evidence at the start of a chain before `pmmh` raises an error.
+_N_STARTS = 20
+
+
+@dataclass
+class _Posterior:
+    """Log prior and estimated log evidence of several parameter vectors, one per row."""
+
+    filter_of: FilterOf
+    observations: list[Any]
+    log_prior: Callable[[np.ndarray], float]
+    batched: bool = False
+    n_runs: int = 0  #: so far: the model is examined once
+
+    def __call__(self, rng: np.random.Generator, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """Mapping with the given ``theta`` (R, d), ``log_density`` (R,) and ``log_evidence`` (R,)."""
+        seeds = rng.integers(2**63, size=len(theta))
+        log_prior = np.array([float(self.log_prior(row)) for row in theta])
+        if np.isnan(log_prior).any():
+            raise InputError(f"the log prior of {theta[np.isnan(log_prior)][0].tolist()} is NaN")
+        evidence, possible = np.full(len(theta), -np.inf), log_prior > -np.inf
+        if possible.any():
+            evidence[possible] = self._estimates(theta[possible], seeds[possible].tolist())
+        return {"theta": theta, "log_density": log_prior + evidence, "log_evidence": evidence}
+
+    def _estimates(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
+        """Log evidences of filters that run in one sweep, or one by one if they cannot be swept."""
+        if self.batched and self.observations:
+            if can_sweep(self._filter(thetas[0])):
+                return self._in_one_sweep(thetas, seeds)
+            self.batched = False
+            warnings.warn("the filters are run one by one: a component looks at several particles", stacklevel=5)
+        found = np.full(len(thetas), -np.inf)
+        for r, (theta, seed) in enumerate(zip(thetas, seeds, strict=True)):
+            with suppress(LostRunError), unexamined(self.n_runs > 0):
+                self.n_runs += 1
+                state, _ = self._filter(theta).run(self.observations, seed)
+                found[r] = state.log_evidence
+        return found
+
+    def _filter(self, theta: np.ndarray) -> ParticleFilter:
+        filter = self.filter_of(theta)
+        if not filter.properly_weighted:
+            raise InputError("a component of the filter is not properly weighted: it has no unbiased evidence")
+        return filter
+
+    def _in_one_sweep(self, thetas: np.ndarray, seeds: list[int]) -> np.ndarray:
+        """Log evidences of filters in one sweep. The components hold one parameter vector for each particle."""
+        first = self._filter(thetas[0])
+        if not self.n_runs:
+            self._examine(first, thetas)
+        self.n_runs += len(thetas)
+
+        @lru_cache(maxsize=4)
+        def made(runs: tuple[int, ...]) -> ParticleFilter:
+            return self.filter_of(np.repeat(thetas[list(runs)], first.n, axis=0).T)
+
+        key = Key(int(seeds[0])).child("sweep", *map(int, seeds[1:3]))
+        runs = sweep_runs(
+            first, self.observations, seeds, key, {"z": log_evidence}, lambda runs: made(tuple(runs.tolist()))
+        )
+        return np.array([-np.inf if run.lost else run.rows["z"][-1] for run in runs])
+
+    def _examine(self, first: ParticleFilter, thetas: np.ndarray) -> None:
+        """Examine the model, and compare the likelihood of many parameter vectors with that of one."""
+        with suppress(LostRunError):
+            list(islice(first.iterate(self.observations, 0), 3))
+        y, u = split_input(self.observations[0])
+        singles: list[Any] = [self.filter_of(theta).at_step(0, u) for theta in thetas[:2]]
+        if y is None or len(singles) < 2 or first.update is None:
+            return
+        both: Any = self.filter_of(np.repeat(thetas[:2], first.n, axis=0).T).at_step(0, u)
+        drawn = [one.initial.sample(Key(k).generator(), y, first.n) for k, one in enumerate(singles)]
+        alone = [one.update.update(Key(0).generator(), x, None, y) for one, x in zip(singles, drawn, strict=True)]
+        found = both.update.update(Key(0).generator(), union(*drawn), None, y).log_weights
+        if not np.allclose(found, np.concatenate([x.log_weights for x in alone]), rtol=1e-6, atol=1e-6):
+            raise InputError(
+                "the likelihood with one parameter vector for each particle is not that of single filters",
+                "with batched=True, filter_of gets parameters of shape (d, R n): use them like particles",
+            )
+
+
+def pmmh(
+    filter_of: FilterOf,
+    observations: Sequence[Any],
+    log_prior: Callable[[np.ndarray], float],
+    start: Any,
+    scale: Any,
+    n_iterations: int,
+    seed: int = 0,
+    *,
+    batched: bool = False,
+) -> Chains:
+    """Particle marginal Metropolis-Hastings: a random walk on the parameters.
+
+    Choose n so that the log evidence has a standard deviation of about 1 at the posterior mean (Doucet, Pitt,
+    Deligiannidis, Kohn 2015).
+
+    Parameters
+    ----------
+    filter_of : callable
+        ``(theta) -> ParticleFilter`` for parameters (d,). The components of the filter must be properly weighted.
+    log_prior : callable
+        ``(theta) -> float``: the log prior density; -inf outside of the support.
+    start : (d,) or (R, d) array_like
+        First parameters of one chain or of R chains, in the order in which `filter_of` takes them.
+    scale : (d,) or (d, d) array_like
+        Standard deviations or covariance of a step. A good choice is 2.4 / sqrt(d) posterior standard deviations.
+    batched : bool
+        Whether ``filter_of`` also accepts parameters (d, m), one column for each of the m particles of all chains.
+        The filters of all chains then run as one batch. To combine a parameter with particles (n, k), use
+        ``theta[0][..., None]``. If a component looks at several particles, the filters run one by one, with a
+        warning.
+
+    Raises
+    ------
+    InputError
+        If the prior is zero at the start of a chain, or if 20 estimates of the evidence at the start are zero.
+    """
+    theta = np.atleast_2d(_numbers("start", start))
+    if theta.ndim > 2:
+        raise InputError(f"start has shape {theta.shape}, expected (d,) or (chains, d)")
+    root = _step_root(scale, theta.shape[1])
+    check_integer("n_iterations", n_iterations)
+    posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
+    key = Key(seed).child("pmmh")
+
+    def propose(rng: np.random.Generator, now: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        new = posterior(rng, now["theta"] + rng.standard_normal(theta.shape) @ root.T)
+        return new, new["log_density"] - now["log_density"]
+
+    state, steps = _start(posterior, key.child("start"), theta), []
+    for i in range(n_iterations):
+        [(state, accepted)] = metropolis(key.child(i).generator(), state, propose)
+        steps.append({**state, "accepted": accepted})
+    found = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
+    return Chains(found["theta"], found["log_evidence"], found["log_density"], found["accepted"].mean(axis=0))
+
+
+def _start(posterior: _Posterior, key: Key, theta: np.ndarray) -> dict[str, np.ndarray]:
+    """The first parameters with their log densities. Estimates of the evidence that are zero are drawn again."""
+    state = posterior(key.generator(), theta)
+    for attempt in range(1, _N_STARTS + 1):
+        lost = np.flatnonzero(~np.isfinite(state["log_density"]))
+        if not len(lost):
+            break
+        impossible = [r for r in lost if posterior.log_prior(theta[r]) == -np.inf]
+        if impossible or attempt == _N_STARTS:
+            r = (impossible or lost)[0]
+            what = "the log prior is -inf" if impossible else f"{_N_STARTS} estimates of the evidence are 0"
+            raise InputError(
+                f"the start {theta[r].tolist()} of chain {r} has log density {state['log_density'][r]}: {what}",
+                "start where the prior and the likelihood are positive, or take more particles",
+            )
+        for name, values in posterior(key.child(attempt).generator(), theta[lost]).items():
+            state[name][lost] = values
+    return state
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """A new float64 array of the values of parameters. Raises InputError if they are not finite numbers."""
+    if isinstance(value, Mapping):
+        raise InputError(
+            f"{name} is a mapping with the keys {', '.join(map(str, value))}, expected an array of numbers",
+            f"parameters have an order and no names: {name}={[*value.values()]}",
+            f"name them where they are used: {', '.join(map(str, value))} = theta",
+        )
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {value!r}, expected an array of numbers") from error
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{name} is {numbers.tolist()}, expected finite numbers")
+    return numbers
+
+
+def _step_root(scale: Any, d: int) -> np.ndarray:
+    """(d, d) square root of the covariance of a step, from standard deviations or a covariance."""
+    scale = _numbers("scale", scale)
+    if scale.ndim < 2 and scale.shape in ((), (1,), (d,)) and np.isfinite(scale).all() and (scale > 0).all():
+        return np.diag(np.broadcast_to(scale, d))
+    try:
+        if scale.shape == (d, d):
+            return np.linalg.cholesky(scale)
+    except np.linalg.LinAlgError:
+        pass
+    raise InputError(
+        f"scale is {scale.tolist()}, expected {d} positive standard deviations or a ({d}, {d}) covariance"
+    )
+
+
+def ensemble(
+    filter_of: FilterOf,
+    observations: Sequence[Any],
+    log_prior: Callable[[np.ndarray], float],
+    start: Any,
+    n_iterations: int,
+    seed: int = 0,
+    *,
+    batched: bool = False,
+) -> Chains:
+    """Ensemble MCMC (Goodman and Weare 2010) by emcee, with the estimated evidence as the likelihood.
+
+    emcee keeps the log density and the estimated evidence (as a blob) of a walker until the walker moves. No estimate
+    is drawn again for unchanged parameters, so the chain converges to the exact posterior.
+
+    Parameters
+    ----------
+    filter_of, observations, log_prior, batched
+        As in `pmmh`. If `batched` is True, the filters of half of the walkers run as one batch.
+    start : (n_walkers, d) array_like
+        First parameters of the walkers. At least 2 d walkers are needed, with different parameters.
+    """
+    import emcee
+
+    theta = _numbers("start", start)
+    if theta.ndim != 2 or len(theta) < 2 * theta.shape[1]:
+        raise InputError(f"start has shape {theta.shape}, expected (walkers, d) with at least 2 d walkers")
+    check_integer("n_iterations", n_iterations)
+    posterior = _Posterior(filter_of, list(check_observations(observations)), log_prior, batched)
+    rng = Key(seed).child("ensemble").generator()
+
+    def log_density(thetas: np.ndarray) -> np.ndarray:
+        found = posterior(rng, thetas)
+        return np.stack([found["log_density"], found["log_evidence"]], axis=1)
+
+    sampler = emcee.EnsembleSampler(*theta.shape, log_density, vectorize=True)
+    own = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))  # emcee draws from the legacy generator
+    sampler.run_mcmc(emcee.State(theta, random_state=own.get_state()), n_iterations)
+    evidence = sampler.get_blobs().reshape(n_iterations, len(theta))
+    return Chains(sampler.get_chain(), evidence, sampler.get_log_prob(), sampler.acceptance_fraction)
+
+
+def particle_gibbs(
+    filter_of: FilterOf,
+    observations: Sequence[Any],
+    draw: Callable[[np.random.Generator, np.ndarray, Particles], Any],
+    start: Any,
+    n_iterations: int,
+    seed: int = 0,
+) -> Chains:
+    """Particle Gibbs: draws the parameters given a path of states, then the path given the parameters.
+
+    Parameters
+    ----------
+    filter_of : callable
+        ``(theta) -> ParticleFilter``. The filter must be supported by `conditional_path`.
+    draw : callable
+        ``(rng, theta, path) -> theta`` (d,), a kernel that leaves p(theta | path, y) invariant. Examples are an exact
+        draw if the prior is conjugate, and a Metropolis step with `path_log_prob`.
+    start : (d,) array_like
+        First parameters.
+    """
+    check_integer("n_iterations", n_iterations)
+    key = Key(seed).child("particle gibbs")
+    theta = _numbers("start", start)
+    if theta.ndim != 1:
+        raise InputError(f"start has shape {theta.shape}, expected (d,)")
+    path = conditional_path(filter_of(theta), observations, key.child("start"))
+    thetas, paths, moved = np.empty((n_iterations, 1, len(theta))), [], 0
+    for i in range(n_iterations):
+        streams, old = key.child(i), theta
+        theta = np.array(draw(streams.child("theta").generator(), theta.copy(), path), np.float64)
+        if theta.shape != old.shape:
+            raise InputError(f"draw returned parameters of shape {theta.shape}, expected {old.shape}")
+        path = conditional_path(filter_of(theta), observations, streams, path)
+        moved += not np.array_equal(theta, old)
+        thetas[i] = theta
+        paths.append(path)
+    unknown = np.full((n_iterations, 1), np.nan)
+    return Chains(thetas, unknown, unknown, np.array([moved / n_iterations]), tuple(paths))

@@ -1,0 +1,487 @@
+"""Distributions for models, drawn and evaluated for all particles together.
+
+>>> import numpy as np
+>>> rng = np.random.default_rng(0)
+>>> x = Normal(np.zeros(5), 2.0).sample(rng, 5)          # one row per particle
+>>> Normal(x, 1.0).log_prob(0.3).shape
+(5,)
+
+The first axis is the axis of the particles. Parameters of shape () or (n,) give values of shape (n,): the event shape
+is (). Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The entries of an event are
+independent, and their log densities are summed. `log_prob` returns (n,) values, or one value if no argument has rows.
+
+Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
+of the classes of this module (`as_distribution`). This module is three to six times as fast as scipy. For a
+distribution of another library, write a `Distribution` whose `sample` draws from the given generator.
+
+A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
+and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
+range is NaN. MCMC moves may propose values that make a parameter invalid. Inside `hypothetical`, such rows do not
+raise InputError, but have the log density NaN, so that the moves are rejected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from mstfilter.base.errors import InputError
+from mstfilter.smc.interfaces import Distribution
+from mstfilter.smc.resampling import draw_rows, search
+
+_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+_FLOAT64 = np.dtype(np.float64)
+_HYPOTHETICAL: ContextVar[bool] = ContextVar("parameters may be out of range", default=False)
+
+
+@contextmanager
+def hypothetical() -> Iterator[None]:
+    """In the block, rows whose parameters are out of range have the log density NaN instead of raising InputError."""
+    token = _HYPOTHETICAL.set(True)
+    try:
+        with np.errstate(invalid="ignore"):
+            yield
+    finally:
+        _HYPOTHETICAL.reset(token)
+
+
+class Range(NamedTuple):
+    """The numbers that a parameter may take."""
+
+    expected: str
+    low: float = -math.inf
+    high: float = math.inf
+    open: bool = True  #: whether the ends are out of range
+
+    def contains(self, value: np.ndarray) -> np.ndarray:
+        """Whether each number is in the range; False for NaN."""
+        return (value > self.low) & (value < self.high) if self.open else (value >= self.low) & (value <= self.high)
+
+    def surely_contains(self, value: Any) -> bool:
+        """Whether a fast test (sum, minimum) shows that all entries of a float or float64 array are in the range."""
+        if type(value) is float:
+            return self.low < value < self.high
+        if self.high < math.inf or not _is_finite(value):
+            return False
+        return self.low == -math.inf or np.minimum.reduce(value, axis=None, initial=math.inf) > self.low
+
+
+FINITE = Range("a finite number")
+POSITIVE = Range("a positive number", 0.0)
+
+
+class _Checked(Distribution):
+    """A distribution that checks its parameters, which are its fields.
+
+    Scalar parameters are checked when the distribution is made. Arrays are checked at the same time unless `lazy` is
+    True. Lazy arrays are checked when the distribution is sampled. The log density of a row with invalid parameters
+    is NaN.
+    """
+
+    draws_numbers = True
+    ranges: ClassVar[Mapping[str, Range]] = {}
+    lazy: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        for name in self.ranges:
+            value = getattr(self, name)
+            if _may_wrap(value):
+                object.__setattr__(self, name, value.astype(np.float64))
+            if not (self.lazy and type(getattr(self, name)) is np.ndarray):
+                self._check(name, self.ranges[name])
+
+    def check_parameters(self) -> None:
+        for name, parameters in self.ranges.items():
+            self._check(name, parameters)
+
+    def _check(self, name: str, allowed: Range) -> None:
+        """Raise InputError if an entry of a parameter is out of range. In `hypothetical`, such rows become NaN."""
+        value = getattr(self, name)
+        if allowed.surely_contains(value):  # a third of the time of the rest
+            return
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiub":
+            raise InputError(
+                f"{name} of a {type(self).__name__} is {value!r}"[:200] + f", expected {allowed.expected}",
+                *(["None stands for a missing observation, or for previous at the first step"] * (value is None)),
+            )
+        self._check_rows(name, array, ~allowed.contains(array), allowed.expected)
+
+    def _check_rows(self, name: str, array: np.ndarray, wrong: np.ndarray, expected: str) -> None:
+        if not wrong.any():
+            return
+        array = np.broadcast_to(array, wrong.shape)
+        if _HYPOTHETICAL.get() and array.ndim:
+            object.__setattr__(self, name, np.where(wrong, np.nan, array))
+            return
+        first = tuple(int(i) for i in np.argwhere(wrong)[0])
+        row = f" in row {first[0]} ({int(wrong.sum())} of {array.size})" if first else ""
+        raise InputError(f"{name} of a {type(self).__name__} is {array[first]}{row}, expected {expected}")
+
+
+class _Independent(_Checked):
+    """A distribution with independent entries. The fields are parameters of shape (), (n,), (1, d) or (n, d)."""
+
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        return _broadcast_shape(*vars(self).values())
+
+    def _mean(self) -> Any:
+        """Means of the independent entries."""
+        return self.loc  # type: ignore[attr-defined]
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.broadcast_to(np.asarray(self._mean(), np.float64), self.parameter_shape)
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether the sum of a float or a float64 array is finite, which implies that all entries are finite."""
+    if isinstance(value, np.ndarray) and value.dtype is _FLOAT64:
+        return math.isfinite(np.add.reduce(value, axis=None))
+    return type(value) is float and math.isfinite(value)
+
+
+def _impossible(value: np.ndarray) -> Any:
+    """Log density of a value outside the support: -inf, or NaN if the value is NaN."""
+    return np.where(np.isnan(value), np.nan, -np.inf) if value.dtype.kind == "f" else -np.inf
+
+
+def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
+    shape: tuple[int, ...] = ()
+    for parameter in parameters:
+        if type(parameter) is float:
+            continue
+        other = parameter.shape if isinstance(parameter, np.ndarray) else np.shape(parameter)
+        if not shape or not other or other == shape:  # the usual case
+            shape = shape or other
+            continue
+        try:
+            if shape[0] > 1 and (shape == (*other, 1) or other == (*shape, 1)):
+                raise ValueError("numpy would make (n, n) of (n,) and (n, 1)")
+            shape = np.broadcast_shapes(shape, other)
+        except ValueError:
+            raise InputError(
+                f"parameters of shapes {' and '.join(str(np.shape(p)) for p in parameters)} do not fit together",
+                "with one row per particle they are all (n,), or all (n, d) or (n, 1)",
+            ) from None
+    return shape
+
+
+def _sum_rows(log_prob: Any) -> np.ndarray:
+    """Sum over all axes except the first, since the entries of a row are independent."""
+    out = np.asarray(log_prob)
+    return out if out.ndim <= 1 else out.reshape(len(out), math.prod(out.shape[1:])).sum(axis=1)
+
+
+def _may_wrap(value: Any) -> bool:
+    """Whether a value is an array or number of a NumPy integer type, whose arithmetic may wrap."""
+    return isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "iub"
+
+
+def _standardised(value: Any, loc: Any, scale: Any) -> np.ndarray:
+    """(value - loc) / scale with one temporary array."""
+    z = np.asarray(np.subtract(value, loc, dtype=np.float64 if _may_wrap(value) else None), dtype=np.float64)
+    fits = (
+        isinstance(scale, float)
+        or np.shape(scale) == z.shape
+        or np.broadcast_shapes(z.shape, np.shape(scale)) == z.shape
+    )
+    return np.divide(z, scale, out=z if z.ndim and fits else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Normal(_Independent):
+    """Gaussian with mean `loc` and standard deviation `scale` > 0."""
+
+    loc: Any = 0.0
+    scale: Any = 1.0
+
+    ranges: ClassVar = {"loc": FINITE, "scale": POSITIVE}
+    lazy: ClassVar = True
+
+    def __post_init__(self) -> None:
+        usual = type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray
+        if not (usual and self.loc.dtype.kind == "f"):
+            super().__post_init__()
+
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        if type(self.scale) is float and type(self.loc) is np.ndarray:  # the usual case
+            return self.loc.shape
+        return super().parameter_shape
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        loc, scale = self.loc, self.scale
+        if not (type(scale) is float and _is_finite(loc)):  # the usual case, whose scale was checked
+            self.check_parameters()
+        z = rng.standard_normal(self.value_shape(size))
+        z *= scale
+        z += loc
+        return z
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        z = _standardised(value, self.loc, self.scale)
+        if isinstance(self.scale, float) and z.ndim:
+            z *= z
+            z *= -0.5
+            z -= math.log(self.scale) + _HALF_LOG_2PI
+            return _sum_rows(z)
+        return _sum_rows(-0.5 * (z * z) - (np.log(self.scale) + _HALF_LOG_2PI))
+
+
+@dataclass(frozen=True, eq=False)
+class Student(_Independent):
+    """Student's t with `df` > 0 degrees of freedom, centre `loc` and scale `scale` > 0."""
+
+    df: Any
+    loc: Any = 0.0
+    scale: Any = 1.0
+
+    ranges: ClassVar = {"df": POSITIVE, "loc": FINITE, "scale": POSITIVE}
+    lazy: ClassVar = True
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        self.check_parameters()
+        return self.loc + self.scale * rng.standard_t(self.df, self.value_shape(size))
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        from scipy.special import gammaln
+
+        z = _standardised(value, self.loc, self.scale)
+        df = self.df if type(self.df) is float else np.asarray(self.df, dtype=np.float64)  # a float is faster
+        constant = gammaln((df + 1) / 2) - gammaln(df / 2) - 0.5 * np.log(df * np.pi) - np.log(self.scale)
+        return _sum_rows(constant - (df + 1) / 2 * np.log1p(z * z / df))
+
+
+@dataclass(frozen=True, eq=False)
+class Uniform(_Independent):
+    """Uniform distribution on [low, high)."""
+
+    low: Any = 0.0
+    high: Any = 1.0
+
+    ranges: ClassVar = {"low": FINITE, "high": Range("a finite number above low")}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _broadcast_shape(self.low, self.high)
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        self._check_rows("high", high, ~(low < high), "a finite number above low")
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        u = rng.random(self.value_shape(size))
+        return self.low + (np.asarray(self.high) - self.low) * u
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        x = np.asarray(value)
+        inside = (x >= self.low) & (x < self.high)
+        return _sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), _impossible(x)))
+
+    def _mean(self) -> Any:
+        return (np.asarray(self.low) + self.high) / 2
+
+
+def _cholesky(cov: np.ndarray) -> np.ndarray:
+    """Lower triangular root of each covariance; in `hypothetical`, NaN for one that is not positive definite."""
+    if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
+        raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
+    size = abs(cov).max(axis=(-1, -2), initial=0.0)
+    symmetric = abs(cov - np.swapaxes(cov, -1, -2)).max(axis=(-1, -2), initial=0.0) <= 1e-6 * size
+    if symmetric.all():
+        try:
+            return np.linalg.cholesky(cov)
+        except np.linalg.LinAlgError:
+            pass
+    valid = symmetric & (np.linalg.eigvalsh(np.nan_to_num(cov))[..., 0] > 0) & np.isfinite(size)
+    if _HYPOTHETICAL.get() and cov.ndim == 3:
+        root = np.linalg.cholesky(np.where(valid[:, None, None], cov, np.eye(cov.shape[-1])))
+        return np.where(valid[:, None, None], root, np.nan)
+    row = int(np.argmin(valid))
+    what = "positive definite" if symmetric.flat[row] else "symmetric"
+    where = f" in row {row}" if cov.ndim == 3 else ""
+    raise InputError(f"covariance is not {what}{where}: {cov.reshape(-1, *cov.shape[-2:])[row].tolist()}"[:300])
+
+
+@dataclass(frozen=True, eq=False)
+class MultivariateNormal(_Checked):
+    """Distribution of Gaussian vectors.
+
+    The mean `loc` has shape (d,) or (n, d). The covariance `cov`, of shape (d, d) or (n, d, d), is positive definite.
+    """
+
+    loc: Any
+    cov: Any
+
+    ranges: ClassVar = {"loc": FINITE}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        root = _cholesky(np.asarray(self.cov, dtype=np.float64))
+        loc = np.shape(self.loc)
+        if loc and loc[-1] != root.shape[-1] and (len(loc), loc[-1]) != (2, 1):
+            raise InputError(
+                f"mean of shape {loc} does not fit a covariance of shape {root.shape}",
+                "the mean is (d,), or (n, d) with one row per particle; x[:, None] makes (n, 1) of (n,)",
+            )
+        object.__setattr__(self, "_root", root)
+
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        return _broadcast_shape(np.zeros((1, 1)), self.loc, self.__dict__["_root"][..., 0])
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        root = self.__dict__["_root"]
+        z = rng.standard_normal(self.value_shape(size))
+        return self.loc + (z @ root.T if root.ndim == 2 else np.einsum("nij,nj->ni", root, z))
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        root = self.__dict__["_root"]
+        d = root.shape[-1]
+        r = np.asarray(value, dtype=np.float64) - self.loc
+        log_det = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+        if root.ndim == 2:
+            from scipy.linalg import solve_triangular
+
+            z = solve_triangular(root, r.T if r.ndim == 2 else r, lower=True, check_finite=False)
+            return -0.5 * (z * z).sum(axis=0) - log_det - d * _HALF_LOG_2PI
+        z = np.linalg.solve(root, np.atleast_2d(r)[..., None])[..., 0]
+        return -0.5 * (z * z).sum(axis=-1) - log_det - d * _HALF_LOG_2PI
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.broadcast_to(np.asarray(self.loc, np.float64), self.parameter_shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Bernoulli(_Independent):
+    """Booleans that are True with probability `p`."""
+
+    p: Any
+    discrete = True
+    ranges: ClassVar = {"p": Range("a probability from 0 to 1", 0.0, 1.0, open=False)}
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        return rng.random(self.value_shape(size)) < self.p
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        x = np.asarray(value)
+        with np.errstate(divide="ignore"):
+            log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p, np.float64)))
+        return _sum_rows(np.where((x == 0) | (x == 1), log_p, _impossible(x)))
+
+    def _mean(self) -> Any:
+        return self.p
+
+
+@dataclass(frozen=True, eq=False)
+class Categorical(Distribution):
+    """A distribution over k categories, 0 to k - 1. Rows of `probs` (k,) or (n, k) are scaled to sum to one."""
+
+    probs: Any
+    discrete = True
+    draws_numbers = True
+
+    def __post_init__(self) -> None:
+        p = np.asarray(self.probs, dtype=np.float64)
+        if p.ndim not in (1, 2) or not p.shape[-1]:
+            raise InputError(f"probabilities of a categorical have shape {p.shape}, expected (k,) or (n, k)")
+        total = p.sum(axis=-1, keepdims=True)
+        if p.size and not (p.min() >= 0 and total.min() > 0 and total.max() < np.inf):
+            wrong = ~((p >= 0).all(axis=-1) & (total[..., 0] > 0) & (total[..., 0] < np.inf))
+            if not (_HYPOTHETICAL.get() and p.ndim == 2):
+                row = int(np.argmax(wrong))
+                where = f" in row {row} ({int(wrong.sum())} of {len(p)})" if p.ndim == 2 else ""
+                raise InputError(
+                    f"probabilities of a categorical are {p.reshape(-1, p.shape[-1])[row].tolist()}{where}"[:300]
+                    + ", expected finite numbers, none negative, not all zero"
+                )
+            total = np.where(wrong[:, None], np.nan, total)
+        object.__setattr__(self, "probs", p / total)
+
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        return self.probs.shape[:-1]
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        """Draw categories. A category of probability zero is never drawn."""
+        u = rng.random(self.value_shape(size))
+        return search(self.probs, u) if self.probs.ndim == 1 else draw_rows(self.probs, u)
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        k = np.asarray(value)
+        k = k.astype(np.int64) if _may_wrap(k) else k  # numpy clips to the range of its type
+        index = np.nan_to_num(np.clip(k, 0, self.probs.shape[-1] - 1)).astype(np.int64)
+        with np.errstate(divide="ignore"):
+            log_p = np.log(self.probs)
+        if self.probs.ndim == 1:
+            picked = log_p[index]
+        else:
+            picked = log_p[0 if len(log_p) == 1 and index.ndim else np.arange(len(log_p)), index]
+        return np.where(index == k, picked, _impossible(k))
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self.probs @ np.arange(self.probs.shape[-1], dtype=np.float64)
+
+
+def as_distribution(value: Any) -> Distribution:
+    """Return a `Distribution`, or convert a frozen distribution of scipy.stats. Raises InputError for other types."""
+    if isinstance(value, Distribution):
+        return value
+    if type(value).__module__.startswith("scipy.stats") and hasattr(value, "rvs"):
+        return FromScipy(value)
+    raise InputError(
+        f"expected a distribution, found a {type(value).__module__}.{type(value).__qualname__}",
+        "use one of mstfilter.smc, a frozen one of scipy.stats, or subclass mstfilter.smc.Distribution",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FromScipy(Distribution):
+    """A univariate or multivariate frozen distribution of scipy.stats."""
+
+    wrapped: Any
+
+    def __post_init__(self) -> None:
+        kind = type(self.wrapped)
+        discrete = any("discrete" in base.__name__.lower() for base in kind.__mro__)
+        object.__setattr__(self, "discrete", discrete or not hasattr(kind, "logpdf"))
+        object.__setattr__(self, "_vector", kind.__module__.endswith("_multivariate"))
+
+    @property
+    def parameter_shape(self) -> tuple[int, ...]:
+        if hasattr(self.wrapped, "args"):  # the mean would be slow
+            return _broadcast_shape(*self.wrapped.args, *self.wrapped.kwds.values())
+        if self.__dict__["_vector"] and not hasattr(self.wrapped, "mean"):
+            return (1, *(np.shape(self.wrapped.rvs(2, random_state=0))[1:] or (1,)))
+        return np.shape(self.mean)
+
+    def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        wrapped, shape = self.wrapped, self.value_shape(size)
+        if self.__dict__["_vector"]:
+            return np.reshape(wrapped.rvs(size=size, random_state=rng), shape)
+        return np.asarray(wrapped.rvs(size=shape, random_state=rng))
+
+    def log_prob(self, value: Any) -> np.ndarray:
+        vector = self.__dict__["_vector"]
+        rows = np.shape(value)[:1] if vector and np.ndim(value) > len(self.event_shape) else ()
+        if type(self.wrapped).__name__ in _PARTICLES_LAST and rows:
+            value = np.moveaxis(value, 0, -1)
+        log_prob = self.wrapped.logpmf(value) if self.discrete else self.wrapped.logpdf(value)
+        return np.reshape(log_prob, rows or np.shape(log_prob)) if vector else _sum_rows(log_prob)
+
+    @property
+    def mean(self) -> np.ndarray:
+        mean = self.wrapped.mean
+        mean = np.asarray(mean() if callable(mean) else mean)
+        return mean[None] if self.__dict__["_vector"] else mean
+
+
+_PARTICLES_LAST = ("dirichlet_frozen", "wishart_frozen", "invwishart_frozen")

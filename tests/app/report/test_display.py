@@ -1,0 +1,140 @@
+"""What a person sees of an object: its text, its HTML, plots, the page that can be rotated, tables and progress."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mstfilter
+from mstfilter.app.report.display import Drawing
+from mstfilter.base.lazy import exported
+from mstfilter.base.resources import preset_names
+from mstfilter.mst.testing import scene_example
+from mstfilter.runs import filter_recording
+from mstfilter.runs.presets import load_config
+from mstfilter.scene import Crop, Hypothesis, ObjectRecord, Recording, VoxelGrid
+from mstfilter.smc import (
+    Candidates,
+    Infos,
+    Population,
+    Ssp,
+    Tempered,
+    Transition,
+    bootstrap,
+    linear_gaussian,
+    run_many,
+)
+from tests.app.report.pages import check_html
+from tests.scene.scenes import CAMERA, table_scene
+
+MODEL = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
+NUMBERS = bootstrap(MODEL, n=50)
+STATE, INFOS = NUMBERS.run([[0.3], [0.1]], seed=0)
+SCENES, CLIP = scene_example(np.random.default_rng(0), 5)
+RGB, DEPTH, _ = table_scene()
+RECORDING = Recording.from_arrays(
+    np.repeat(RGB[None], 30, 0), np.repeat(DEPTH[None], 30, 0), CAMERA.K, pauses="every", name="a long name " * 10
+)
+MANY = Hypothesis.from_labels(np.arange(1, 1001).reshape(10, 10, 10), VoxelGrid((0, 0, 0), 0.01, (10, 10, 10)))
+FLOOR = mstfilter.preset("floor_one_blob")
+OBJECTS = {
+    "recording": RECORDING,
+    "clip": CLIP,
+    "clip of one frame": RECORDING.clips()[0],
+    "frame": CLIP.after,
+    "camera": CAMERA,
+    "hypothesis": SCENES.particles[0],
+    "hypothesis of 1000 objects": MANY,
+    "empty hypothesis": Hypothesis.from_labels(np.zeros((2, 2, 2), int), VoxelGrid((0, 0, 0), 0.01, (2, 2, 2))),
+    "record": ObjectRecord(3, 65539, 1, Crop.of(np.ones((4, 4, 4), bool))),
+    "population of hypotheses": SCENES,
+    "population of numbers": STATE.population,
+    "population of a mapping": Population({f"coordinate {k}": np.zeros((90, 3)) for k in range(20)}),
+    "candidates": Population(Candidates(lambda k: k, 1000)),
+    "state": STATE,
+    "first state": NUMBERS.start(0),
+    "state of scenes": FLOOR.step(FLOOR.start(1), CLIP)[0],
+    "info": INFOS[1],
+    "infos": INFOS,
+    "no infos": Infos(),
+    "belief": mstfilter.Belief(SCENES),
+    "filter": NUMBERS,
+    "preset": mstfilter.preset("mst"),
+}
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_text_and_html_are_short_and_complete(name):
+    text = repr(OBJECTS[name])
+    assert 0 < len(text) <= 300
+    assert len(text.splitlines()) <= 5
+    assert " at 0x" not in text
+    assert "array(" not in text
+    if hasattr(OBJECTS[name], "_repr_html_"):
+        made = OBJECTS[name]._repr_html_()
+        check_html(made)
+        assert text.splitlines()[0].replace("'", "&#x27;") in made
+        assert len(made) < 1_000_000
+
+
+def test_texts_hold_the_facts():
+    assert repr(SCENES.particles[0]).splitlines()[0] == f"Hypothesis of {SCENES.particles[0].n_objects} objects"
+    assert "24 x 24 x 8 voxels of 20 mm" in repr(CLIP)
+    assert "3 frames over 0.4 s" in repr(CLIP)
+    assert repr(STATE.population).startswith("Population: n = 50, float64 (50, 1), ESS ")
+    assert "n = 1000, candidates, 0 built" in repr(OBJECTS["candidates"])
+    assert "log evidence -" in repr(STATE)
+    assert "resampler Systematic" in repr(OBJECTS["preset"])
+
+
+def test_the_texts_of_components_name_changed_fields():
+    for name in preset_names():
+        made = mstfilter.preset(name)
+        for slot in ("transition", "proposal", "update", "resampler"):
+            assert len(repr(getattr(made, slot))) <= 300
+    assert repr(mstfilter.preset("mst").transition) == "TrackingTransition()"
+    assert repr(Tempered()) == "Tempered()"
+
+    class Plain(Transition):
+        def predict(self, rng, population, observation):
+            return population
+
+    assert repr(Plain()) == "Plain()"
+    assert repr(Tempered(power=0.25, scheme=Ssp())) == "Tempered(scheme=Ssp(), power=0.25)"
+
+
+def test_the_front_door_names_classes_that_can_be_shown():
+    for name in ("Recording", "Clip", "Frame", "Hypothesis", "Population", "Belief"):
+        assert name in exported(mstfilter.__file__)
+        assert callable(getattr(mstfilter, name)._repr_html_)
+
+
+def test_plots():
+    for figure, axes in (
+        (RECORDING.plot(), 2 * 6 + 2),  # colour and depth of six pauses, time line, colour bar
+        (SCENES.plot(), None),
+        (STATE.population.plot(), 1),
+        (Population({"a": np.arange(9.0), "b": np.zeros((9, 2))}).plot(), 3),
+    ):
+        assert isinstance(figure, Drawing)
+        assert axes is None or len(figure.axes) == axes
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    bars = STATE.population.plot().axes[0].patches
+    assert sum(bar.get_height() for bar in bars) == pytest.approx(1)
+
+
+def test_progress_is_shown_if_asked(tmp_path, capsys):
+    NUMBERS.run([[0.1]] * 4, seed=0)
+    assert capsys.readouterr() == ("", "")
+    NUMBERS.run([[0.1]] * 4, seed=0, progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "4/4" in err
+    calls = []
+    NUMBERS.run(iter([[0.1]] * 2), seed=0, progress=lambda *call: calls.append(call))
+    assert calls == [(0, None), (1, None), (2, None)]
+    run_many({"a": NUMBERS}, [[0.1]], range(3), progress=True)
+    assert "3/3" in capsys.readouterr().err
+    arrays = Recording.from_arrays(RGB, DEPTH, CAMERA.K)
+    filter_recording(arrays, load_config("floor_one_blob"), tmp_path / "run", progress=True)
+    assert "1/1" in capsys.readouterr().err
