@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from miniature_filters import level_sets
 from miniature_mst import CutProposal, DepthFreeSpace
 from miniature_world import Miniature, Observation
 from scipy.optimize import minimize
@@ -27,7 +26,7 @@ from scipy.special import expit
 
 from mstfilter.mst.completion import Completer, Completion
 from mstfilter.mst.partition import Cells, PairEvidence, PairOdds, PartitionUpdate
-from mstfilter.scene import Evidence, Hypothesis, Occupancy, VoxelGrid, memo
+from mstfilter.scene import Hypothesis, Occupancy, VoxelGrid, memo
 from mstfilter.scene.support import Foreground
 from mstfilter.smc import ParticleFilter, Population, Systematic, Transition, Update
 
@@ -247,25 +246,6 @@ def partition_filter(world: Miniature, n: int, completer: TableCompleter, pairs:
     )
 
 
-@dataclass(frozen=True)
-class ExpectedLikelihood(Evidence):
-    """Scores a candidate by the mean likelihood of the states that it stands for."""
-
-    world: Miniature
-
-    def log_score(self, hypotheses: Sequence[Hypothesis], clip: Any) -> np.ndarray:
-        states = self.world.states
-        likelihood = np.exp(self.world.log_likelihood(clip.after.observation))
-        sets = (level_sets(h.shares) for h in hypotheses)
-        return np.log([sum(q * likelihood[states.index_of_labels(labels)] for labels, q in one) for one in sets])
-
-
-def with_likelihood(world: Miniature, filter: ParticleFilter) -> ParticleFilter:
-    """The filter with four candidates for each hypothesis, weighted by their likelihood."""
-    partition = replace(filter.update.partition, evidence=(ExpectedLikelihood(world),))
-    return replace(filter, update=RowUpdate(partition))
-
-
 def fit(
     world: Miniature, seeds: Iterable[int], n: int = 20, n_steps: int = 6, n_rounds: int = 2
 ) -> tuple[TableCompleter, PairEvidence]:
@@ -287,34 +267,6 @@ def fit(
         table = (counts[1] + _PRIOR * share) / (counts.sum(axis=0) + _PRIOR)
         evidence = _logistic(*(np.concatenate(column) for column in zip(*asked, strict=True)))
     return TableCompleter(table), evidence
-
-
-def components_apart(world: Miniature, exact: np.ndarray, cells: Cells, observation: Observation) -> float:
-    """Total variation between the exact law (S,) of the partition of the readings, and its components drawn apart."""
-    x = cells.readings.pixels[cells.of_reading >= 0]
-    labels = world.states.labels.reshape(-1, *world.shape)[:, x, observation.depth[x]]
-    component = cells.component[cells.of_reading[cells.of_reading >= 0]]
-    apart: dict[tuple[int, ...], float] = {(): 1.0}
-    order = np.argsort(component, kind="stable")
-    for c in np.unique(component):
-        marginal = _patterns(exact, labels[:, component == c])
-        apart = {
-            (*a, *(k and k + max(a, default=0) for k in b)): p * q
-            for a, p in apart.items()
-            for b, q in marginal.items()
-        }
-    joint = _patterns(exact, labels[:, order])
-    return 0.5 * sum(abs(joint.get(k, 0.0) - apart.get(k, 0.0)) for k in joint.keys() | apart.keys())
-
-
-def _patterns(p: np.ndarray, labels: np.ndarray) -> dict[tuple[int, ...], float]:
-    """Probability of each partition in p (S,), of cells with these labels (S, m); objects numbered as they occur."""
-    found: dict[tuple[int, ...], float] = {}
-    for row, probability in zip(labels.tolist(), p.tolist(), strict=True):
-        names = {0: 0}
-        pattern = tuple(names.setdefault(k, len(names)) for k in row)
-        found[pattern] = found.get(pattern, 0.0) + probability
-    return found
 
 
 def _count(

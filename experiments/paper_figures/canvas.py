@@ -16,7 +16,6 @@ from mstfilter.base.files import write_csv
 from mstfilter.scene import Camera, VoxelGrid
 
 PAPER, INK, MUTED, LINE = "#fcfcfa", "#1d2126", "#646b74", "#e1e2e0"
-BLUE, ORANGE, FLOOR = "#336fb9", "#ee9138", "#b26a1c"
 
 
 def page(rows: int, columns: int, width: float, height: float, **layout: Any) -> tuple[Figure, np.ndarray]:
@@ -47,8 +46,7 @@ def voxels(labels: np.ndarray, grid: VoxelGrid, view: Camera, colours: Mapping[i
 def save(figure: Figure, path: Path, dpi: int = 100) -> Path:
     """Write the figure. Equal figures give files with equal bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    metadata = {"Date": None, "Creator": None} if path.suffix == ".svg" else {"Software": None}
-    figure.savefig(path, dpi=dpi, metadata=metadata)
+    figure.savefig(path, dpi=dpi, metadata={"Software": None})
     return path
 
 

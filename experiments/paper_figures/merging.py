@@ -1,4 +1,4 @@
-"""Figure `merging`: merges of two real hypotheses, step by step, and the frequency of merges by formula.
+"""Figure `merging`: merges of two real hypotheses, step by step.
 
 The first row shows a sample, a prediction and their conflict graph. Each of two further rows shows the same random
 order with other merges, the painted objects, and the result of the mode filter. The particles are the authors' (see
@@ -7,13 +7,13 @@ r1.py), and the fusion is the fusion of `paper`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import networkx as nx
 import numpy as np
-from canvas import INK, MUTED, page, save, show, voxels, write_rows
+from canvas import INK, MUTED, page, save, show, voxels
 from matplotlib.axes import Axes
 from r1 import NOTICE, Particles, folder
 
@@ -24,12 +24,9 @@ from mstfilter.mst.crossover import (
     ConflictGraph,
     ConflictResolution,
     Crossover,
-    RandomOrder,
-    SpanningTree,
     Structure,
     assign_labels,
     conflict_graph,
-    merge_probability,
 )
 from mstfilter.runs.presets import REGISTRY, load_config
 
@@ -38,7 +35,6 @@ SEED = 0
 COOL = ("#bfe3c0", "#2ca281", "#12305c", "#336fb9", "#a3d3eb")
 WARM = ("#f7d98b", "#ee9138", "#c9302c", "#5e0d2a", "#e8a0b0")
 Edges = list[tuple[int, int]]
-Chance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -53,12 +49,12 @@ class Replay(Structure):
 
 
 def make(out: Path, smoke: bool) -> list[Path]:
-    """Draw the figure and write the table; returns no paths if the data are missing."""
+    """Draw the figure; returns no paths if the data are missing."""
     found = folder()
     if found is None:
         return []
     particles = Particles(found)
-    return [picture(particles, out / "merging.png", smoke), table(particles, out / "merge_forms.csv", smoke)]
+    return [picture(particles, out / "merging.png", smoke)]
 
 
 def picture(particles: Particles, path: Path, smoke: bool) -> Path:
@@ -173,87 +169,3 @@ def draw_graph(
         axes.text(places[:, 0].mean(), -0.24, "objects of the prediction", ha="center", color=MUTED)
     axes.set(xlim=(places[:, 0].min() - 0.7, places[:, 0].max() + 0.7), ylim=(-0.4, 1.4))
     axes.set_axis_off()
-
-
-#: Name, formula with child n1, parent n2 and I common voxels, and the probability itself.
-FORMS: tuple[tuple[str, str, Chance], ...] = (
-    ("paper as printed", "min(1, IoU n2 / n1^2)", lambda i, a, b: merge_probability("printed", i, a, b)),
-    ("authors' program", "min(1, I n2 / n1^2)", lambda i, a, b: merge_probability("share", i, a, b)),
-    (
-        "paper with its dimensions mended",
-        "min(1, IoU n2 / n1)",
-        lambda i, a, b: np.minimum(1, i / (a + b - i) * b / a),
-    ),
-    ("IoU", "IoU", lambda i, a, b: i / (a + b - i)),
-    ("containment", "I / n1", lambda i, a, b: i / a),
-    ("containment of the smaller", "I / min(n1, n2)", lambda i, a, b: i / np.minimum(a, b)),
-)
-STRUCTURES: tuple[tuple[str, Structure], ...] = (
-    ("random order", RandomOrder()),
-    ("spanning tree", SpanningTree()),
-)
-
-
-def table(particles: Particles, path: Path, smoke: bool) -> Path:
-    """Write how often each form of the merge probability merges the conflicts of all 25 pairs.
-
-    The columns ``mean`` to ``at 1`` count every conflict in both directions. For each structure, the table has the
-    share of the drawn edges along which a merge happens, and the mean number of objects after all merges.
-    """
-    graphs = [conflict_graph(s.labels, p.labels) for s in particles.samples for p in particles.predictions]
-    both = [np.concatenate([g.intersection] * 2) for g in graphs]
-    child = [np.concatenate([g.size[g.edges[:, 0]], g.size[g.edges[:, 1]]]) for g in graphs]
-    parent = [np.concatenate([g.size[g.edges[:, 1]], g.size[g.edges[:, 0]]]) for g in graphs]
-    chances = {
-        form: chance(*(np.concatenate(x).astype(float) for x in (both, child, parent))) for form, _, chance in FORMS
-    }
-    rounds = 2 if smoke else 100
-    drawn = {name: list(edges_of(structure, graphs, rounds)) for name, structure in STRUCTURES}
-    rows = []
-    for form, formula, chance in FORMS:
-        p = chances[form]
-        row = [
-            form,
-            formula,
-            len(p),
-            float(p.mean()),
-            float(np.median(p)),
-            float((p < 0.01).mean()),
-            float((p == 1).mean()),
-        ]
-        for name, _ in STRUCTURES:
-            row += merged(graphs, drawn[name], chance)
-        rows.append(row)
-    named = [f"{what}: {name}" for name, _ in STRUCTURES for what in ("merges", "objects")]
-    columns = ["form", "formula", "directed conflicts", "mean", "median", "below 1 %", "at 1", *named]
-    return write_rows(path, columns, rows)
-
-
-def edges_of(structure: Structure, graphs: Sequence[ConflictGraph], rounds: int) -> list[tuple[int, np.ndarray]]:
-    """Index of the graph and directed edges (m, 2), for each of `rounds` draws of each graph."""
-    rng, found = np.random.default_rng(SEED), []
-    for k, graph in enumerate(graphs):
-        links = graph.networkx()
-        for _ in range(rounds):
-            edges = [e for c in graph.components() for e in structure.draw(rng, links, c)[1]]
-            found.append((k, np.array(edges).reshape(-1, 2)))
-    return found
-
-
-def merged(graphs: Sequence[ConflictGraph], drawn: Sequence[tuple[int, np.ndarray]], chance: Chance) -> list[float]:
-    """Share of drawn edges that merge, and mean number of objects afterwards."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    rng, total, n_edges, objects = np.random.default_rng(SEED + 1), 0, 0, []
-    for k, edges in drawn:
-        graph = graphs[k]
-        common = np.zeros((len(graph), len(graph)))
-        a, b = graph.edges.T
-        common[a, b] = common[b, a] = graph.intersection
-        child, parent = edges.T
-        yes = rng.random(len(edges)) < chance(common[child, parent], graph.size[child], graph.size[parent])
-        links = coo_matrix((np.ones(yes.sum()), edges[yes].T), shape=(len(graph), len(graph)))
-        objects.append(connected_components(links, directed=False)[0])
-        total, n_edges = total + int(yes.sum()), n_edges + len(edges)
-    return [total / n_edges, float(np.mean(objects))]

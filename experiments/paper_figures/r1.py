@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from mstfilter.scene import Hypothesis, VoxelGrid
-from mstfilter.scoring import weighted_coverage
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -28,7 +27,7 @@ def folder() -> Path | None:
 
 @dataclass(frozen=True)
 class Particles:
-    """R1 at t = 1: samples, predictions, and the fused hypotheses of the authors' program.
+    """R1 at t = 1: samples and predictions of the authors' program.
 
     Parameters
     ----------
@@ -59,26 +58,6 @@ class Particles:
     def predictions(self) -> tuple[Hypothesis, ...]:
         """Five hypotheses at t = 0, moved to t = 1 and without voxels in free space."""
         return self._hypotheses(self._load("freespace_refined", "labels")[0], 0)
-
-    @cached_property
-    def estimates(self) -> tuple[Hypothesis, ...]:
-        """The five fused hypotheses (of 125) that the authors' program kept."""
-        return self._hypotheses(self._load("estimate", "labels")[0], 1)
-
-    @cached_property
-    def log_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Log weights (5,) of samples, of predictions, and the predictions' shares (5,) outside free space."""
-        measured = self._load("measurement", "weight")
-        return measured[1, :5], measured[0, :5], self._load("freespace_refined", "weight")[0]
-
-    def partition(self, labels: np.ndarray) -> np.ndarray:
-        """Reference for scoring a hypothesis: its voxels divided into can (2) and carton (1)."""
-        can = self._load("pseudo_truth", "can_footprint")[1].astype(bool)
-        return np.where(labels > 0, np.where(can[:, :, None], 2, 1), 0).astype(np.uint16)
-
-    def score(self, labels: np.ndarray) -> float:
-        """Objects quality against `partition`. It measures segmentation only, not missing or invented voxels."""
-        return weighted_coverage(labels, self.partition(labels))
 
 
 NOTICE = "Particles: Copyright (c) 2020 The Autonomous Robotic Manipulation Lab, MIT licence."

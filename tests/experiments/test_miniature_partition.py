@@ -16,13 +16,12 @@ from miniature_partition import (
     CellView,
     KnownPush,
     TableCompleter,
-    components_apart,
     fit,
     partition_filter,
 )
 from miniature_world import Miniature, Observation
 
-from mstfilter.mst.partition import Cells, PairEvidence, Readings
+from mstfilter.mst.partition import PairEvidence
 from mstfilter.scene import Occupancy
 from mstfilter.smc import Population
 from tests.experiments.test_miniature_world import ids
@@ -85,26 +84,6 @@ def test_the_table_is_asked_about_what_the_observation_and_the_latest_view_show(
     np.testing.assert_allclose(completion.probability, expected, rtol=1e-6)
     np.testing.assert_array_equal(view.cells, np.where(now <= BEHIND, now, 3))
     np.testing.assert_array_equal(completer.log[0][1], np.stack([now, past]))
-
-
-def test_components_that_depend_on_each_other_cost_what_their_dependence_is():
-    world = Miniature((4, 1))
-    index = world.states.index_of_labels
-    readings = Readings(np.arange(4), np.zeros((4, 3), int), (1, 4))
-
-    def cells_of(sample):
-        return Cells(readings, np.arange(4), np.array([sample]), np.zeros((0, 4), int))
-
-    cells = cells_of([1, 1, 2, 2])
-    observation = Observation(np.zeros(4, int), np.ones(3, bool))
-    together, apart = index(np.array([1, 1, 2, 2])), index(np.array([1, 2, 3, 4]))
-    p = np.zeros(len(world.states))
-    p[[together, apart]] = 0.5
-    assert components_apart(world, p, cells, observation) == pytest.approx(0.5)
-    p[[index(np.array([1, 1, 2, 3])), index(np.array([1, 2, 3, 3]))]] = 0.5
-    assert components_apart(world, p / p.sum(), cells, observation) == pytest.approx(0)
-    one = cells_of([1, 1, 1, 1])
-    assert components_apart(world, world.prior, one, observation) == pytest.approx(0)
 
 
 def test_a_fit_learns_that_surface_is_occupied_and_is_the_same_again():

@@ -8,7 +8,6 @@ import shutil
 import numpy as np
 import pytest
 
-from mstfilter import smc
 from mstfilter.base.files import read_csv
 from mstfilter.base.resources import models_folder
 from mstfilter.base.trained import open_model
@@ -39,19 +38,6 @@ def test_smoothing(tmp_path):
     assert methods == ["exact", "mcmc", "mcmc, 3 steps", "genealogy"]
 
 
-def test_partition_fit(tmp_path):
-    """What is known of a pair beats knowing nothing (log 2), also if the past is of another scene and is weighed."""
-    run_script("partition_fit/run.py", "--smoke", "--out", tmp_path)
-    rows = {row["evidence"]: row for row in read_csv(tmp_path / "fit.csv")}
-    assert list(rows) == ["image", "past", "both, past right", "both"]
-    assert all(float(row[past]) < math.log(2) for row in rows.values() for past in ("video", "two frames"))
-    assert float(rows["both"]["stranger"]) < math.log(2)  # most objects of a wrong past are refuted before
-    pairs = np.load(tmp_path / "pairs/demo-0.npz")
-    for found in (pairs[past] for past in pairs):  # of one pause, given each of five predictions
-        assert found[:, 7].sum() == pytest.approx(5) and ((found[:, 6] >= 0) & (found[:, 6] <= 1)).all()
-        np.testing.assert_allclose(found[:, 0] + found[:, 2], 1)  # the past is wrong, or right
-
-
 def test_calibration_of_the_partition_update(tmp_path):
     """The losses that are minimised are those of the table, and a forecast is better than knowing nothing."""
     run_script("partition_fit/calibration.py", "--smoke", "--out", tmp_path)
@@ -70,24 +56,6 @@ def test_controls(tmp_path):
     # An object moved, and following it is better than leaving it.
     assert float(rows["moved: mst in order"]["mean"]) > float(rows["moved: frozen in order"]["mean"])
     assert "'scene'" not in run_script(*arguments), "finished scenes are not run again"
-
-
-POLICIES = ("random", "information", "one hypothesis", "least sure")
-
-
-def test_decisions(tmp_path):
-    arguments = ("decisions/run.py", "--smoke", "--out", tmp_path)
-    run_script(*arguments)
-    rows = read_csv(tmp_path / "runs.csv")
-    assert len(rows) == 2 * 4 * 2 and {r["k"] for r in rows} == {"0", "1"}
-    start = {(r["scene"], r["coverage"]) for r in rows if r["k"] == "0"}
-    assert len(start) == 2, "all policies start from the same belief about the same scene"
-    quality = {p: [float(r["quality"]) for r in rows if (r["policy"], r["k"]) == (p, "1")] for p in POLICIES}
-    for r in read_csv(tmp_path / "summary.csv"):
-        if (r["score"], r["pushes"]) == ("quality", "1"):
-            expected = (sum(quality[r["policy"]]) - sum(quality["random"])) / len(quality["random"])
-            assert float(r["difference"]) == pytest.approx(expected, abs=2e-4)
-    assert {r["policy"] for r in read_csv(tmp_path / "summary.csv")} == set(POLICIES) - {"random"}
 
 
 def test_past(tmp_path):
@@ -109,21 +77,6 @@ def test_past(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
     run_script(*arguments)
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "counts").iterdir()}
-
-
-def test_families(tmp_path):
-    arguments = ("families/run.py", "--smoke", "--out", tmp_path)
-    run_script(*arguments)
-    difficulty, counts = read_csv(tmp_path / "difficulty.csv"), read_csv(tmp_path / "counts.csv")
-    assert [row["seed"] for row in difficulty] == [row["seed"] for row in counts] == ["0", "1"]
-    assert all(row["restless"] == row["left_workspace"] == row["without_voxels"] == "0" for row in counts)
-    assert all(float(row["single_frame_image"]) > float(row["one_blob_image"]) for row in difficulty)
-    assert {row["measure"] for row in read_csv(tmp_path / "summary.csv")} >= {"single_frame_image", "hidden"}
-    # A finished scene is not run again: a row that was changed by hand stays.
-    text = (tmp_path / "counts.csv").read_text()
-    (tmp_path / "counts.csv").write_text(text.replace(counts[0]["median_pixels"], "1.5"))
-    run_script(*arguments)
-    assert read_csv(tmp_path / "counts.csv")[0]["median_pixels"] == "1.5"
 
 
 def test_large_images():
@@ -220,15 +173,6 @@ def test_osd_frames(tmp_path):
         assert r[floor] == committed[r["frame"]][floor]
 
 
-def test_resampling(tmp_path):
-    arguments = ("resampling/run.py", "--smoke", "--out", tmp_path)
-    run_script(*arguments)
-    rows = read_csv(tmp_path / "summary.csv")
-    assert {r["scheme"] for r in rows} == {*smc.__components__["resampler"], "kdpp"}
-    assert not [r for r in rows if r["measure"].startswith("log_evidence") and r["scheme"] == "keep_weights"]
-    assert run_script(*arguments, "--only", "plain") == "", "finished parts are not run again"
-
-
 def test_inference(tmp_path):
     arguments = ("inference/run.py", "--smoke", "--out", tmp_path)
     assert "particle_gibbs: 4 data sets" in run_script(*arguments)
@@ -249,12 +193,3 @@ def test_newcomer(tmp_path):
     rows = read_csv(tmp_path / "hour.csv")
     assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer", "notebook"}
     assert [row["step"] for row in rows if row["fault"]] == []
-
-
-def test_planted_faults(tmp_path):
-    """Some faults of the lists are named, and some right components are not rejected."""
-    faults = ["SortedNoise", "Coin", "EachTwice", "LogOfNegative", "Cosine", "Flat"]
-    right = ["Drift", "LoopUpdate", "Blob", "UniformDensity", "Same"]
-    names = [*faults, *right]
-    out = run_script("planted/run.py", "--only", *names, "--out", tmp_path)
-    assert "named 6 of 6 faults, rejected 0 of 5 right ones" in out

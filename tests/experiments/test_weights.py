@@ -80,10 +80,6 @@ def test_small_forms(tmp_path):
     at_1 = {row["question"]: row for row in rows if row["temperature"] == "1.0"}
     assert {"component", "image", "scene"} <= set(at_1)
     assert all(0 <= float(row["frequency"]) <= 1 and float(row["log_loss"]) >= 0 for row in at_1.values())
-    run_script("weights/pairs.py", "--smoke", "--out", tmp_path)
-    terms = np.load(tmp_path / "terms/s1-0.npz")["p"]
-    for k in np.unique(terms[:, 0]):  # the probabilities of a component, for each of the odds
-        np.testing.assert_allclose(terms[terms[:, 0] == k, 4:].sum(axis=0), 1, rtol=1e-6)
     run_script("weights/ambiguity.py", "--smoke", "--out", tmp_path)
     assert len(read_csv(tmp_path / "scenes.csv")) == 4
     assert read_csv(tmp_path / "ambiguity.csv")[0]["scenes"] == "all"

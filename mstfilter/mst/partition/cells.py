@@ -20,8 +20,8 @@ f_prediction is the corresponding weighted share of the predictions. The log odd
 R is the probability that a prediction is valid. The update gives one prediction at a time a weight above 0, so
 f_prediction is 0 or 1 there. W <= R is the total weight of the predictions with an object at both
 cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,
-logit(f_image) is not scaled. The coefficient of the predictions was fitted in `experiments/partition_fit`, and the
-constants were chosen in `experiments/weights`.
+logit(f_image) is not scaled. The coefficient of the predictions was fitted to pairs of cells, and the constants were
+chosen in `experiments/weights` (docs/history.md).
 
 The alternatives of a component are its partitions in the samples and in the predictions. If a prediction has no
 object at a cell, each sample in turn determines which predicted object the cell joins. A mixture of the alternatives
