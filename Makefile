@@ -1,17 +1,22 @@
-# Two commands: `make demo` and `make test`. Each makes what it needs first.
+# Two commands: `make demo` and `make test`. Each makes what it needs first. `make nightly` runs the long tests too.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint docs dist clean
+.PHONY: demo test nightly lint docs dist clean
 
 demo: $(STAMP)
 	rm -rf demo
 	$(BIN)/mstfilter demo --out demo
 
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
 test: $(STAMP) lint
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+	$(PYTEST) -m "not nightly"
+
+nightly: $(STAMP) lint
+	$(PYTEST)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from functools import cache
 
+import pytest
+
 from tests.experiments.scripts import EXPERIMENTS, own_modules, run_script
 
 FOLDER = EXPERIMENTS / "paper_figures"
@@ -23,11 +25,13 @@ def script(name):
         return importlib.import_module(name)
 
 
+@pytest.mark.nightly
 def test_simulated_figures(tmp_path):
     make(tmp_path, "teaser", "sampled_cuts")
     assert all((tmp_path / "out" / name).stat().st_size > 2000 for name in SIMULATED)
 
 
+@pytest.mark.nightly
 def test_real_figures(tmp_path, shared_data):
     shared_data("r1")
     make(tmp_path, "merging")

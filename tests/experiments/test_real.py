@@ -107,6 +107,7 @@ def test_the_wall_is_no_object(scores, monkeypatch):
     assert found["covered_objects"] > 0.9
 
 
+@pytest.mark.nightly
 def test_small_form(tmp_path, shared_data):
     shared_data("real/osd_learn")
     run_script("real/run.py", "--smoke", "--out", tmp_path)

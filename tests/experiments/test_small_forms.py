@@ -1,4 +1,4 @@
-"""The scripts of experiments/ run in their small form (`--smoke`) and do not overwrite committed results."""
+"""The scripts of experiments/ run in their small form (`--smoke`)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,9 @@ from mstfilter.base.trained import open_model
 from mstfilter.mst.segmentation import FEATURES, LearnedTree, PairNetwork
 from mstfilter.scene import read_rgb
 from tests.conftest import find_shared
-from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
+from tests.experiments.scripts import EXPERIMENTS, run_script
 
-SCRIPTS = [
-    str(p.relative_to(EXPERIMENTS)) for p in sorted(EXPERIMENTS.glob("*/*.py")) if '"--smoke"' in p.read_text()
-]
-
-
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_small_form_never_overwrites_results(script):
-    assert "would overwrite the" in run_script(script, "--smoke", expected_exit=2)
+pytestmark = pytest.mark.nightly
 
 
 def test_benchmark_of_the_filter(tmp_path):
@@ -149,19 +142,6 @@ def test_miniature(tmp_path):
     assert sum(ranks) == 10 * len(tests)
 
 
-def test_f_of_segments_and_borders():
-    segment_f = import_script("osd_frames/measures.py").segment_f
-    truth = np.zeros((480, 640), np.int64)
-    truth[100:200, 100:200], truth[100:200, 300:400] = 1, 2
-    assert segment_f(truth, truth) == segment_f((3 - truth) * (truth > 0), truth) == (1.0, 1.0)
-    assert segment_f(np.minimum(truth, 1), truth)[0] == 0.5  # half of its pixels are of the object that it matches
-    assert segment_f(np.where(truth == 1, 1, 0), truth) == pytest.approx((2 / 3, 2 / 3))
-    assert segment_f(np.zeros_like(truth), truth) == (0.0, 0.0)
-    overlap, border = segment_f(np.roll(truth, 2, axis=1), truth)  # within 3 pixels, .3 % of the diagonal
-    assert overlap == pytest.approx(0.98) and border == 1
-    assert segment_f(np.roll(truth, 10, axis=1), truth)[1] < 0.6
-
-
 def test_osd_frames(tmp_path):
     find_shared("real/osd_learn/learn0_rgb.png")
     run_script("osd_frames/run.py", "--smoke", "--out", tmp_path)
@@ -186,7 +166,6 @@ def test_inference(tmp_path):
     assert "4 data sets" not in run_script(*arguments).split("chi-square")[0], "finished data sets are not run again"
 
 
-@pytest.mark.slow
 def test_newcomer(tmp_path):
     """The first hour of a new user: commands of the documentation in processes of their own."""
     assert "0 failed" in run_script("newcomer/run.py", "--smoke", "--out", tmp_path)

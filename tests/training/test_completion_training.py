@@ -109,6 +109,7 @@ def test_earlier_views_are_evidence_about_the_object():
     assert compared >= 1
 
 
+@pytest.mark.nightly
 def test_training_learns_resumes_and_is_used(files, tmp_path):
     """The log loss after a few steps is below that of extrusion with the best probability inside and outside."""
     torch.set_num_threads(1)
