@@ -18,7 +18,7 @@ from mst_training.scenes import draw_camera, draw_scene
 from mst_training.shapes import HELD_OUT, TRAINED, draw_training_shape
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import read_csv
-from mstfilter.base.trained import open_model
+from mstfilter.base.trained import open_model, write_model
 from mstfilter.lab.simulation.shapes import label_voxels
 from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.mst.completion.crops import extruded
@@ -165,16 +165,31 @@ def test_settings():
         CompletionTraining.recipe("fast")
 
 
+def test_steps_on_a_batch_lower_its_loss(samples):
+    torch.manual_seed(0)
+    settings = replace(SMALL, half_precision=False)
+    networks, (batch,) = settings.networks(), settings.batches(samples, 0, 1)
+    optimiser, losses = torch.optim.AdamW(networks["net"].parameters(), lr=1e-2), []
+    for step in range(8):
+        total, figures = settings.loss(networks, step, batch)
+        optimiser.zero_grad()
+        total.backward()
+        optimiser.step()
+        losses.append(figures[0])
+    assert losses[-1] < 0.8 * losses[0]
+
+
 def test_training_starts_from_a_model(files, tmp_path):
-    """At a learning rate of zero, the result is the model."""
+    """At a learning rate of zero, the result is the model, whose file has half precision."""
     for name in ("train", "validation", "test"):
         (tmp_path / f"a/samples/{name}").mkdir(parents=True)
         shutil.copy(files[0], tmp_path / f"a/samples/{name}/scenes-000000.npz")
-    model = open_model("completion")
-    width, n = (model.description["network"][name] for name in ("width", "n_globals"))
-    run_training(replace(SMALL, start="completion", width=width, n_globals=n, rate=0.0, steps=1), tmp_path / "a")
-    for name, tensor in model.tensors.items():
-        assert np.allclose(open_model(str(tmp_path / "a")).tensors[name], tensor, atol=1e-6)
+    torch.manual_seed(1)
+    tensors = {name: t.half().float().numpy() for name, t in SMALL.networks()["net"].state_dict().items()}
+    write_model(tmp_path / "start", {"architecture": SMALL.architecture}, tensors)
+    run_training(replace(SMALL, start=str(tmp_path / "start"), rate=0.0, steps=1), tmp_path / "a")
+    for name, tensor in open_model(str(tmp_path / "a"), SMALL.architecture).tensors.items():
+        np.testing.assert_allclose(tensor, tensors[name], atol=1e-6)
 
 
 def test_sizes_of_training_shapes():
