@@ -23,7 +23,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"
 SMALL = "simulate demo demo/recording n_actions=1 n_objects_min=2 n_objects_max=2 supersample=false"
 REMOVE = "import shutil; shutil.rmtree('demo/recording'); print('removed')"
-NOTEBOOKS = ("tutorial", "own-component", "comparing", "beliefs", "inputs")
 #: What the documentation says that a command prints.
 SHOWN = {
     "demo": r"report +demo/report.html",
@@ -70,18 +69,6 @@ with open("bedroom/camera_intrinsic.json", "w") as file:
 print(os.listdir("bedroom"))
 """
 )
-#: A notebook: the cells of a page, executed by Jupyter.
-NOTEBOOK = """
-import re, sys
-from pathlib import Path
-import nbclient, nbformat
-text = Path(sys.argv[1]).read_text()
-cells = re.findall(r"^```{code-cell}\\n(?::[^\\n]*\\n)*(.*?)```", text, flags=re.DOTALL | re.MULTILINE)
-book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
-book = nbclient.NotebookClient(book, timeout=600, kernel_name="python3").execute()
-shown = [kind for cell in book.cells for output in cell.outputs for kind in output.get("data", {})]
-print(len(cells), "cells executed,", shown.count("image/png"), "pictures")
-"""
 
 
 class Step(NamedTuple):
@@ -134,8 +121,6 @@ def steps(smoke: bool) -> list[Step]:
     for kind in ("evidence",) if smoke else starter_kinds("scenes"):
         found.append(plan("every kind", f"mstfilter new {kind} my_{kind}.py"))
     found.append(plan("viewer", "mstfilter view runs/mine --out run.html"))
-    for name in ("comparing",) if smoke else NOTEBOOKS:
-        found.append(Step("notebook", ["-c", NOTEBOOK, str(DOCS / f"{name}.md")], f"docs/{name}.md"))
     return found
 
 

@@ -170,5 +170,5 @@ def test_newcomer(tmp_path):
     """The first hour of a new user: commands of the documentation in processes of their own."""
     assert "0 failed" in run_script("newcomer/run.py", "--smoke", "--out", tmp_path)
     rows = read_csv(tmp_path / "hour.csv")
-    assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer", "notebook"}
+    assert {row["part"] for row in rows} >= {"demo", "own arrays", "own component", "study", "viewer"}
     assert [row["step"] for row in rows if row["fault"]] == []
