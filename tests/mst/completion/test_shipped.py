@@ -8,7 +8,6 @@ import pytest
 from mst_training.completion import shape_iou
 from mst_training.completion_data import CompletionSamples
 from mst_training.shapes import HELD_OUT, TRAINED
-from mstfilter.base.resources import models_folder
 from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.mst.completion.crops import extruded
 from mstfilter.scene import Seen
@@ -34,12 +33,3 @@ def test_better_than_extrusion_on_new_scenes(samples):
     for low, high in ((0.02, 0.3), (0.3, 0.7), (0.7, 0.999)):
         bin_ = asked & (p >= low) & (p < high)
         assert abs(p[bin_].mean() - samples.truth[bin_].mean()) < 0.12
-
-
-def test_size_and_card():
-    folder = models_folder() / "completion"
-    assert sum(path.stat().st_size for path in folder.iterdir()) < 8e6
-    card = (folder / "README.md").read_text()
-    for part in ("mstfilter train completion", "MIT", "IoU", "not trained on", "Limits"):
-        assert part in card
-    assert NetworkCompleter().weights_key

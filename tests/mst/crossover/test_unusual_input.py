@@ -46,22 +46,6 @@ def test_grids_that_differ(grid, found):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (((0, 0, 0), 0.01, (0, 8, 7)), r"shape is \(0, 8, 7\)"),
-        (((0, 0, 0), 0.01, (9.5, 8, 7)), r"shape is \(9.5, 8, 7\)"),
-        (((0, 0, 0), 0.01, 9), "shape is 9"),
-        (((0, 0, 0), "fine", (9, 8, 7)), "voxel size is 'fine'"),
-        (((0, 0, 0), [0.01, 0.02], (9, 8, 7)), "voxel size is .0.01, 0.02."),
-        (((0, 0, "low"), 0.01, (9, 8, 7)), "origin is .*low"),
-    ],
-)
-def test_invalid_grids_raise_an_error(arguments, message):
-    with pytest.raises(InputError, match=message):
-        VoxelGrid(*arguments)
-
-
-@pytest.mark.parametrize(
     ("wrong", "message"),
     [
         (-A.astype(int), "from -3 to 0"),

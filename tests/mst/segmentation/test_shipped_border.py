@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from mst_training.border_data import BorderSamples, targets
-from mstfilter.base.resources import models_folder
 from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary
 from mstfilter.mst.segmentation.border_network import encode_image, load_border_network, near_objects, reduced
 from mstfilter.scene import Camera, Frame, look_at
@@ -58,14 +57,6 @@ def test_the_correction_lowers_the_log_loss_of_pairs_on_new_images():
     linear, sign = x @ np.array(list(weights.values())), np.where(different, 1, -1)
     losses = [np.average(np.logaddexp(0, -sign * l), weights=weight) for l in (linear + correction(x), linear)]
     assert losses[0] < losses[1] < np.log(2)
-
-
-def test_size_and_card():
-    sizes = [path.stat().st_size for name in ("border", "completion") for path in (models_folder() / name).iterdir()]
-    assert sum(sizes) < 8e6
-    card = (models_folder() / "border/README.md").read_text()
-    for part in ("mstfilter train border", "MIT", "not used in training", "Limits"):
-        assert part in card
 
 
 def test_the_network_sees_the_depth_images_of_its_training():
