@@ -11,6 +11,8 @@ from mst_training.shapes import HELD_OUT, TRAINED
 from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.mst.completion.crops import extruded
 from mstfilter.scene import Seen
+from tests.mst.completion.test_completion import iou, masks_of, placed
+from tests.mst.segmentation.scenes import GRID, TWO, frame_of
 
 SEED = 99  # of no training
 
@@ -21,6 +23,14 @@ def samples(tmp_path_factory) -> CompletionSamples:
     return CompletionSamples.read(files)
 
 
+def test_two_boxes():
+    frame = frame_of(TWO, width=320, noise=0.3)
+    made = NetworkCompleter().complete(np.random.default_rng(0), frame, masks_of(TWO, frame), GRID)
+    for k, one in enumerate(made, start=1):
+        assert iou(placed(one) >= 0.5, k == TWO) > 0.85
+
+
+@pytest.mark.nightly
 def test_better_than_extrusion_on_new_scenes(samples):
     """About 40 masks of each of four scenes. On the 50 test scenes of the card the difference is of similar size."""
     boxes = [samples.box(k) for k in range(len(samples))]

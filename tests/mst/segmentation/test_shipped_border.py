@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mst_training.border_data import BorderSamples, targets
 from mstfilter.mst.segmentation import BorderTree, ColourDepthBoundary
@@ -42,6 +43,7 @@ def test_the_tree_has_weights_for_the_evidence():
     assert np.isfinite(tree.odds).all() and tree.n_leaves > 2 and BorderTree().weights_key
 
 
+@pytest.mark.nightly
 def test_the_correction_lowers_the_log_loss_of_pairs_on_new_images():
     """Pairs of regions in twelve images of two scenes. Log loss .016 with the correction and .020 without."""
     correction, (weights, _) = BorderTree().correction(), BorderTree().model()

@@ -176,7 +176,7 @@ def test_streams_in_several_threads_have_the_results_of_one():
     def run(k):
         found = []
         with mstfilter.Stream(CAMERA.K, FAST, seed=k, pauses=None, threads=2, on_pause=found.append) as stream:
-            for j in range(0, len(SHIFTS), 4):
+            for j in range(0, len(SHIFTS), 8):
                 stream.push(RGB[j], DEPTH[j], TIMES[j], pause=True, wait=True)
         return [arrays(pause.state) for pause in found]
 
