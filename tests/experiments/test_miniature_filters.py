@@ -56,7 +56,7 @@ def test_one_step_of_the_guided_filter_has_the_exact_evidence(world):
         assert state.log_evidence == pytest.approx(exact.log_evidence[0], abs=1e-10)
 
 
-@pytest.mark.parametrize("name", PROPER)
+@pytest.mark.parametrize("name", [pytest.param("bootstrap", marks=pytest.mark.nightly), "guided", "balanced"])
 @ids
 def test_the_evidence_is_unbiased(name, world):
     """On data whose estimates are not skewed (spread below a half), so that few runs show their mean."""
@@ -167,7 +167,7 @@ def ranks_of(filter, world, n_worlds):
     return {name: np.array(r) for name, r in out.items()}
 
 
-@pytest.mark.parametrize("name", ["exact", "guided", "balanced"])
+@pytest.mark.parametrize("name", ["exact", "guided", pytest.param("balanced", marks=pytest.mark.nightly)])
 def test_ranks_of_a_proper_filter_are_uniform(name):
     """Four statistics: together they reject a right filter with probability 4 FALSE_ALARM."""
 

@@ -10,6 +10,8 @@ from tests.experiments.scripts import EXPERIMENTS, own_modules
 
 POINTS = {"run": 6, "run --replace": 6, "study": 2, "simulate": 2, "save_recording": 9, "demo": 3, "write_masks": 18}
 
+LONG = ("study", "simulate", "demo")
+
 
 @pytest.fixture(scope="module")
 def battery(recordings):
@@ -33,7 +35,9 @@ def trials(battery, name, root, points):
     }
 
 
-@pytest.mark.parametrize("name", POINTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] * (name in LONG)) for name in POINTS]
+)
 def test_a_stopped_command_is_repeated_to_the_same_bytes(battery, tmp_path, name):
     found = trials(battery, name, tmp_path, POINTS[name])
     assert {where: result for where, result in found.items() if result != "same"} == {}
