@@ -67,6 +67,7 @@ __components__ = {
         "coalesced": "Coalesced",
         "tempered": "Tempered",
         "shuffled": "Shuffled",
+        "sized": "Sized",
         "sorted": "Sorted",
         "keep_weights": "KeepWeights",
     },

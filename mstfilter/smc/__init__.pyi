@@ -128,6 +128,7 @@ from mstfilter.smc.wrapped_resampling import (
     KeepWeights as KeepWeights,
     ResamplerWrapper as ResamplerWrapper,
     Shuffled as Shuffled,
+    Sized as Sized,
     Sorted as Sorted,
     Tempered as Tempered,
     coalesce as coalesce,

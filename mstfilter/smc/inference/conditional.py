@@ -94,7 +94,7 @@ def _observations(observations: Sequence[Any], path: Particles | None) -> list[A
 
 
 def _check_conditional(filter: ParticleFilter) -> None:
-    for slot in ("proposal", "lookahead", "rejuvenation", "size"):
+    for slot in ("proposal", "lookahead", "rejuvenation"):
         if getattr(filter, slot) is not None:
             raise InputError(
                 f"conditional SMC does not know a filter with `{slot}`", "use a bootstrap or guided filter"
