@@ -20,7 +20,6 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, missing_library
 from mstfilter.smc.interfaces import Info, State
-from mstfilter.smc.population import flat_columns
 
 Collector = Callable[[State, Info], Any]
 
@@ -108,6 +107,16 @@ class History(Mapping[str, np.ndarray]):
             for name, a in self.values_.items()
         }
         return xarray.Dataset(data, coords=dict(self.coords))
+
+
+def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
+    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
+    columns = {}
+    for name, a in arrays.items():
+        a = np.asarray(a)
+        for k in np.ndindex(a.shape[axes:]):
+            columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
+    return columns
 
 
 def _summary(name: str, a: np.ndarray) -> str:

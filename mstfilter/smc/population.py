@@ -188,7 +188,9 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
         wrong = np.flatnonzero(~(lw < np.inf))
         raise InputError(
             f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)",
-            *(["is the observation NaN? one that is missing is None"] if np.isnan(lw).all() else []),
+            "is the observation NaN? one that is missing is None"
+            if np.isnan(lw).all()
+            else "is a parameter of a distribution out of range, such as a negative scale?",
         )
     if top == -np.inf:
         raise LostRunError(
@@ -303,6 +305,16 @@ class Population:
         """Number of particles of the previous population that have descendants; 0 if the parents are unknown."""
         previous = self.parents.get("previous", np.zeros(0, np.int64))
         return len(np.unique(previous[previous >= 0]))
+
+    def known_parents(self) -> np.ndarray:
+        """(n,) indices of the parents in the previous population; InputError if a particle has no known parent."""
+        index = self.parents.get("previous")
+        if index is None or (index < 0).any():
+            raise InputError(
+                f"{'no' if index is None else 'not every'} particle has a known parent",
+                "a filter with a proposal of new particles has no paths",
+            )
+        return index
 
     @property
     def best(self) -> Any:
@@ -423,16 +435,6 @@ def digest_of(population: Population) -> str:
         if isinstance(a, np.ndarray) and a.dtype != object:
             found.update(f"{name} {a.dtype.str} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
     return found.hexdigest()
-
-
-def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
-    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
-    columns = {}
-    for name, a in arrays.items():
-        a = np.asarray(a)
-        for k in np.ndindex(a.shape[axes:]):
-            columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
-    return columns
 
 
 def _kind(particles: Particles) -> str:

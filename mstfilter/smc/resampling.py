@@ -251,6 +251,15 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
     return np.minimum(index, (cumulative < total).sum(axis=1))
 
 
+def draw_log(rng: np.random.Generator, log_weights: np.ndarray) -> np.ndarray:
+    """Draw one index for each row of log weights (n, m); InputError for a row without a finite maximum."""
+    top = log_weights.max(axis=1, keepdims=True)
+    if not np.isfinite(top).all():
+        row = int(np.argmin(np.isfinite(top[:, 0])))
+        raise InputError(f"the largest log weight of row {row} is {top[row, 0]}, so no index can be drawn")
+    return draw_rows(np.exp(log_weights - top), rng.random(len(log_weights)))
+
+
 def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:
     """(n,) indices, sorted, drawn independently by weights (m,)."""
     return search(weights, ordered_uniforms(rng, n), ascending=True)

@@ -15,14 +15,13 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inference.smoothing import draw_log
 from mstfilter.smc.inputs import check_observations, same_component, split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
 from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, program_step, run_program
 from mstfilter.smc.models.programs.handlers import GivenHandler
 from mstfilter.smc.models.state_space import Dynamics, Prior
 from mstfilter.smc.population import Particles, Population, count_particles, take
-from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.resampling import Multinomial, draw_log
 from mstfilter.smc.streams import Key
 
 _FIRST = np.zeros(1, np.int64)  # the row of the particle that follows the given path

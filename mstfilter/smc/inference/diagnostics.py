@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, check_integer
+from mstfilter.base.errors import InputError, check_integer, naming
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inference.smoothing import known_parents
 from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.wrapped_resampling import Coalesced, ResamplerWrapper
@@ -153,7 +152,8 @@ def run_variance(
         if info.t == 0:
             ancestry.begin(info.n_candidates)
             first = np.arange(info.n_candidates)
-        parents = known_parents(population, info.t) if info.t else population.parents.get("ancestor", first)
+        with naming(f"step {info.t}"):
+            parents = population.known_parents() if info.t else population.parents.get("ancestor", first)
         ancestry.descend(watched.selections, parents, population.weights)
         watched.selections.clear()
         if info.t > 0 and lag is not None:

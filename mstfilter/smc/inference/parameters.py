@@ -31,11 +31,11 @@ import numpy as np
 from mstfilter.base.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
-from mstfilter.smc.history import log_evidence
+from mstfilter.smc.history import flat_columns, log_evidence
 from mstfilter.smc.inference.conditional import conditional_path
+from mstfilter.smc.inference.metropolis import metropolis
 from mstfilter.smc.inputs import check_observations, split_input
-from mstfilter.smc.models.state_space import metropolis
-from mstfilter.smc.population import Particles, flat_columns, union
+from mstfilter.smc.population import Particles, union
 from mstfilter.smc.streams import Key
 from mstfilter.smc.sweep import can_sweep, sweep_runs
 
