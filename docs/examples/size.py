@@ -33,6 +33,7 @@ class MySize(Size):
     n_max: int = 1000
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.n_max < self.n_min:
             raise InputError(f"n_max is {self.n_max}, less than n_min, {self.n_min}")
 

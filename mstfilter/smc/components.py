@@ -213,6 +213,7 @@ class Kld(Size):
     n_max: int = 100_000
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_integer("n_max", self.n_max, f"n_min is {self.n_min}", at_least=self.n_min)
 
     def choose(self, population: Population) -> int:

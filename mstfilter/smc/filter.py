@@ -108,6 +108,7 @@ class ParticleFilter(AtStep):
     step_functions: ClassVar = {slot: None for slot in _SLOTS if slot not in _WITHOUT_STEP}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
         if self.lookahead is not None and self.resample == "after":

@@ -111,6 +111,7 @@ class RandomWalkMove(Rejuvenation):
     step_functions: ClassVar = {"model": None}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         scale = np.asarray(self.scale, dtype=np.float64)
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")

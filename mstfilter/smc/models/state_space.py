@@ -39,7 +39,7 @@ from mstfilter.smc.first_steps import (
     first_difference,
     spread_rows,
 )
-from mstfilter.smc.inputs import AtStep, check_signature, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep, check_signature
 from mstfilter.smc.interfaces import (
     DensityTransition,
     Distribution,
@@ -110,27 +110,14 @@ class StateSpaceModel(AtStep):
                 )
             check_signature(name, function, 1)
 
-        def sample(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
-            new = as_distribution(transition(x, **step)).sample(rng, count_particles(x))
-            return _of_shape("transition", new, x)
-
-        def log_density(previous: Any, new: Any, **step: Any) -> np.ndarray:
-            return _log_state(as_distribution(transition(previous, **step)), new)
-
-        def log_likelihood(x: Any, y: Any, **step: Any) -> np.ndarray:
-            return _log_likelihood(as_distribution(observation(x, **step)), y)
-
-        def sample_observation(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
-            return as_distribution(observation(x, **step)).sample(rng, count_particles(x))
-
-        moves, observes = step_parameters(transition, 1), step_parameters(observation, 1)
+        model = _Densities(transition, observation)
         return cls(
             first.sample,
-            with_step(sample, moves),
-            with_step(log_likelihood, observes),
+            model.sample_transition,
+            model.log_likelihood,
             partial(_log_state, first),
-            with_step(log_density, moves),
-            sample_observation=with_step(sample_observation, observes),
+            model.log_transition,
+            model.sample_observation,
         )
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
@@ -145,6 +132,28 @@ class StateSpaceModel(AtStep):
                 "give StateSpaceModel its log densities, or use .of(); a singular covariance has none",
             )
         return found
+
+
+@dataclass(frozen=True)
+class _Densities(AtStep):
+    """The functions of a model whose x_t and y_t have distributions given the particles."""
+
+    transition: Callable[..., Any]
+    observation: Callable[..., Any]
+    step_functions: ClassVar = {"transition": 1, "observation": 1}
+
+    def sample_transition(self, rng: np.random.Generator, x: Any) -> np.ndarray:
+        new = as_distribution(self.transition(x)).sample(rng, count_particles(x))
+        return _of_shape("transition", new, x)
+
+    def log_transition(self, previous: Any, new: Any) -> np.ndarray:
+        return _log_state(as_distribution(self.transition(previous)), new)
+
+    def log_likelihood(self, x: Any, y: Any) -> np.ndarray:
+        return _log_likelihood(as_distribution(self.observation(x)), y)
+
+    def sample_observation(self, rng: np.random.Generator, x: Any) -> np.ndarray:
+        return as_distribution(self.observation(x)).sample(rng, count_particles(x))
 
 
 def _of_shape(what: str, new: np.ndarray, old: Any) -> np.ndarray:
