@@ -1,10 +1,9 @@
 """The particle filter: a short loop over components.
 
->>> filter = ParticleFilter(initial=prior, transition=move, update=Reweight(likelihood), n=1000)
->>> state, infos = filter.run(observations, seed=0)
->>> state.population.weights, state.log_evidence
-
-A step for an observation y makes these calls::
+A filter keeps a weighted set of particles x_t^1 .. x_t^n which stands for what is known after the observations
+y_0 .. y_t: the weighted mean of any function of the particles estimates its posterior expectation. A new observation
+y needs three things: particles are selected in proportion to their weights, moved by the model, and weighted by how
+well they explain y. Each is a component, and a step calls one after the other::
 
     past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
@@ -12,11 +11,23 @@ A step for an observation y makes these calls::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-With ``resample="before"``, a step also resamples after the update if there are more than n particles.
+Textbook filters have no `proposal`. The bootstrap filter of x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5^2) and y_t ~
+N(x_t, 1) moves by the model and weights by the likelihood:
 
-Textbook filters have no `proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided
-filters have a transition that also weights particles. `step` is a pure function of a `State`, so a run can be
-stopped, stored and resumed at any step.
+>>> from mstfilter.smc import Dynamics, Normal, ParticleFilter, Prior, Reweight, StateSpaceModel
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> filter = ParticleFilter(Prior(model), Dynamics(model), update=Reweight(model.log_likelihood), n=1000)
+>>> state, infos = filter.run([0.3, -0.1, 0.8], seed=0)
+>>> mean = state.population.weights @ state.population.particles           # E[x_2 | y_0 .. y_2]
+>>> state.log_evidence                                                     # log p(y_0 .. y_2), an estimate
+-3.7...
+
+`bootstrap(model, n=1000)` is the same filter. Guided filters have a transition that also weights particles, and MST
+(Price, Huang, Berenson 2021) uses all four components above. With ``resample="before"``, a step also resamples after
+an update that returned more than n particles.
+
+`step` is a pure function of a `State`, so a run can be stopped, stored and resumed at any step. Reference: Chopin and
+Papaspiliopoulos (2020), "An introduction to sequential Monte Carlo", chapter 10.
 """
 
 from __future__ import annotations
@@ -174,14 +185,12 @@ class ParticleFilter(AtStep):
         return self._step(state, observation, Examined.of_run() if state.t < 2 else None)
 
     def _step(self, state: State, observation: Any, examined: Examined | None) -> tuple[State, Info]:
-        y, u = split_input(observation)
-        step = _Step(self.at_step(state.t, u), state, y, examined)
-        step.starts_from_proposal = state.population is None and self.starts_from_proposal
+        step = _Step(self, state, observation, examined)
         past = step.before(state.population)
         predicted, proposed = step.extend(past)
         fused = step.update(predicted, proposed)
-        chosen = step.rejuvenate(step.after(fused, past), past)
-        return step.finish(chosen, fused, past)
+        chosen = step.after(fused, past)
+        return step.finish(step.rejuvenate(chosen, past), fused, past)
 
     def iterate(self, observations: Iterable[Any], seed: int | State = 0) -> Iterator[tuple[State, Info]]:
         """Yield the `State` and the `Info` of every step.
@@ -231,17 +240,15 @@ class ParticleFilter(AtStep):
 
 
 class _Step:
-    """The calls of the components in one step, in the order of the module's docstring.
+    """The calls of the components in one step. Their errors name step and slot; `Info` gets their times and notes."""
 
-    Errors name the step and the slot (`_Slot`). Times and notes of the components are collected for `Info`.
-    """
-
-    def __init__(self, filter: ParticleFilter, state: State, y: Any, examined: Examined | None) -> None:
-        self.filter, self.state, self.y, self.examined = filter, state, y, examined
+    def __init__(self, filter: ParticleFilter, state: State, observation: Any, examined: Examined | None) -> None:
+        self.y, u = split_input(observation)
+        self.filter, self.state, self.examined = filter.at_step(state.t, u), state, examined
+        self.only_proposed = state.population is None and filter.starts_from_proposal
+        self.resampled_before = self.resampled_after = False
         self.notes: dict[str, Mapping[str, Any]] = {}
         self.seconds: dict[str, float] = {}
-        self.resampled = {"before": False, "after": False}
-        self.starts_from_proposal = False  # whether this step has only proposed particles
 
     def slot(self, name: str) -> _Slot:
         return _Slot(name, self.state.t, self.seconds)
@@ -257,7 +264,8 @@ class _Step:
             )
         if n is not None and len(found) != n:
             raise InputError(f"asked for {n} particles it returned {len(found)}")
-        self.examine(slot, component, arguments[0], found)
+        if self.examined is not None:
+            self.examine(self.examined, slot, component, arguments[0], found)
         if found.notes:
             self.notes[slot] = found.notes
         return found
@@ -266,14 +274,13 @@ class _Step:
         """The random stream of a component in this step."""
         return self.state.key.child(stream, self.state.t).generator() if component.draws else _UNUSED
 
-    def examine(self, slot: str, component: Component, before: Any, after: Population) -> None:
+    def examine(self, examined: Examined, slot: str, component: Component, before: Any, after: Population) -> None:
         """Let a component examine the functions of its model, if this is one of the first steps of a run."""
-        examined, missing = self.examined, self.y is None
-        if examined is None or type(component).examine is Component.examine or not examined.wants(slot, missing):
+        missing = self.y is None
+        if type(component).examine is Component.examine or not examined.wants(slot, missing):
             return
         before = before if isinstance(before, Population) else None
-        conclusive = component.examine(self.rng(slot, component), before, self.y, after)
-        examined.note(slot, missing, conclusive)
+        examined.note(slot, missing, component.examine(self.rng(slot, component), before, self.y, after))
 
     def before(self, previous: Population | None) -> Population | None:
         """The particles x_{t-1} to move, resampled if the filter does so before the prediction."""
@@ -284,7 +291,7 @@ class _Step:
         with self.slot("resampler"):
             if not self.filter.trigger.wants(population, self.state.t):
                 return previous
-            self.resampled["before"] = True
+            self.resampled_before = True
             past = self.resample(population.labelled({}), "resampler")
             if priority is None:
                 return past
@@ -300,7 +307,8 @@ class _Step:
             return None
         with self.slot("lookahead"):
             priority = _priority(lookahead, previous, self.y)
-            self.examine("lookahead", lookahead, previous, previous)
+            if self.examined is not None:
+                self.examine(self.examined, "lookahead", lookahead, previous, previous)
         return priority
 
     def resample(self, population: Population, stream: str) -> Population:
@@ -323,7 +331,7 @@ class _Step:
     def predict(self, past: Population | None) -> Population | None:
         """The moved particles; at the first step the initial ones, or None if the filter starts from its proposal."""
         if past is None:
-            if self.starts_from_proposal:
+            if self.only_proposed:
                 return None
             with self.slot("initial"):
                 return self.call("initial", "sample", self.y, self.filter.n, n=self.filter.n)
@@ -339,7 +347,7 @@ class _Step:
 
     def propose(self) -> Population | None:
         """Particles drawn from the observation; None if the observation is missing."""
-        if self.y is None and not self.starts_from_proposal:
+        if self.y is None and not self.only_proposed:
             return None
         with self.slot("proposal"):
             if self.y is None:
@@ -366,13 +374,14 @@ class _Step:
         with self.slot("resampler"):
             if len(fused) <= most and not filter.trigger.wants(fused, self.state.t):
                 return fused
-            self.resampled["after"] = True
+            self.resampled_after = True
             # A step that resamples before the prediction may resample a second time, so it needs another stream.
             return self.resample(fused.labelled(fused.parents), "resampler" if after else "second resampler")
 
     def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
         """Move the particles, after a resampling. The parents of particles do not change."""
-        if self.filter.rejuvenation is None or not (any(self.resampled.values()) or self.filter.resample == "after"):
+        wanted = self.resampled_before or self.resampled_after or self.filter.resample == "after"
+        if self.filter.rejuvenation is None or not wanted:
             return chosen
         with self.slot("rejuvenation"):
             population, previous = chosen.realised().labelled(chosen.parents), None
@@ -390,8 +399,9 @@ class _Step:
         ess = fused.ess  # stored in the population, where the trigger of the next step reads it
         with self.slot("build"):
             population = chosen.realised()
-        population = population.traced_through(past if self.resampled["before"] else None)
-        info = Info(t, len(population), len(fused), ess, any(self.resampled.values()), self.notes, self.seconds)
+        population = population.traced_through(past if self.resampled_before else None)
+        resampled = self.resampled_before or self.resampled_after
+        info = Info(t, len(population), len(fused), ess, resampled, self.notes, self.seconds)
         return State(t + 1, population, key, self.state.properly_weighted and self.filter.properly_weighted), info
 
 

@@ -223,17 +223,16 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
     The shifts, in [0, 1), are (n,), or (1,) if all points have the same one.
     """
     ends = weights.cumsum()
-    total = ends[-1]
-    last = ends == total
-    ends *= n / total
+    ends *= n / ends[-1]  # where the intervals of the particles end, in units of 1 / n
     if len(shifts) == 1:
         ends -= shifts[0]
     else:
         for begin in range(0, len(ends), _BLOCK):
             block = ends[begin : begin + _BLOCK]
-            block -= shifts.take(block.astype(np.int64), mode="clip")  # the last position lies in stratum n
-    np.ceil(ends, out=ends)  # the number of points below each cumulative weight: not negative, as it was above -1
-    np.putmask(ends, last, n)  # whatever the rounding
+            block -= shifts.take(block.astype(np.int64), mode="clip")  # the last end lies in stratum n
+    np.ceil(ends, out=ends)  # the number of points below each end
+    if ends[-1] != n:  # by rounding
+        ends[ends == ends[-1]] = n
     return expanded(ends.astype(np.int64), n)
 
 
