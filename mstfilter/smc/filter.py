@@ -19,8 +19,7 @@ N(x_t, 1) moves by the model and weights by the likelihood:
 >>> filter = ParticleFilter(Prior(model), Dynamics(model), update=Reweight(model.log_likelihood), n=1000)
 >>> state, infos = filter.run([0.3, -0.1, 0.8], seed=0)
 >>> mean = state.population.weights @ state.population.particles           # E[x_2 | y_0 .. y_2]
->>> state.log_evidence                                                     # log p(y_0 .. y_2), an estimate
--3.7...
+>>> log_evidence = state.log_evidence                                      # an estimate of log p(y_0 .. y_2)
 
 `bootstrap(model, n=1000)` is the same filter. Guided filters have a transition that also weights particles, and MST
 (Price, Huang, Berenson 2021) uses all four components above. With ``resample="before"``, a step also resamples after
@@ -35,7 +34,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -45,7 +44,7 @@ from mstfilter.base.fields import NonNegativeInt, PositiveInt
 from mstfilter.base.lazy import progress_of
 from mstfilter.base.processes import together
 from mstfilter.smc.components import EssBelow
-from mstfilter.smc.first_steps import Examined
+from mstfilter.smc.first_steps import Examined, recorded
 from mstfilter.smc.inputs import AtStep, check_observations, same_component, split_input, usual_slip
 from mstfilter.smc.interfaces import (
     Component,
@@ -256,16 +255,13 @@ class _Step:
     def call(self, slot: str, method: str, *arguments: Any, n: int | None = None, stream: str = "") -> Population:
         """The population that a component returns, of size `n` if it is given."""
         component = getattr(self.filter, slot)
-        found = getattr(component, method)(self.rng(stream or slot, component), *arguments)
-        if not isinstance(found, Population):
-            raise InputError(
-                f"{type(component).__name__} returned {type(found).__name__}, expected a Population",
-                "does every branch of the method return it?",
-            )
-        if n is not None and len(found) != n:
-            raise InputError(f"asked for {n} particles it returned {len(found)}")
-        if self.examined is not None:
-            self.examine(self.examined, slot, component, arguments[0], found)
+        make = partial(getattr(component, method), self.rng(stream or slot, component), *arguments)
+        if self.examined is None:
+            found = _checked(make(), component, n)
+        else:
+            with recorded():
+                found = _checked(make(), component, n)
+                self.examine(self.examined, slot, component, arguments[0], found)
         if found.notes:
             self.notes[slot] = found.notes
         return found
@@ -426,6 +422,17 @@ class _Slot:
             raise InputError(f"{where}: {fact} ({place}): {type(error).__name__}: {error}", *hints) from error
         if isinstance(error, Exception):
             error.add_note(f"in {where}")
+
+
+def _checked(found: Any, component: Component, n: int | None) -> Population:
+    if not isinstance(found, Population):
+        raise InputError(
+            f"{type(component).__name__} returned {type(found).__name__}, expected a Population",
+            "does every branch of the method return it?",
+        )
+    if n is not None and len(found) != n:
+        raise InputError(f"asked for {n} particles it returned {len(found)}")
+    return found
 
 
 def _priority(lookahead: Lookahead, population: Population, observation: Any) -> np.ndarray:

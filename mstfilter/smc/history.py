@@ -1,12 +1,18 @@
 """Collectors, which record quantities of a run at every step.
 
-A collector is a function ``(state, info) -> number or array``, which is called after every step.
+A run returns its last state, because all populations of a long run would not fit into memory. What is wanted of the
+others is computed as they come: a collector is a function ``(state, info) -> number or array`` that is called after
+every step.
 
->>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
->>> history["ess"]                                   # (T,)
->>> history.to_xarray()                              # needs xarray
+>>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, collect, ess, mean
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> steps = bootstrap(model, n=100).iterate([0.3, -0.1, 0.8], 0)
+>>> history = collect(steps, ess=ess, mean=mean, largest=lambda state, info: state.population.weights.max())
+>>> history["mean"].shape, sorted(history)
+((3,), ['ess', 'largest', 'mean'])
 
-`mstfilter.smc.run_many` takes the same collectors.
+`mstfilter.smc.run_many` takes the same collectors, and ``history.to_xarray()`` makes a labelled data set of the
+arrays.
 """
 
 from __future__ import annotations

@@ -1,10 +1,20 @@
 """Weighted particles.
 
+Particles x^1 .. x^n with weights W^1 .. W^n (which sum to one) stand for a distribution: the expectation of f(x) is
+estimated by sum_i W^i f(x^i). The weights are stored as unnormalised logarithms, because likelihoods of many
+observations underflow:
+
 >>> import numpy as np
 >>> from mstfilter.smc import Population
 >>> population = Population(np.array([0.0, 1.0, 2.0]), np.log([1.0, 1.0, 2.0]))
 >>> population.weights
 array([0.25, 0.25, 0.5 ])
+>>> float(population.weights @ population.particles)                # the expectation of x
+1.25
+
+If few particles carry most of the weight, the others are wasted. The effective sample size (sum w)^2 / sum w^2 says
+how many particles of equal weight would be as good (Kong, Liu, Wong 1994):
+
 >>> round(population.ess, 3)
 2.667
 

@@ -1,5 +1,9 @@
 """Paths of states given all observations, drawn one at a time by conditional SMC.
 
+A filter of n particles draws a path x_0 .. x_T that has nearly the law p(x_0 .. x_T | y_0 .. y_T), with a bias of
+order 1 / n. Conditional SMC removes the bias: one of the particles must follow a given path, and the drawn path
+replaces it. This is a Markov chain of paths whose law is exact for any n >= 2 (Andrieu, Doucet, Holenstein 2010):
+
 >>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 

@@ -10,8 +10,8 @@ one chain for each row, all chains take a step in one call:
 ...     return new, 0.5 * (x**2 - new**2)
 >>> rng = np.random.default_rng(0)
 >>> x, share = moved(rng, np.full(1000, 3.0), propose, steps=50)
->>> round(float(x.mean()), 1), round(float(x.std()), 1)
-(0.0, 1.0)
+>>> bool(abs(x.mean()) < 0.2), round(float(x.std()), 1)                 # however far they started
+(True, 1.0)
 
 `RandomWalkMove` uses the kernel as a move of a resample-move filter (Gilks and Berzuini 2001), and `pmmh` for
 parameters of a model. Reference: Chopin and Papaspiliopoulos (2020), "An introduction to sequential Monte Carlo",

@@ -1,15 +1,20 @@
 """Smoothers, which use the populations of a run to estimate the states given all observations.
 
->>> record = keep(bootstrap(model, n=500), observations, seed=0)
+A filter says what is known about x_t after y_0 .. y_t. Later observations say more about x_t. The ancestors of the
+last particles are draws of x_t given all observations, but after many resamplings few distinct ones are left.
+Backward sampling draws new paths instead: from the end, it chooses particle i at time t as the predecessor of
+x_{t+1} with probability proportional to w_i f(x_{t+1} | x_i).
+
+>>> import numpy as np
+>>> from mstfilter.smc import Dynamics, Normal, StateSpaceModel, backward_paths, bootstrap, keep
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> record = keep(bootstrap(model, n=500), [0.3, -0.1, 0.8], seed=0)
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
->>> [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_T], t = 0 .. T
+>>> means = [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_2]
 
-`genealogy`, `fixed_lag` and `backward_paths` take a `Record` and return a tuple with one population per time. The
-page "Smoothing" of the documentation compares them.
-
-The smoothers accept any properly weighted filter, including filters with guided moves, a lookahead or rejuvenation.
-
-`mstfilter.smc.inference.conditional` draws single paths of models and of programs.
+`genealogy`, `fixed_lag` and `backward_paths` take a `Record` of any properly weighted filter and return a tuple with
+one population per time. The page "Smoothing" of the documentation compares them. `conditional_path` draws single
+paths of models and of programs. Reference: Godsill, Doucet, West (2004).
 """
 
 from __future__ import annotations

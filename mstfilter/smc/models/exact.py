@@ -1,12 +1,18 @@
 """Linear-Gaussian and finite models, and their exact posteriors.
 
->>> filter = bootstrap(linear_gaussian(F, Q, H, R, m0, P0), n=1000)
->>> exact = kalman_filter(F, Q, H, R, m0, P0, observations)
->>> exact.means, exact.covariances, exact.log_evidence             # (T, d), (T, d, d), (T,)
+Two kinds of models have posteriors that can be computed: Kalman's recursions give the mean and covariance of a linear
+model with Gaussian noise, and sums over all states give the probabilities of a finite one. They tell how far a filter
+is from the truth:
 
->>> filter = bootstrap(hidden_markov(initial, transition, log_likelihood), n=1000)
->>> exact = forward_backward(initial, transition, log_likelihood, observations)
->>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
+>>> import numpy as np
+>>> from mstfilter.smc import bootstrap, kalman_filter, linear_gaussian
+>>> model = {"F": [[0.9]], "Q": [[0.25]], "H": [[1.0]], "R": [[1.0]], "m0": [0.0], "P0": [[1.0]]}
+>>> exact = kalman_filter(**model, observations=[0.3, -0.1, 0.8])
+>>> state, _ = bootstrap(linear_gaussian(**model), n=10_000).run([0.3, -0.1, 0.8], seed=0)
+>>> bool(abs(state.log_evidence - exact.log_evidence[-1]) < 0.05)
+True
+
+`hidden_markov` and `forward_backward` do the same for a chain of K states (Rabiner 1989).
 
 A missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
 belongs to the transition from x_{t-1} to x_t, and entry 0 is not used.

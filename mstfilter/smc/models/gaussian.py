@@ -1,21 +1,24 @@
 """Models with Gaussian noise, filters guided by the unscented Kalman filter, and Rao-Blackwellised filters.
 
+If f and h are nonlinear, x_t = f(x_{t-1}) + N(0, Q) and y_t = h(x_t) + N(0, R) have no exact filter. The posterior of
+x_t that an unscented Kalman filter computes for each particle is a good proposal, because it has seen y_t, and the
+weights correct its error:
+
 >>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
 
-The update of the unscented Kalman filter is a good proposal for a nonlinear model with Gaussian noise.
-
->>> filter = rao_blackwellised(model, n=100)
->>> state, infos = filter.run(observations, seed=0)
->>> state.population.particles["mean"].shape           # (n, d)
-
-A Rao-Blackwellised filter draws a part u_t of the state (a regime, a contact, an association). Given u_0 .. u_t, the
-other part z_t is linear and Gaussian:
+Often only a part u_t of the state is hard (a regime, a contact, an association). Given u_0 .. u_t, the other part z_t
+is linear and Gaussian:
 
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
-A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_0 .. y_t. The particles are a mapping
-of arrays. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}). Reference: Doucet, de Freitas, Murphy, Russell
-(2000).
+Then particles are needed for u_t only. Each carries the Kalman mean and covariance of z_t, which are exact, so the
+weights p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) vary less than those of particles of both parts:
+
+>>> filter = rao_blackwellised(ConditionallyLinear(sample_initial, sample_transition, linear, mean, cov), n=100)
+>>> state, infos = filter.run(observations, seed=0)
+>>> state.population.particles["mean"].shape           # (n, d)
+
+References: van der Merwe, Doucet, de Freitas, Wan (2000); Doucet, de Freitas, Murphy, Russell (2000).
 """
 
 from __future__ import annotations

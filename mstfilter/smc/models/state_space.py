@@ -1,17 +1,26 @@
 """State-space models, the components made from them, and the textbook filters.
 
+The state is a Markov chain, x_0 ~ p(x_0) and x_t ~ f(x_t | x_{t-1}), and each observation depends on the present
+state, y_t ~ p(y_t | x_t). Three distributions are a model:
+
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
 ...     transition=lambda x: Normal(0.9 * x, 0.5),
 ...     observation=lambda x: Normal(x, 1.0),
 ... )
 >>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)           # Gordon, Salmond, Smith 1993
+
+The bootstrap filter moves particles by f, and so without regard to y_t. If the likelihood is narrow, few of them
+land where it is large. A guided filter draws them from a proposal q(x_t | x_{t-1}, y_t) and corrects the weights by
+f / q. An auxiliary filter selects the particles with an eye on y_t before it moves them:
+
 >>> guided(model, lambda x, y: Normal(0.5 * (0.9 * x + y), 0.4), n=100)         # Doucet, Godsill, Andrieu 2000
 >>> auxiliary(model, log_priority, n=100)                                       # Pitt and Shephard 1999
 >>> resample_move(model, RandomWalkMove(model, 0.5), n=100)                     # Gilks and Berzuini 2001
 
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
-resampler=...)``. The first observation updates the initial state before any prediction.
+resampler=...)``. The first observation updates the initial state before any prediction. Reference: Chopin and
+Papaspiliopoulos (2020), chapter 10.
 """
 
 from __future__ import annotations
