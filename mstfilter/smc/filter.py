@@ -412,11 +412,13 @@ class _Slot:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
         self.seconds[self.name] = self.seconds.get(self.name, 0.0) + time.perf_counter() - self.began
+        if error is None:
+            return
         where = f"step {self.t}, {self.name}"
         if isinstance(error, InputError):
             raise error.with_message(f"{where}: {error.message}") from error
         slip = usual_slip(error) if isinstance(error, TypeError | ValueError | AttributeError) else None
-        place = place_in_user_file(error) if slip and error is not None else None
+        place = place_in_user_file(error) if slip else None
         if slip and place:
             fact, *hints = slip
             raise InputError(f"{where}: {fact} ({place}): {type(error).__name__}: {error}", *hints) from error
