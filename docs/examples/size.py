@@ -30,7 +30,7 @@ class MySize(Size):
 
     factor: PositiveFloat = 2.0
     n_min: PositiveInt = 10
-    n_max: int = 1000
+    n_max: int = 100
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -418,11 +418,10 @@ class Population:
 
     def realised(self) -> Population:
         """The same population, with all `Candidates` built."""
-        if type(self.particles) is not np.ndarray and isinstance(
-            self.particles, Candidates
-        ):  # the first test is fast
-            return replace(self, particles=self.particles.built())
-        return self
+        # Arrays are tested first, as a test for an abstract class such as `Candidates` takes longer.
+        if type(self.particles) is np.ndarray or not isinstance(self.particles, Candidates):
+            return self
+        return replace(self, particles=self.particles.built())
 
     def reweighted(self, log_factors: np.ndarray) -> Population:
         """The same particles with `log_factors` added to the log weights."""
