@@ -6,11 +6,11 @@ python equivalence.py
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from mstfilter.smc import Equivalence, Kld, bootstrap, first_seen, linear_gaussian
+from mstfilter.smc import Equivalence, Kld, Sized, bootstrap, first_seen, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,6 @@ class MyEquivalence(Equivalence):
 if __name__ == "__main__":
     # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
     model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
-    filter = replace(bootstrap(model, n=1000), size=Kld(equivalence=MyEquivalence()))
+    filter = bootstrap(model, n=1000, resampler=Sized(size=Kld(MyEquivalence())))
     state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
     print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

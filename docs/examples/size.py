@@ -1,19 +1,19 @@
-"""A size: how many particles a resampling makes.
+"""A size: how many particles the resampler `Sized` selects.
 
 mstfilter check ./size.py:MySize
-mstfilter run demo/recording size=./size.py:MySize size.n_min=3 size.n_max=8 --out runs/mine --replace
+mstfilter run demo/recording resampler=sized resampler.size=./size.py:MySize --out runs/mine --replace
 python size.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.fields import PositiveFloat, PositiveInt
-from mstfilter.smc import Population, Size, bootstrap, linear_gaussian
+from mstfilter.smc import Population, Size, Sized, bootstrap, linear_gaussian
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,10 @@ class MySize(Size):
 
     factor: PositiveFloat = 2.0
     n_min: PositiveInt = 10
-    n_max: int = 1000
+    n_max: int = 100
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.n_max < self.n_min:
             raise InputError(f"n_max is {self.n_max}, less than n_min, {self.n_min}")
 
@@ -47,6 +48,6 @@ class MySize(Size):
 if __name__ == "__main__":
     # x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5), y_t ~ N(x_t, 1)
     model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[1.0]], m0=[0.0], P0=[[1.0]])
-    filter = replace(bootstrap(model, n=1000), size=MySize())
+    filter = bootstrap(model, n=1000, resampler=Sized(size=MySize()))
     state, infos = filter.run([[0.3], [-0.1], [0.8]], seed=0)
     print("mean", state.population.weights @ state.population.particles, "ESS", [round(info.ess) for info in infos])

@@ -31,6 +31,7 @@ class MyTransition(Transition):
     properly_weighted = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.scale >= 0:
             raise InputError(f"scale is {self.scale}, expected a number of at least 0")
 

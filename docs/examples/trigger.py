@@ -26,6 +26,7 @@ class MyTrigger(Trigger):
     share: float = 0.5
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.share < 1:
             raise InputError(f"share is {self.share}, expected a number in (0, 1)")
 

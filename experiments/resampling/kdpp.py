@@ -46,6 +46,7 @@ class KDpp(Resampler):
     exact_size: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_component("similarity", self.similarity, Similarity)
 
     @property

@@ -15,7 +15,7 @@ mstfilter.base.errors.InputError: power is 2.0, expected a finite exponent above
 A field is checked if its annotation is a number with `Bounds`, a ``Literal``, or a subclass of `Bounded` such as the
 interface of a component, also as ``Interface | None``. Other fields are not checked.
 
-After these checks, the ``__post_init__`` of the class is called. It can check conditions on several fields.
+A class with conditions on several fields defines ``__post_init__``, which calls ``super().__post_init__()`` first.
 """
 
 from __future__ import annotations
@@ -53,19 +53,7 @@ Share = Annotated[float, Bounds(at_least=0, at_most=1)]
 
 
 class Bounded:
-    """Base class of dataclasses whose fields are checked before the ``__post_init__`` of the class is called."""
-
-    def __init_subclass__(cls, **named: Any) -> None:
-        super().__init_subclass__(**named)
-        own = cls.__dict__.get("__post_init__")
-        if own is not None:
-
-            @functools.wraps(own)
-            def after_checks(self: Any) -> None:
-                Bounded.__post_init__(self)
-                own(self)
-
-            cls.__post_init__ = after_checks  # type: ignore[method-assign]
+    """Base class of dataclasses whose fields are checked by ``__post_init__``."""
 
     def __post_init__(self) -> None:
         """Raise InputError if a field is outside of its bounds."""

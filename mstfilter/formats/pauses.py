@@ -121,6 +121,7 @@ class Still(PauseRule):
     region: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         left, top, right, bottom = self.region if len(self.region) == 4 else (1, 1, 0, 0)
         if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
             raise InputError(f"region is {self.region}, expected left, top, right, bottom from 0 to 1")

@@ -43,7 +43,7 @@ REGISTRY = Registry(*PACKAGES)
 _META = ("description", "source")
 _FIELDS = (
     *("n", "n_proposed", "resample"),
-    *("initial", "transition", "proposal", "update", "resampler", "trigger", "size", "lookahead", "rejuvenation"),
+    *("initial", "transition", "proposal", "update", "resampler", "trigger", "lookahead", "rejuvenation"),
 )
 
 

@@ -1,37 +1,40 @@
 """Particle filters for any kind of particle. The package does not depend on images or voxels.
 
->>> from mstfilter.smc import EssBelow, ParticleFilter, Reweight, Systematic, bootstrap, linear_gaussian
->>> filter = bootstrap(model, n=1000)                                   # a textbook filter
->>> filter = ParticleFilter(initial=prior, transition=move, update=Reweight(log_likelihood),
+A hidden state x_t moves by a model, and is seen only through noisy observations y_t. A particle filter represents
+what is known about x_t by weighted particles:
+
+>>> from mstfilter.smc import EssBelow, Normal, ParticleFilter, Reweight, StateSpaceModel, Systematic, bootstrap
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> state, infos = bootstrap(model, n=1000).run([0.3, -0.1, 0.8], seed=0)       # a textbook filter
+>>> state.population.particles.shape, state.population.weights.shape
+((1000,), (1000,))
+>>> log_evidence = state.log_evidence                                          # of log p(y_0, y_1, y_2)
+
+The filter is made of components, and each can be replaced by one of your own:
+
+>>> filter = ParticleFilter(initial=prior, transition=move, update=Reweight(log_likelihood),    # doctest: +SKIP
 ...                         resampler=Systematic(), trigger=EssBelow(), n=1000)
->>> state, infos = filter.run(observations, seed=0)
->>> state.population.particles, state.population.weights, state.log_evidence
+
+Read first `filter` (the loop), `interfaces` (what a component promises) and `population` (what components exchange).
 
 ======================  ===================================================================================
 `filter`                `ParticleFilter`; `ParticleFilter.step` is one step of the filter
 `interfaces`            base classes of components (`Transition`, `Proposal`, `Update`, `Resampler`, ...),
                         `State` and `Info`
-`inputs`                time and inputs of models: `WithInput`, an observation with an input
 `population`            `Population`: particles, log weights, parents; `Candidates`, particles built on access
 `resampling`            schemes that need only weights, with equal output weights
 `diverse_resampling`    schemes that keep more distinct particles, with unequal weights
-`wrapped_resampling`    wrappers of schemes: sorted, shuffled, merged, tempered
+`wrapped_resampling`    wrappers of schemes: sorted, shuffled, merged, tempered, of another size
 `components`            update by a likelihood, branching, triggers, sizes, equality of particles
+`inputs`                time and inputs of models: `WithInput`, an observation with an input
 `streams`               random streams named by seed, step, slot and index
 `history`               collectors: quantities of a run, recorded at every step
-`running`               `run_many`: several filters, seeds and data sets
-`sweep`                 many runs of a filter at once, as arrays
+`running`, `sweep`      `run_many`: several filters, seeds and data sets; many runs at once, as arrays
 `first_steps`           examines the functions of a model at the first steps of a run
 `checkpoint`            storage of the state of a run in a file
-`state_space`           state-space models; bootstrap, guided, auxiliary and resample-move filters
-`exact`                 linear-Gaussian and finite models with exact posteriors
-`gaussian`              models with Gaussian noise; UKF proposals, Rao-Blackwellised filters
-`programs`              filters for probabilistic programs
-`distributions`         distributions for models; an adapter for those of scipy
-`smoothing`             states given all observations
-`conditional`           paths of states by conditional SMC, one at a time
-`inference`             parameters of a model: PMMH, particle Gibbs, emcee
-`diagnostics`           variance of the estimates of a run, energy distances of populations
+`models`                state-space models, programs, distributions, models with exact posteriors
+`inference`             smoothing, parameters of a model, variances of the estimates of a run
+`testing`               contracts: tests of components of your own
 ======================  ===================================================================================
 """
 
@@ -67,6 +70,7 @@ __components__ = {
         "coalesced": "Coalesced",
         "tempered": "Tempered",
         "shuffled": "Shuffled",
+        "sized": "Sized",
         "sorted": "Sorted",
         "keep_weights": "KeepWeights",
     },

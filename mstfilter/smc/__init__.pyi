@@ -33,6 +33,7 @@ from mstfilter.smc.inference.diagnostics import (
     energy_distance as energy_distance,
     run_variance as run_variance,
 )
+from mstfilter.smc.inference.metropolis import RandomWalkMove as RandomWalkMove
 from mstfilter.smc.inference.parameters import (
     Chains as Chains,
     ensemble as ensemble,
@@ -97,7 +98,6 @@ from mstfilter.smc.models.state_space import (
     Dynamics as Dynamics,
     Prior as Prior,
     PriorityLookahead as PriorityLookahead,
-    RandomWalkMove as RandomWalkMove,
     StateSpaceModel as StateSpaceModel,
     auxiliary as auxiliary,
     bootstrap as bootstrap,
@@ -128,6 +128,7 @@ from mstfilter.smc.wrapped_resampling import (
     KeepWeights as KeepWeights,
     ResamplerWrapper as ResamplerWrapper,
     Shuffled as Shuffled,
+    Sized as Sized,
     Sorted as Sorted,
     Tempered as Tempered,
     coalesce as coalesce,

@@ -1,12 +1,17 @@
 """Components that need no model: an update, branching, triggers, a size, and equality of particles.
 
->>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
->>> transition = Branching(Dynamics(model), branches=4)
-
-A size component decides the number of particles:
+The bootstrap filter multiplies each weight by the likelihood of the observation, w_i p(y | x_i):
 
 >>> import numpy as np
->>> from mstfilter.smc import Bins, Kld, Population
+>>> from scipy.stats import norm
+>>> from mstfilter.smc import Bins, Kld, Population, Reweight
+>>> update = Reweight(lambda particles, y: norm.logpdf(y, loc=particles, scale=0.5))
+>>> rng = np.random.default_rng(0)
+>>> update.update(rng, Population(np.array([0.0, 1.0])), None, 0.9).weights.round(2)
+array([0.17, 0.83])
+
+A wide posterior needs more particles than a narrow one. `Kld` counts the bins that the particles occupy (Fox 2003):
+
 >>> wide = Population(np.linspace(0, 10, 200))
 >>> narrow = Population(np.linspace(0, 10, 200), -50.0 * (np.linspace(0, 10, 200) - 5.25) ** 2)
 >>> size = Kld(equivalence=Bins(0.5), epsilon=0.05, n_min=10)
@@ -213,6 +218,7 @@ class Kld(Size):
     n_max: int = 100_000
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_integer("n_max", self.n_max, f"n_min is {self.n_min}", at_least=self.n_min)
 
     def choose(self, population: Population) -> int:

@@ -1,10 +1,9 @@
 """The particle filter: a short loop over components.
 
->>> filter = ParticleFilter(initial=prior, transition=move, update=Reweight(likelihood), n=1000)
->>> state, infos = filter.run(observations, seed=0)
->>> state.population.weights, state.log_evidence
-
-A step for an observation y makes these calls::
+A filter keeps a weighted set of particles x_t^1 .. x_t^n which stands for what is known after the observations
+y_0 .. y_t: the weighted mean of any function of the particles estimates its posterior expectation. A new observation
+y needs three things: particles are selected in proportion to their weights, moved by the model, and weighted by how
+well they explain y. Each is a component, and a step calls one after the other::
 
     past      = resampler.resample(previous, n)          only with resample="before", the textbook order
     predicted = transition.predict(past, y)
@@ -12,20 +11,30 @@ A step for an observation y makes these calls::
     fused     = update.update(predicted, proposed, y)
     next      = resampler.resample(fused, n)             with resample="after", the order of MST
 
-With ``resample="before"``, a step also resamples after the update if there are more than n particles.
+Textbook filters have no `proposal`. The bootstrap filter of x_0 ~ N(0, 1), x_t ~ N(0.9 x_{t-1}, 0.5^2) and y_t ~
+N(x_t, 1) moves by the model and weights by the likelihood:
 
-Textbook filters have no `proposal`; MST (Price, Huang, Berenson 2021) uses all four of the components above. Guided
-filters have a transition that also weights particles. `step` is a pure function of a `State`, so a run can be
-stopped, stored and resumed at any step.
+>>> from mstfilter.smc import Dynamics, Normal, ParticleFilter, Prior, Reweight, StateSpaceModel
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> filter = ParticleFilter(Prior(model), Dynamics(model), update=Reweight(model.log_likelihood), n=1000)
+>>> state, infos = filter.run([0.3, -0.1, 0.8], seed=0)
+>>> mean = state.population.weights @ state.population.particles           # E[x_2 | y_0 .. y_2]
+>>> log_evidence = state.log_evidence                                      # an estimate of log p(y_0 .. y_2)
+
+`bootstrap(model, n=1000)` is the same filter. Guided filters have a transition that also weights particles, and MST
+(Price, Huang, Berenson 2021) uses all four components above. With ``resample="before"``, a step also resamples after
+an update that returned more than n particles.
+
+`step` is a pure function of a `State`, so a run can be stopped, stored and resumed at any step. Reference: Chopin and
+Papaspiliopoulos (2020), "An introduction to sequential Monte Carlo", chapter 10.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -35,7 +44,7 @@ from mstfilter.base.fields import NonNegativeInt, PositiveInt
 from mstfilter.base.lazy import progress_of
 from mstfilter.base.processes import together
 from mstfilter.smc.components import EssBelow
-from mstfilter.smc.first_steps import Examined
+from mstfilter.smc.first_steps import Examined, recorded
 from mstfilter.smc.inputs import AtStep, check_observations, same_component, split_input, usual_slip
 from mstfilter.smc.interfaces import (
     Component,
@@ -45,7 +54,6 @@ from mstfilter.smc.interfaces import (
     Proposal,
     Rejuvenation,
     Resampler,
-    Size,
     State,
     Transition,
     Trigger,
@@ -55,8 +63,8 @@ from mstfilter.smc.population import Population, digest_of, identity
 from mstfilter.smc.resampling import Systematic
 from mstfilter.smc.streams import Key
 
-_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "lookahead", "rejuvenation", "size")
-_WITHOUT_STEP = ("resampler", "trigger", "size")  # they see the population only
+_SLOTS = ("initial", "transition", "proposal", "update", "resampler", "trigger", "lookahead", "rejuvenation")
+_WITHOUT_STEP = ("resampler", "trigger")  # they see the population only
 #: For components that draw no random numbers. Saves the time to make a stream.
 _UNUSED = Key(0).child("unused").generator()
 
@@ -86,10 +94,8 @@ class ParticleFilter(AtStep):
         Resample-move filter: moves the particles at the end of a step that resampled; with ``resample="after"`` at
         the end of every step. (There the trigger has seen the particles that would be moved. If it decided about
         the move, the evidence would be biased.)
-    size : Size, optional
-        Chooses the number of particles that are selected. By default, the number is always `n`.
     n : int
-        Number of particles at the start and after each resampling (unless `size` chooses another).
+        Number of particles at the start and after each resampling. The resampler `Sized` chooses other numbers.
     n_proposed : int
         Number of particles that `proposal` draws at each step. If 0, `proposal` draws `n` particles.
     resample : {"after", "before"}
@@ -105,7 +111,6 @@ class ParticleFilter(AtStep):
     trigger: Trigger = EssBelow()  # noqa: RUF009 (frozen)
     lookahead: Lookahead | None = None
     rejuvenation: Rejuvenation | None = None
-    size: Size | None = None
     n: PositiveInt = 100
     n_proposed: NonNegativeInt = 0
     resample: Literal["after", "before"] = "before"
@@ -113,6 +118,7 @@ class ParticleFilter(AtStep):
     step_functions: ClassVar = {slot: None for slot in _SLOTS if slot not in _WITHOUT_STEP}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.initial is None and self.proposal is None:
             raise InputError("the filter has neither `initial` nor `proposal`: no particles to start from")
         if self.lookahead is not None and self.resample == "after":
@@ -136,6 +142,11 @@ class ParticleFilter(AtStep):
             return False
         components = (getattr(self, slot) for slot in _SLOTS)
         return all(c.properly_weighted for c in components if isinstance(c, Component))
+
+    @cached_property
+    def starts_from_proposal(self) -> bool:
+        """Whether the first step has only proposed particles."""
+        return self.initial is None or same_component(self.initial, self.proposal)
 
     def start(self, seed: int | Key = 0, population: Population | None = None, t: int = 0) -> State:
         """The state before the first observation, or a state with given particles.
@@ -174,13 +185,11 @@ class ParticleFilter(AtStep):
 
     def _step(self, state: State, observation: Any, examined: Examined | None) -> tuple[State, Info]:
         step = _Step(self, state, observation, examined)
-        past, resampled_before = step.select_before()
+        past = step.before(state.population)
         predicted, proposed = step.extend(past)
-        fused = step.fuse(predicted, proposed)
-        chosen, resampled_after = step.select_after(fused, past)
-        if resampled_before or resampled_after or self.resample == "after":
-            chosen = step.rejuvenate(chosen, past)
-        return step.finish(past, fused, chosen, resampled_before, resampled_after)
+        fused = step.update(predicted, proposed)
+        chosen = step.after(fused, past)
+        return step.finish(step.rejuvenate(chosen, past), fused, past)
 
     def iterate(self, observations: Iterable[Any], seed: int | State = 0) -> Iterator[tuple[State, Info]]:
         """Yield the `State` and the `Info` of every step.
@@ -230,240 +239,202 @@ class ParticleFilter(AtStep):
 
 
 class _Step:
-    """The stages of one step. Each call of a component is wrapped by ``with self.slot(name)``."""
+    """The calls of the components in one step. Their errors name step and slot; `Info` gets their times and notes."""
 
-    def __init__(
-        self, filter: ParticleFilter, state: State, observation: Any, examined: Examined | None = None
-    ) -> None:
-        self.observation, u = split_input(observation)
-        self.filter, self.state = filter.at_step(state.t, u), state
-        self.given, self.examined = filter, examined
-        self.slot = _Slot(state.t)
+    def __init__(self, filter: ParticleFilter, state: State, observation: Any, examined: Examined | None) -> None:
+        self.y, u = split_input(observation)
+        self.filter, self.state, self.examined = filter.at_step(state.t, u), state, examined
+        self.only_proposed = state.population is None and filter.starts_from_proposal
+        self.resampled_before = self.resampled_after = False
+        self.notes: dict[str, Mapping[str, Any]] = {}
+        self.seconds: dict[str, float] = {}
 
-    def rng(self, slot: str) -> np.random.Generator:
+    def slot(self, name: str) -> _Slot:
+        return _Slot(name, self.state.t, self.seconds)
+
+    def call(self, slot: str, method: str, *arguments: Any, n: int | None = None, stream: str = "") -> Population:
+        """The population that a component returns, of size `n` if it is given."""
+        component = getattr(self.filter, slot)
+        make = partial(getattr(component, method), self.rng(stream or slot, component), *arguments)
+        if self.examined is None:
+            found = _checked(make(), component, n)
+        else:
+            with recorded():
+                found = _checked(make(), component, n)
+                self.examine(self.examined, slot, component, arguments[0], found)
+        if found.notes:
+            self.notes[slot] = found.notes
+        return found
+
+    def rng(self, stream: str, component: Component) -> np.random.Generator:
         """The random stream of a component in this step."""
-        return self.state.key.child(slot, self.state.t).generator()
+        return self.state.key.child(stream, self.state.t).generator() if component.draws else _UNUSED
 
-    def examine(self, slot: str, component: Component, before: Population | None, after: Population) -> None:
+    def examine(self, examined: Examined, slot: str, component: Component, before: Any, after: Population) -> None:
         """Let a component examine the functions of its model, if this is one of the first steps of a run."""
-        examined, missing = self.examined, self.observation is None
-        if examined is None or type(component).examine is Component.examine or not examined.wants(slot, missing):
+        missing = self.y is None
+        if type(component).examine is Component.examine or not examined.wants(slot, missing):
             return
-        rng = self.rng(slot) if component.draws else _UNUSED
-        examined.note(slot, missing, component.examine(rng, before, self.observation, after))
+        before = before if isinstance(before, Population) else None
+        examined.note(slot, missing, component.examine(self.rng(slot, component), before, self.y, after))
 
-    def select_before(self) -> tuple[Population | None, bool]:
-        """Select the particles x_{t-1} to move. Returns the particles and whether they were resampled."""
-        population, priority = self.state.population, None
-        if population is None or self.filter.resample == "after":
-            return population, False
-        if self.filter.lookahead is not None and self.observation is not None:
-            with self.slot("lookahead"):
-                priority = _priority(self.filter.lookahead, population, self.observation)
-                self.examine("lookahead", self.filter.lookahead, population, population)
-                population = population.reweighted(priority)
+    def before(self, previous: Population | None) -> Population | None:
+        """The particles x_{t-1} to move, resampled if the filter does so before the prediction."""
+        if previous is None or self.filter.resample == "after":
+            return previous
+        priority = self.priority(previous)
+        population = previous if priority is None else previous.reweighted(priority)
         with self.slot("resampler"):
             if not self.filter.trigger.wants(population, self.state.t):
-                return self.state.population, False
-            n = self.filter.n if self.filter.size is None else self.filter.size.checked(population)
-            selected = self._resample(population.labelled({}), n, "resampler")
-            if priority is not None:
-                ancestors = selected.parents["ancestor"]
-                if (ancestors < 0).any():
-                    raise InputError("a lookahead needs a resampler that reports ancestors")
-                selected = selected.reweighted(-priority[ancestors])
-            self.slot.record(selected.notes)
-        return selected, True
+                return previous
+            self.resampled_before = True
+            past = self.resample(population.labelled({}), "resampler")
+            if priority is None:
+                return past
+            ancestors = past.parents["ancestor"]
+            if (ancestors < 0).any():
+                raise InputError("a lookahead needs a resampler that reports ancestors")
+            return past.reweighted(-priority[ancestors])
 
-    def _resample(self, population: Population, n: int, stream: str) -> Population:
+    def priority(self, previous: Population) -> np.ndarray | None:
+        """(n,) log priorities of the particles for the selection; None if there is no lookahead or observation."""
+        lookahead = self.filter.lookahead
+        if lookahead is None or self.y is None:
+            return None
+        with self.slot("lookahead"):
+            priority = _priority(lookahead, previous, self.y)
+            if self.examined is not None:
+                self.examine(self.examined, "lookahead", lookahead, previous, previous)
+        return priority
+
+    def resample(self, population: Population, stream: str) -> Population:
         """Resampled particles. The ancestors are -1 if the resampler does not report ancestors."""
-        resampler = self.filter.resampler
-        selected = _checked(resampler.resample(self.rng(stream), population, n), resampler)
+        selected = self.call("resampler", "resample", population, self.filter.n, stream=stream)
         if "ancestor" in selected.parents:
             return selected
         return selected.with_ancestors(np.full(len(selected), -1))
 
     def extend(self, past: Population | None) -> tuple[Population | None, Population | None]:
         """The predicted and the proposed particles, which are independent given the observation."""
-        if past is None or self.observation is None or self.filter.proposal is None:
-            predicted = self.predict(past)
-            return predicted, self.propose(predicted)
-        found = together(lambda: self.predict(past), lambda: self.propose(past))
-        for name in ("transition", "proposal"):  # in this order, whichever is complete first
-            if name in self.slot.notes:
-                self.slot.notes[name] = self.slot.notes.pop(name)
+        if self.filter.proposal is None:
+            return self.predict(past), None
+        found = together(lambda: self.predict(past), self.propose)
+        for slot in ("transition", "proposal"):  # in this order, whichever is complete first
+            if slot in self.notes:
+                self.notes[slot] = self.notes.pop(slot)
         return found
 
     def predict(self, past: Population | None) -> Population | None:
-        """The moved particles; None at the first step of a filter that starts from its proposal."""
+        """The moved particles; at the first step the initial ones, or None if the filter starts from its proposal."""
         if past is None:
-            return self._first()
+            if self.only_proposed:
+                return None
+            with self.slot("initial"):
+                return self.call("initial", "sample", self.y, self.filter.n, n=self.filter.n)
         stayed = {"previous": identity(len(past))}
         population = past.realised().labelled(stayed)
-        transition = self.filter.transition
-        if transition is None:
+        if self.filter.transition is None:
             return population
         with self.slot("transition"):
-            moved = transition.predict(self.rng("transition"), population, self.observation)
-            moved = _checked(moved, transition)
-            self.examine("transition", transition, population, moved)
-            if "previous" not in moved.parents and len(moved) == len(population):
-                moved = moved.labelled({**moved.parents, **stayed}, moved.notes)
-            self.slot.record(moved.notes)
-        return moved
+            moved = self.call("transition", "predict", population, self.y)
+        if "previous" in moved.parents or len(moved) != len(population):
+            return moved
+        return moved.labelled({**moved.parents, **stayed}, moved.notes)
 
-    def _first(self) -> Population | None:
-        initial, n = self.filter.initial, self.filter.n
-        if initial is None or same_component(self.given.initial, self.given.proposal):
-            return None
-        with self.slot("initial"):
-            population = _checked(initial.sample(self.rng("initial"), self.observation, n), initial)
-            if len(population) != n:
-                raise InputError(f"asked for {n} particles it returned {len(population)}")
-            self.examine("initial", initial, None, population)
-            self.slot.record(population.notes)
-        return population
-
-    def propose(self, predicted: Population | None) -> Population | None:
-        """Particles drawn from the observation; None if there is no proposal or no observation."""
-        proposal = self.filter.proposal
-        if proposal is None or (self.observation is None and predicted is not None):
+    def propose(self) -> Population | None:
+        """Particles drawn from the observation; None if the observation is missing."""
+        if self.y is None and not self.only_proposed:
             return None
         with self.slot("proposal"):
-            if self.observation is None:
+            if self.y is None:
                 raise InputError("the first observation is missing and the filter starts from its proposal")
-            n = self.filter.n_proposed or self.filter.n
-            proposed = _checked(proposal.sample(self.rng("proposal"), self.observation, n), proposal)
-            self.slot.record(proposed.notes)
+            proposed = self.call("proposal", "sample", self.y, self.filter.n_proposed or self.filter.n)
         return proposed.labelled({"proposed": identity(len(proposed))}, proposed.notes)
 
-    def fuse(self, predicted: Population | None, proposed: Population | None) -> Population:
+    def update(self, predicted: Population | None, proposed: Population | None) -> Population:
         """The particles after the update."""
-        update = self.filter.update
-        if self.observation is None or update is None:
-            fused = predicted if predicted is not None else proposed
-            assert fused is not None
-            return fused
-        with self.slot("update"):
-            rng = self.rng("update") if update.draws else _UNUSED
-            fused = _checked(update.update(rng, predicted, proposed, self.observation), update)
-            self.examine("update", update, predicted, fused)
-            self.slot.record(fused.notes)
-        return fused
+        if self.y is not None and self.filter.update is not None:
+            with self.slot("update"):
+                return self.call("update", "update", predicted, proposed, self.y)
+        unchanged = predicted if predicted is not None else proposed
+        assert unchanged is not None
+        return unchanged
 
-    def select_after(self, fused: Population, past: Population | None) -> tuple[Population, bool]:
-        """Select the particles to keep. Returns the particles and whether they were resampled."""
-        size, after = self.filter.size, self.filter.resample == "after"
-        n = limit = self.filter.n
-        if len(fused) <= n and not after and size is None:
-            return fused, False
+    def after(self, fused: Population, past: Population | None) -> Population:
+        """The particles to keep: all, or resampled ones if there are too many or if the filter does so at the end."""
+        filter, after, most = self.filter, self.filter.resample == "after", self.filter.n
+        if filter.resampler.chooses_n and past is not None:
+            most = max(most, len(past))
+        if len(fused) <= most and not after:
+            return fused
         with self.slot("resampler"):
-            if size is not None:
-                # With resample="before", the size was chosen before the prediction: only remove excess particles.
-                limit = max(n, 0 if past is None else len(past))
-                if after or len(fused) > limit:
-                    n = size.checked(fused)
-                    limit = n if after else limit
-            if len(fused) > limit or (after and self.filter.trigger.wants(fused, self.state.t)):
-                # A step that resamples before the prediction may resample a second time, so it needs another stream.
-                selected = self._resample(fused, n, "resampler" if after else "second resampler")
-                if selected.notes is not fused.notes:
-                    self.slot.record(selected.notes)
-                return selected, True
-        return fused, False
+            if len(fused) <= most and not filter.trigger.wants(fused, self.state.t):
+                return fused
+            self.resampled_after = True
+            # A step that resamples before the prediction may resample a second time, so it needs another stream.
+            return self.resample(fused.labelled(fused.parents), "resampler" if after else "second resampler")
 
     def rejuvenate(self, chosen: Population, past: Population | None) -> Population:
-        """Move the particles by `rejuvenation`. The parents of particles do not change."""
-        rejuvenation = self.filter.rejuvenation
-        if rejuvenation is None:
+        """Move the particles, after a resampling. The parents of particles do not change."""
+        wanted = self.resampled_before or self.resampled_after or self.filter.resample == "after"
+        if self.filter.rejuvenation is None or not wanted:
             return chosen
         with self.slot("rejuvenation"):
-            population, previous = chosen.realised(), None
+            population, previous = chosen.realised().labelled(chosen.parents), None
             if past is not None:
                 index = population.parents.get("previous")
                 if index is None or (index < 0).any():
                     raise InputError("rejuvenation needs a parent for every particle, and some have none")
                 previous = past if index is identity(len(past)) else past.take(index)
-            moved = rejuvenation.move(self.rng("rejuvenation"), population, previous, self.observation)
-            moved = _checked(moved, rejuvenation)
-            if len(moved) != len(population):
-                raise InputError(
-                    f"a move returned {len(moved)} of {len(population)} particles, expected all in order"
-                )
-            if moved.notes is not population.notes:
-                self.slot.record(moved.notes)
-        return moved.labelled(population.parents, moved.notes)
+            moved = self.call("rejuvenation", "move", population, previous, self.y, n=len(population))
+        return moved.labelled(population.parents)
 
-    def finish(
-        self,
-        past: Population | None,
-        fused: Population,
-        chosen: Population,
-        resampled_before: bool,
-        resampled_after: bool,
-    ) -> tuple[State, Info]:
+    def finish(self, chosen: Population, fused: Population, past: Population | None) -> tuple[State, Info]:
         """The next `State` and the `Info` of the step."""
-        with self.slot("build"):
-            chosen = chosen.realised()
+        t, key = self.state.t, self.state.key
         ess = fused.ess  # stored in the population, where the trigger of the next step reads it
-        population = chosen.traced_through(past if resampled_before else None)
-        info = Info(
-            t=self.state.t,
-            n=len(population),
-            n_candidates=len(fused),
-            ess=ess,
-            resampled=resampled_before or resampled_after,
-            notes=self.slot.notes,
-            seconds=self.slot.seconds,
-        )
-        proper = self.state.properly_weighted and self.given.properly_weighted
-        return State(self.state.t + 1, population, self.state.key, proper), info
+        with self.slot("build"):
+            population = chosen.realised()
+        population = population.traced_through(past if self.resampled_before else None)
+        resampled = self.resampled_before or self.resampled_after
+        info = Info(t, len(population), len(fused), ess, resampled, self.notes, self.seconds)
+        return State(t + 1, population, key, self.state.properly_weighted and self.filter.properly_weighted), info
 
 
 class _Slot:
-    """Wraps a call of a component: measures wall time, and adds the step and the component to error messages."""
+    """The block in which a component is called: measures wall time, and adds the step and the slot to errors."""
 
-    def __init__(self, t: int) -> None:
-        self.t, self._here = t, threading.local()
-        self.seconds: dict[str, float] = {}
-        self.notes: dict[str, Mapping[str, Any]] = {}
-
-    def __call__(self, name: str) -> _Slot:
-        self._here.name = name
-        return self
+    def __init__(self, name: str, t: int, seconds: dict[str, float]) -> None:
+        self.name, self.t, self.seconds = name, t, seconds
 
     def __enter__(self) -> None:
-        self._here.began = time.perf_counter()
+        self.began = time.perf_counter()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
-        name = self._here.name
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - self._here.began
+        self.seconds[self.name] = self.seconds.get(self.name, 0.0) + time.perf_counter() - self.began
+        if error is None:
+            return
+        where = f"step {self.t}, {self.name}"
         if isinstance(error, InputError):
-            raise error.with_message(f"step {self.t}, {name}: {error.message}") from error
+            raise error.with_message(f"{where}: {error.message}") from error
         slip = usual_slip(error) if isinstance(error, TypeError | ValueError | AttributeError) else None
-        place = place_in_user_file(error) if slip and error is not None else None
+        place = place_in_user_file(error) if slip else None
         if slip and place:
             fact, *hints = slip
-            raise InputError(
-                f"step {self.t}, {name}: {fact} ({place}): {type(error).__name__}: {error}", *hints
-            ) from error
+            raise InputError(f"{where}: {fact} ({place}): {type(error).__name__}: {error}", *hints) from error
         if isinstance(error, Exception):
-            error.add_note(f"in step {self.t}, {name}")
-
-    def record(self, notes: Mapping[str, Any]) -> None:
-        """Store the `notes` (extra values) that a component returned in its population."""
-        if notes:
-            self.notes[self._here.name] = notes
+            error.add_note(f"in {where}")
 
 
-def _checked(found: Any, component: Component) -> Population:
-    """The population that a component returned. Raises InputError if the result is not a `Population`."""
-    if isinstance(found, Population):
-        return found
-    name = type(component).__name__
-    raise InputError(
-        f"{name} returned {type(found).__name__}, expected a Population", "does every branch of the method return it?"
-    )
+def _checked(found: Any, component: Component, n: int | None) -> Population:
+    if not isinstance(found, Population):
+        raise InputError(
+            f"{type(component).__name__} returned {type(found).__name__}, expected a Population",
+            "does every branch of the method return it?",
+        )
+    if n is not None and len(found) != n:
+        raise InputError(f"asked for {n} particles it returned {len(found)}")
+    return found
 
 
 def _priority(lookahead: Lookahead, population: Population, observation: Any) -> np.ndarray:

@@ -37,8 +37,8 @@ from mstfilter.smc.streams import child
 MOST, DRAWS = 64, 200
 #: Share of the posterior mass that a proposal may miss. A truncated proposal often misses a little.
 _MISSED = 1e-3
-#: Networks in single precision give other last digits for another number of rows.
-_LOG_DENSITY, _VALUE = 1e-3, 1e-5
+#: Differences that count as rounding. Networks in single precision give other last digits for another number of rows.
+LOG_DENSITY, VALUE = 1e-3, 1e-5
 #: Two samples differ in law if the Kolmogorov-Smirnov test gives less. So high because a run may not be refused.
 _P_LAW = 1e-12
 
@@ -64,6 +64,25 @@ def unexamined(skip: bool = True) -> Iterator[None]:
         yield
     finally:
         _UNEXAMINED.reset(token)
+
+
+_RECORDED: ContextVar[list[Any] | None] = ContextVar("runs of programs that record their calls", default=None)
+
+
+@contextmanager
+def recorded() -> Iterator[list[Any]]:
+    """Yields a list with a `ProgramRun` for each run of a program in the block. Each run stores its `calls`."""
+    runs: list[Any] = []
+    token = _RECORDED.set(runs)
+    try:
+        yield runs
+    finally:
+        _RECORDED.reset(token)
+
+
+def made_runs() -> list[Any] | None:
+    """The runs of programs in the present block `recorded`; None outside of such a block."""
+    return _RECORDED.get()
 
 
 class Examined(dict[tuple[str, bool], int]):
@@ -135,10 +154,10 @@ def compare_alone(what: str, function: Callable[..., Any], few: Few, *others: An
         return
     whole = _densities(what, function, columns, len(few), "")
     alone = _densities(what, function, [take(c, few.pair) for c in columns], len(few.pair), " alone")
-    same = nearly_equal(whole[few.pair], alone, _LOG_DENSITY, 1.0)
+    same = nearly_equal(whole[few.pair], alone, LOG_DENSITY, 1.0)
     if same.all():
         return
-    if not nearly_equal(_densities(what, function, columns, len(few), ""), whole, _LOG_DENSITY, 1.0).all():
+    if not nearly_equal(_densities(what, function, columns, len(few), ""), whole, LOG_DENSITY, 1.0).all():
         raise InputError(f"{what} differs when it is computed again for the same particles", *REPEATED)
     k = int(np.argmin(same))
     raise InputError(
@@ -193,7 +212,7 @@ def first_difference(ours: Any, again: Any, rows: Any = slice(None)) -> str | No
     if ours.shape != again.shape:
         return f"the shapes {ours.shape} and {again.shape}"
     a, b = ours[rows], again[rows]
-    return None if (a == b).all() or nearly_equal(a, b, _VALUE, spread(ours)).all() else "the particles"
+    return None if (a == b).all() or nearly_equal(a, b, VALUE, spread(ours)).all() else "the particles"
 
 
 # --- draws ----------------------------------------------------------------------------------------------------------

@@ -1,12 +1,18 @@
 """Collectors, which record quantities of a run at every step.
 
-A collector is a function ``(state, info) -> number or array``, which is called after every step.
+A run returns its last state, because all populations of a long run would not fit into memory. What is wanted of the
+others is computed as they come: a collector is a function ``(state, info) -> number or array`` that is called after
+every step.
 
->>> history = collect(filter.iterate(observations, 0), ess=ess, mean=mean)
->>> history["ess"]                                   # (T,)
->>> history.to_xarray()                              # needs xarray
+>>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, collect, ess, mean
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> steps = bootstrap(model, n=100).iterate([0.3, -0.1, 0.8], 0)
+>>> history = collect(steps, ess=ess, mean=mean, largest=lambda state, info: state.population.weights.max())
+>>> history["mean"].shape, sorted(history)
+((3,), ['ess', 'largest', 'mean'])
 
-`mstfilter.smc.run_many` takes the same collectors.
+`mstfilter.smc.run_many` takes the same collectors, and ``history.to_xarray()`` makes a labelled data set of the
+arrays.
 """
 
 from __future__ import annotations
@@ -20,7 +26,6 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, missing_library
 from mstfilter.smc.interfaces import Info, State
-from mstfilter.smc.population import flat_columns
 
 Collector = Callable[[State, Info], Any]
 
@@ -108,6 +113,16 @@ class History(Mapping[str, np.ndarray]):
             for name, a in self.values_.items()
         }
         return xarray.Dataset(data, coords=dict(self.coords))
+
+
+def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
+    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
+    columns = {}
+    for name, a in arrays.items():
+        a = np.asarray(a)
+        for k in np.ndindex(a.shape[axes:]):
+            columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
+    return columns
 
 
 def _summary(name: str, a: np.ndarray) -> str:

@@ -79,41 +79,25 @@ def _all_nan(y: np.ndarray) -> bool:
     return bool(np.isnan(y).all())
 
 
-@dataclass(frozen=True)
-class StepFunction:
-    """A function whose signature does not show that it accepts ``t`` and ``u`` by keyword."""
-
-    function: Callable[..., Any]
-    parameters: Mapping[str, bool]  #: as `step_parameters` returns them
-
-    def __call__(self, *args: Any, **step: Any) -> Any:
-        return self.function(*args, **step)
-
-
 def step_parameters(function: Any, n_arguments: int) -> dict[str, bool]:
     """Which of ``t`` and ``u`` a function accepts after its first `n_arguments` parameters, and which are required.
 
     A parameter without a default value is required.
     """
-    if isinstance(function, StepFunction):
-        return dict(function.parameters)
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):  # not a function, or one without a signature
         return {}
-    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    named = {
-        p.name: p.default is p.empty
-        for i, p in enumerate(parameters)
-        if p.name in ("t", "u") and p.kind in kinds and (i >= n_arguments or p.kind is kinds[1])
-    }
-    return named
+    by_keyword = inspect.Parameter.KEYWORD_ONLY
+    after = [p for p in parameters if p.kind is by_keyword or p in parameters[n_arguments:]]
+    return {p.name: p.default is p.empty for p in after if p.name in ("t", "u") and p.kind in (_NAMED, by_keyword)}
+
+
+_NAMED = inspect.Parameter.POSITIONAL_OR_KEYWORD
 
 
 def check_signature(what: str, function: Any, n_arguments: int) -> None:
     """Raise InputError unless a function can be called with `n_arguments` arguments, and ``t`` and ``u`` by name."""
-    if isinstance(function, StepFunction):
-        return
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # not a function, or one without a signature
@@ -159,11 +143,6 @@ def usual_slip(error: Exception) -> tuple[str, str] | None:
     return next((_USUAL_SLIPS[part] for part in _USUAL_SLIPS if part in str(error)), None)
 
 
-def with_step(function: Callable[..., Any], parameters: Mapping[str, bool]) -> Callable[..., Any]:
-    """Mark a function ``(*arguments, **step)`` as accepting the given parameters by keyword."""
-    return StepFunction(function, parameters) if parameters else function
-
-
 def bind_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: int, u: Any) -> Callable[..., Any]:
     """The function with ``t`` and ``u`` bound. A call raises InputError if a required input is missing."""
     given = {name: value for name, value in (("t", t), ("u", u)) if name in parameters}
@@ -175,7 +154,12 @@ def bind_step(function: Callable[..., Any], parameters: Mapping[str, bool], t: i
 
 
 def _no_input(t: int, *args: Any, **named: Any) -> Any:
-    raise InputError(
+    raise missing_input(t)
+
+
+def missing_input(t: int) -> InputError:
+    """The error if step `t` has no input and the model needs one."""
+    return InputError(
         f"a function of the model has a parameter u, and step {t} has no input",
         "give the input with the observation: WithInput(y, u); name the parameter otherwise if it is none",
     )
@@ -199,7 +183,10 @@ def same_component(one: Any, other: Any) -> bool:
 
 
 class AtStep(Bounded):
-    """Base class of components and models. `at_step` binds time and input to the functions in the fields."""
+    """Base class of components and models. `at_step` binds time and input to the functions in the fields.
+
+    A function in a field may also be a method of an `AtStep` object, which is then bound.
+    """
 
     #: Fields that may be functions of the step -> number of their arguments before ``t`` and ``u``; None for a field
     #: that is a component or a model.
@@ -207,18 +194,23 @@ class AtStep(Bounded):
 
     @cached_property
     def _of_step(self) -> dict[str, dict[str, bool] | None]:
-        """Map each field that depends on the step to its parameters `t` and `u`; None for a component or model."""
+        """Map each field that depends on the step to its parameters `t` and `u`; None for an `AtStep` object."""
         found: dict[str, dict[str, bool] | None] = {}
         for name, n_arguments in self.step_functions.items():
             value = getattr(self, name)
-            if n_arguments is None:
-                if isinstance(value, AtStep) and (type(value).at_step is not AtStep.at_step or value._of_step):
+            if isinstance(owner := _owner(value), AtStep):
+                if owner.depends_on_step:
                     found[name] = None
-            elif value is not None:
+            elif value is not None and n_arguments is not None:
                 check_signature(f"{type(self).__name__}.{name}", value, n_arguments)
                 if parameters := step_parameters(value, n_arguments):
                     found[name] = parameters
         return found
+
+    @property
+    def depends_on_step(self) -> bool:
+        """Whether the result of `at_step` depends on the step."""
+        return type(self).at_step is not AtStep.at_step or bool(self._of_step)
 
     def at_step(self, t: int, u: Any = None) -> Self:
         """The component or model at step `t` with input `u`; the object itself if no field depends on the step.
@@ -234,7 +226,19 @@ class AtStep(Bounded):
             return self
         new = object.__new__(type(self))
         new.__dict__.update(self.__dict__, _of_step={})  # its functions have their step
+        bound: dict[int, Any] = {}
         for name, parameters in self._of_step.items():
             value = getattr(self, name)
-            new.__dict__[name] = value.at_step(t, u) if parameters is None else bind_step(value, parameters, t, u)
+            if parameters is not None:
+                new.__dict__[name] = bind_step(value, parameters, t, u)
+                continue
+            owner = _owner(value)
+            if id(owner) not in bound:
+                bound[id(owner)] = owner.at_step(t, u)
+            new.__dict__[name] = bound[id(owner)] if owner is value else getattr(bound[id(owner)], value.__name__)
         return new
+
+
+def _owner(value: Any) -> Any:
+    """The object of a method; other values are returned unchanged."""
+    return getattr(value, "__self__", value)

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, check_integer
+from mstfilter.base.errors import InputError
 from mstfilter.base.fields import Bounded
 from mstfilter.base.lazy import late, short_repr
 from mstfilter.smc.inputs import AtStep
@@ -137,6 +137,11 @@ class Resampler(Component):
         """Whether the result always has `n` particles. Schemes without duplicates may return fewer particles."""
         return True
 
+    @property
+    def chooses_n(self) -> bool:
+        """Whether the scheme chooses the number of particles itself, so that more than `n` are not too many."""
+        return False
+
     @abstractmethod
     def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
         """Select `n` particles; ``parents["ancestor"]`` holds the (n,) indices of the selected particles."""
@@ -184,17 +189,11 @@ class Trigger(Bounded, ABC):
 
 
 class Size(Bounded, ABC):
-    """Chooses the number of particles to select. The field `n` of the filter is then only the number at the start."""
+    """Chooses the number of particles to select, for the resampler `Sized`."""
 
     @abstractmethod
     def choose(self, population: Population) -> int:
         """Number of particles to select (at least 1), given the weighted particles before the resampling."""
-
-    def checked(self, population: Population) -> int:
-        """The number that `choose` returns. Raises InputError if the number is not an integer of at least 1."""
-        n = self.choose(population)
-        check_integer(f"number of particles that {type(self).__name__} chose", n)
-        return int(n)
 
 
 class Similarity(Bounded, ABC):

@@ -1,10 +1,20 @@
 """Weighted particles.
 
+Particles x^1 .. x^n with weights W^1 .. W^n (which sum to one) stand for a distribution: the expectation of f(x) is
+estimated by sum_i W^i f(x^i). The weights are stored as unnormalised logarithms, because likelihoods of many
+observations underflow:
+
 >>> import numpy as np
 >>> from mstfilter.smc import Population
 >>> population = Population(np.array([0.0, 1.0, 2.0]), np.log([1.0, 1.0, 2.0]))
 >>> population.weights
 array([0.25, 0.25, 0.5 ])
+>>> float(population.weights @ population.particles)                # the expectation of x
+1.25
+
+If few particles carry most of the weight, the others are wasted. The effective sample size (sum w)^2 / sum w^2 says
+how many particles of equal weight would be as good (Kong, Liu, Wong 1994):
+
 >>> round(population.ess, 3)
 2.667
 
@@ -188,7 +198,9 @@ def _check_log_weights(lw: np.ndarray, n: int) -> None:
         wrong = np.flatnonzero(~(lw < np.inf))
         raise InputError(
             f"log weight of particle {wrong[0]} is {lw[wrong[0]]} ({len(wrong)} of {n} are NaN or +inf)",
-            *(["is the observation NaN? one that is missing is None"] if np.isnan(lw).all() else []),
+            "is the observation NaN? one that is missing is None"
+            if np.isnan(lw).all()
+            else "is a parameter of a distribution out of range, such as a negative scale?",
         )
     if top == -np.inf:
         raise LostRunError(
@@ -304,6 +316,16 @@ class Population:
         previous = self.parents.get("previous", np.zeros(0, np.int64))
         return len(np.unique(previous[previous >= 0]))
 
+    def known_parents(self) -> np.ndarray:
+        """(n,) indices of the parents in the previous population; InputError if a particle has no known parent."""
+        index = self.parents.get("previous")
+        if index is None or (index < 0).any():
+            raise InputError(
+                f"{'no' if index is None else 'not every'} particle has a known parent",
+                "a filter with a proposal of new particles has no paths",
+            )
+        return index
+
     @property
     def best(self) -> Any:
         """The particle of largest weight.
@@ -396,11 +418,10 @@ class Population:
 
     def realised(self) -> Population:
         """The same population, with all `Candidates` built."""
-        if type(self.particles) is not np.ndarray and isinstance(
-            self.particles, Candidates
-        ):  # the first test is fast
-            return replace(self, particles=self.particles.built())
-        return self
+        # Arrays are tested first, as a test for an abstract class such as `Candidates` takes longer.
+        if type(self.particles) is np.ndarray or not isinstance(self.particles, Candidates):
+            return self
+        return replace(self, particles=self.particles.built())
 
     def reweighted(self, log_factors: np.ndarray) -> Population:
         """The same particles with `log_factors` added to the log weights."""
@@ -423,16 +444,6 @@ def digest_of(population: Population) -> str:
         if isinstance(a, np.ndarray) and a.dtype != object:
             found.update(f"{name} {a.dtype.str} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
     return found.hexdigest()
-
-
-def flat_columns(arrays: Mapping[str, Any], axes: int = 1) -> dict[str, np.ndarray]:
-    """Table columns from arrays. The first `axes` axes index the rows; array x has columns ``x_0``, ``x_1``, ..."""
-    columns = {}
-    for name, a in arrays.items():
-        a = np.asarray(a)
-        for k in np.ndindex(a.shape[axes:]):
-            columns["_".join([name, *map(str, k)])] = a[(..., *k)].reshape(-1)
-    return columns
 
 
 def _kind(particles: Particles) -> str:

@@ -223,17 +223,16 @@ def inverse_cdf(weights: np.ndarray, shifts: np.ndarray, n: int) -> np.ndarray:
     The shifts, in [0, 1), are (n,), or (1,) if all points have the same one.
     """
     ends = weights.cumsum()
-    total = ends[-1]
-    last = ends == total
-    ends *= n / total
+    ends *= n / ends[-1]  # where the intervals of the particles end, in units of 1 / n
     if len(shifts) == 1:
         ends -= shifts[0]
     else:
         for begin in range(0, len(ends), _BLOCK):
             block = ends[begin : begin + _BLOCK]
-            block -= shifts.take(block.astype(np.int64), mode="clip")  # the last position lies in stratum n
-    np.ceil(ends, out=ends)  # the number of points below each cumulative weight: not negative, as it was above -1
-    np.putmask(ends, last, n)  # whatever the rounding
+            block -= shifts.take(block.astype(np.int64), mode="clip")  # the last end lies in stratum n
+    np.ceil(ends, out=ends)  # the number of points below each end
+    if ends[-1] != n:  # by rounding
+        ends[ends == ends[-1]] = n
     return expanded(ends.astype(np.int64), n)
 
 
@@ -249,6 +248,15 @@ def draw_rows(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
     total = cumulative[:, -1:]
     index = (cumulative <= uniforms[:, None] * total).sum(axis=1)  # "at" a point skips weights of zero
     return np.minimum(index, (cumulative < total).sum(axis=1))
+
+
+def draw_log(rng: np.random.Generator, log_weights: np.ndarray) -> np.ndarray:
+    """Draw one index for each row of log weights (n, m); InputError for a row without a finite maximum."""
+    top = log_weights.max(axis=1, keepdims=True)
+    if not np.isfinite(top).all():
+        row = int(np.argmin(np.isfinite(top[:, 0])))
+        raise InputError(f"the largest log weight of row {row} is {top[row, 0]}, so no index can be drawn")
+    return draw_rows(np.exp(log_weights - top), rng.random(len(log_weights)))
 
 
 def independent_draws(rng: np.random.Generator, weights: np.ndarray, n: int) -> np.ndarray:

@@ -43,7 +43,7 @@ class Collected:
 
 def can_sweep(filter: ParticleFilter) -> bool:
     """Whether runs of a filter can be swept: its components process each particle alone, and n is constant."""
-    if any(getattr(filter, slot) is not None for slot in ("proposal", "rejuvenation", "size")):
+    if any(getattr(filter, slot) is not None for slot in ("proposal", "rejuvenation")):
         return False
     components = (filter.initial, filter.transition, filter.update, filter.lookahead)
     return filter.resampler.exact_size and all(c is None or c.alone for c in components)

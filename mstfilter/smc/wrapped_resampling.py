@@ -18,11 +18,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from mstfilter.base.errors import InputError
+from mstfilter.base.errors import InputError, check_integer
 from mstfilter.base.fields import Share
-from mstfilter.smc.components import ExactEquality
+from mstfilter.smc.components import ExactEquality, Kld
 from mstfilter.smc.diverse_resampling import FearnheadClifford
-from mstfilter.smc.interfaces import Equivalence, Resampler
+from mstfilter.smc.interfaces import Equivalence, Resampler, Size
 from mstfilter.smc.population import Population, as_matrix
 from mstfilter.smc.resampling import Multinomial, Stratified, Systematic, checked_weights, search
 
@@ -43,6 +43,10 @@ class ResamplerWrapper(Resampler):
     @property
     def exact_size(self) -> bool:
         return self.scheme.exact_size
+
+    @property
+    def chooses_n(self) -> bool:
+        return self.scheme.chooses_n
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,21 @@ def coalesce(rng: np.random.Generator, log_weights: np.ndarray, classes: np.ndar
     representatives = np.sort(drawn)
     total = np.log(np.bincount(classes, weights)[classes[representatives]]) + lw.max()
     return representatives, total + np.log(len(representatives) / len(lw))
+
+
+@dataclass(frozen=True)
+class Sized(ResamplerWrapper):
+    """Selects as many particles as `size` chooses. The number `n` of the filter is then only that at the start."""
+
+    size: Size = Kld()  # noqa: RUF009 (frozen)
+
+    exact_size: ClassVar[bool] = False
+    chooses_n: ClassVar[bool] = True
+
+    def resample(self, rng: np.random.Generator, population: Population, n: int) -> Population:
+        chosen = self.size.choose(population)
+        check_integer(f"number of particles that {type(self.size).__name__} chose", chosen)
+        return self.scheme.resample(rng, population, int(chosen))
 
 
 @dataclass(frozen=True)

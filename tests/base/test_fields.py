@@ -40,6 +40,7 @@ class Own(Part):
     m: int = 2
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.m < self.n:
             raise InputError(f"m is {self.m}, expected at least n = {self.n}")
 

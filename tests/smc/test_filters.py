@@ -17,6 +17,7 @@ from mstfilter.smc import (
     PriorityLookahead,
     RandomWalkMove,
     Size,
+    Sized,
     StateSpaceModel,
     WeightResampler,
     auxiliary,
@@ -168,7 +169,7 @@ class Alternating(Size):
 
 @pytest.mark.parametrize("resample", ["before", "after"])
 def test_a_size_that_changes_keeps_the_evidence(resample):
-    filter = replace(bootstrap(AR1, 60), size=Alternating(), resample=resample)
+    filter = replace(bootstrap(AR1, 60, Sized(size=Alternating())), resample=resample)
     sizes = {info.n for info in filter.run(YS, 0)[1]}
     assert len(sizes) > 1
     mean, standard, _ = mean_ratio(filter, YS, kalman_ar1(YS)[1], range(500))

@@ -103,8 +103,8 @@ def test_functions_and_covariances_of_the_step():
     Qs = np.stack([9 * np.eye(2), Q])
     found = ukf_proposal(lambda x, t: f(x) + t, Qs, h, R)
     expected = ukf_proposal(lambda x: f(x) + 1, Q, h, R)(PARTICLES, Y)
-    np.testing.assert_allclose(found(PARTICLES, Y, t=1).mean, expected.mean)
-    np.testing.assert_allclose(found(PARTICLES, Y, t=1).cov, expected.cov)
+    np.testing.assert_allclose(found.at_step(1)(PARTICLES, Y).mean, expected.mean)
+    np.testing.assert_allclose(found.at_step(1)(PARTICLES, Y).cov, expected.cov)
     model = nonlinear_gaussian(lambda x, t: f(x) + t, Qs, h, R, np.zeros(2), np.eye(2))
     assert np.isfinite(guided(model, found, 20).run([Y, Y], 0)[0].log_evidence)
 

@@ -27,6 +27,7 @@ from mstfilter.smc import (
     Program,
     Proposal,
     Reweight,
+    Sized,
     StateSpaceModel,
     Transition,
     Uniform,
@@ -369,7 +370,7 @@ def test_what_chains_reject():
             pmmh(filter_of, YS, log_prior, [0.1], scale, 5)
     with pytest.warns(UserWarning, match="one by one: a component looks at several particles"):
         pmmh(
-            lambda theta: replace(bootstrap(AR1, 5), size=Kld(n_min=2, n_max=9)),
+            lambda theta: bootstrap(AR1, 5, Sized(size=Kld(n_min=2, n_max=9))),
             YS,
             log_prior,
             [0.1],

@@ -16,6 +16,7 @@ from mstfilter.smc import (
     Gaussian,
     Kld,
     Population,
+    Sized,
     Systematic,
     bootstrap,
     linear_gaussian,
@@ -45,7 +46,7 @@ def test_kld_follows_the_posterior_in_a_filter():
     """Narrow posterior, few particles; the filter takes the size at each resampling."""
     model = linear_gaussian(F=[[0.9]], Q=[[0.5]], H=[[1.0]], R=[[0.01]], m0=[0.0], P0=[[4.0]])
     start = bootstrap(model, n=1000, resampler=Systematic(), trigger=Always())
-    sized = replace(start, size=Kld(Bins(0.25), epsilon=0.05, n_min=20))
+    sized = replace(start, resampler=Sized(Systematic(), Kld(Bins(0.25), epsilon=0.05, n_min=20)))
     state, _ = sized.run([0.3, -0.1, 0.8], seed=0)
     assert 20 <= len(state.population) < 300
 

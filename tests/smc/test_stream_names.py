@@ -20,6 +20,7 @@ from mstfilter.smc import (
     Normal,
     Program,
     RandomWalkMove,
+    Sized,
     auxiliary,
     bootstrap,
     guided,
@@ -57,7 +58,7 @@ ASSEMBLIES = {
     "auxiliary": branching(auxiliary(AR1, predictive, 8, trigger=Always())),
     "resample-move": branching(resample_move(AR1, RandomWalkMove(AR1, 0.5), 8, trigger=Always())),
     "clusters": branching(bootstrap(AR1, 8, ClusterStratified(), Always())),
-    "KLD size": branching(replace(bootstrap(AR1, 8, trigger=Always()), size=Kld(n_min=2, n_max=9))),
+    "KLD size": branching(bootstrap(AR1, 8, Sized(size=Kld(n_min=2, n_max=9)), Always())),
     "program": branching(Program(walk).guided(guide, 8, trigger=Always())),
 }
 

@@ -77,6 +77,7 @@ class SceneFamily(Bounded):
     voxel_size: Annotated[float, Bounds(at_least=0.001, at_most=0.1)] = 0.01  #: edge of a voxel, metres
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_integer("n_objects_max", self.n_objects_max, at_least=self.n_objects_min, at_most=40)
         for field in ("n_twins", "n_stacked", "n_hidden"):
             check_integer(field, getattr(self, field), at_least=0, at_most=self.n_objects_min - 1)

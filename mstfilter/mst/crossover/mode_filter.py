@@ -46,6 +46,7 @@ class ModeFilter(Bounded):
     max_sweeps: PositiveInt = 100
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.window % 2 == 0:
             raise InputError(f"mode filter window is {self.window}, expected an odd number of voxels")
 

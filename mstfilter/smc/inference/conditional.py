@@ -1,5 +1,9 @@
 """Paths of states given all observations, drawn one at a time by conditional SMC.
 
+A filter of n particles draws a path x_0 .. x_T that has nearly the law p(x_0 .. x_T | y_0 .. y_T), with a bias of
+order 1 / n. Conditional SMC removes the bias: one of the particles must follow a given path, and the drawn path
+replaces it. This is a Markov chain of paths whose law is exact for any n >= 2 (Andrieu, Doucet, Holenstein 2010):
+
 >>> path = conditional_path(filter, observations, seed=0)                  # from an ordinary filter
 >>> path = conditional_path(filter, observations, seed=1, path=path)       # the next one, given the first
 
@@ -15,14 +19,13 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inference.smoothing import draw_log
 from mstfilter.smc.inputs import check_observations, same_component, split_input
 from mstfilter.smc.interfaces import DensityTransition, Transition
-from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, program_step, run_program
+from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, run_program
 from mstfilter.smc.models.programs.handlers import GivenHandler
 from mstfilter.smc.models.state_space import Dynamics, Prior
 from mstfilter.smc.population import Particles, Population, count_particles, take
-from mstfilter.smc.resampling import Multinomial
+from mstfilter.smc.resampling import Multinomial, draw_log
 from mstfilter.smc.streams import Key
 
 _FIRST = np.zeros(1, np.int64)  # the row of the particle that follows the given path
@@ -94,7 +97,7 @@ def _observations(observations: Sequence[Any], path: Particles | None) -> list[A
 
 
 def _check_conditional(filter: ParticleFilter) -> None:
-    for slot in ("proposal", "lookahead", "rejuvenation", "size"):
+    for slot in ("proposal", "lookahead", "rejuvenation"):
         if getattr(filter, slot) is not None:
             raise InputError(
                 f"conditional SMC does not know a filter with `{slot}`", "use a bootstrap or guided filter"
@@ -138,8 +141,14 @@ def _moved(
     """The particles of a step before the update. Particle 0 is the given particle with the weight of its move."""
     component: Any
     slot, component = ("initial", filter.initial) if past is None else ("transition", filter.transition)
+    rng, moved = streams.child(slot).generator(), past
     try:
-        particles, log_weights = _drawn(streams.child(slot).generator(), component, past, y, filter.n)
+        if past is None:
+            moved = component.sample(rng, y, filter.n)
+        elif component is not None:
+            moved = component.predict(rng, past, y)
+        assert moved is not None
+        particles, log_weights = moved.particles, moved.log_weights
     except LostRunError:  # all particles have weight 0, but perhaps not the given one
         if given is None:
             raise
@@ -165,20 +174,6 @@ def _moved(
             "use Prior, Dynamics or a Program",
         )
     return Population(_with_first(particles, given), log_weights)
-
-
-def _drawn(
-    rng: np.random.Generator, component: Any, past: Population | None, y: Any, n: int
-) -> tuple[Particles, np.ndarray]:
-    """Particles and log weights of a step, drawn without a given path. Programs run without `Guard` checks."""
-    if not isinstance(component, ProgramInitial | ProgramTransition):
-        if past is None:
-            moved = component.sample(rng, y, n)
-        else:
-            moved = past if component is None else component.predict(rng, past, y)
-        return moved.particles, moved.log_weights
-    guide = None if y is None else component.guide
-    return program_step(rng, component.model, guide, None if past is None else past.particles, y, n)
 
 
 def _given_to_program(component: Any, old: Particles | None, given: Particles, y: Any) -> tuple[Particles, float]:

@@ -1,12 +1,18 @@
 """Monte Carlo variances of the estimates of a run, estimated from the same run, and distances between populations.
 
->>> found = run_variance(bootstrap(model, n=1000), observations, seed=0, lag=20)
->>> found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5    # an estimate and its standard error
+How much would the log evidence change with another seed? Particles that descend from one ancestor are not
+independent, so the run itself tells: the fewer ancestors carry the weight, the larger is the variance (Lee and
+Whiteley 2018).
+
+>>> from mstfilter.smc import Normal, StateSpaceModel, bootstrap, run_variance
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> found = run_variance(bootstrap(model, n=1000), [0.3, -0.1, 0.8], seed=0, lag=20)
+>>> estimate, standard_error = found.log_evidence[-1], found.log_evidence_variance[-1] ** 0.5
 
 `energy_distance` compares two populations. Half of the energy distance between a population and the true state is
 the energy score (Gneiting and Raftery 2007). A lower score is better:
 
->>> energy_distance(population, Population(np.array([truth]))) / 2
+>>> energy_distance(population, Population(np.array([truth]))) / 2         # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -18,9 +24,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, check_integer
+from mstfilter.base.errors import InputError, check_integer, naming
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inference.smoothing import known_parents
 from mstfilter.smc.interfaces import State
 from mstfilter.smc.population import Population, as_matrix, union
 from mstfilter.smc.wrapped_resampling import Coalesced, ResamplerWrapper
@@ -153,7 +158,8 @@ def run_variance(
         if info.t == 0:
             ancestry.begin(info.n_candidates)
             first = np.arange(info.n_candidates)
-        parents = known_parents(population, info.t) if info.t else population.parents.get("ancestor", first)
+        with naming(f"step {info.t}"):
+            parents = population.known_parents() if info.t else population.parents.get("ancestor", first)
         ancestry.descend(watched.selections, parents, population.weights)
         watched.selections.clear()
         if info.t > 0 and lag is not None:

@@ -1,6 +1,9 @@
 """Inference of model parameters by particle Markov chain Monte Carlo.
 
-A model with parameters is a function that returns a filter:
+The posterior of parameters is p(theta) p(y | theta) up to a factor. A filter estimates the evidence p(y | theta)
+without bias, and an unbiased estimate in place of the exact value leaves the posterior of a Metropolis chain exact,
+if the estimate of the present parameters is kept until a proposal is accepted (Andrieu, Doucet, Holenstein 2010). So
+a model with parameters is a function that returns a filter:
 
 >>> def filter_of(theta):
 ...     rho, sigma = theta
@@ -8,10 +11,8 @@ A model with parameters is a function that returns a filter:
 >>> chains = pmmh(filter_of, observations, log_prior, start=[0.5, 1.0], scale=[0.1, 0.1], n_iterations=5000)
 >>> chains.theta[1000:].mean(axis=(0, 1)), chains.autocorrelation_times()
 
-- `pmmh` is a Metropolis chain that uses the filter's unbiased estimate of the likelihood. The estimate for the
-  current parameters is kept until a proposal is accepted, so the chain converges to the exact posterior for any
-  number of particles (Andrieu, Doucet, Holenstein 2010).
-- `ensemble` runs the ensemble sampler emcee with such estimates of the likelihood. It needs no scale of the steps.
+- `pmmh` is such a Metropolis chain.
+- `ensemble` runs the ensemble sampler emcee with the same estimates. It needs no scale of the steps.
 - `particle_gibbs` draws the parameters given the path of states, and then the path by `conditional_path`. Without
   ancestor sampling the early states of the path hardly change.
 """
@@ -31,11 +32,11 @@ import numpy as np
 from mstfilter.base.errors import InputError, LostRunError, check_integer
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import unexamined
-from mstfilter.smc.history import log_evidence
+from mstfilter.smc.history import flat_columns, log_evidence
 from mstfilter.smc.inference.conditional import conditional_path
+from mstfilter.smc.inference.metropolis import metropolis
 from mstfilter.smc.inputs import check_observations, split_input
-from mstfilter.smc.models.state_space import metropolis
-from mstfilter.smc.population import Particles, flat_columns, union
+from mstfilter.smc.population import Particles, union
 from mstfilter.smc.streams import Key
 from mstfilter.smc.sweep import can_sweep, sweep_runs
 

@@ -1,15 +1,20 @@
 """Smoothers, which use the populations of a run to estimate the states given all observations.
 
->>> record = keep(bootstrap(model, n=500), observations, seed=0)
+A filter says what is known about x_t after y_0 .. y_t. Later observations say more about x_t. The ancestors of the
+last particles are draws of x_t given all observations, but after many resamplings few distinct ones are left.
+Backward sampling draws new paths instead: from the end, it chooses particle i at time t as the predecessor of
+x_{t+1} with probability proportional to w_i f(x_{t+1} | x_i).
+
+>>> import numpy as np
+>>> from mstfilter.smc import Dynamics, Normal, StateSpaceModel, backward_paths, bootstrap, keep
+>>> model = StateSpaceModel.of(Normal(0.0, 1.0), lambda x: Normal(0.9 * x, 0.5), lambda x: Normal(x, 1.0))
+>>> record = keep(bootstrap(model, n=500), [0.3, -0.1, 0.8], seed=0)
 >>> paths = backward_paths(np.random.default_rng(1), record, Dynamics(model), n=200)
->>> [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_T], t = 0 .. T
+>>> means = [population.weights @ population.particles for population in paths]        # E[x_t | y_0 .. y_2]
 
-`genealogy`, `fixed_lag` and `backward_paths` take a `Record` and return a tuple with one population per time. The
-page "Smoothing" of the documentation compares them.
-
-The smoothers accept any properly weighted filter, including filters with guided moves, a lookahead or rejuvenation.
-
-`mstfilter.smc.inference.conditional` draws single paths of models and of programs.
+`genealogy`, `fixed_lag` and `backward_paths` take a `Record` of any properly weighted filter and return a tuple with
+one population per time. The page "Smoothing" of the documentation compares them. `conditional_path` draws single
+paths of models and of programs. Reference: Godsill, Doucet, West (2004).
 """
 
 from __future__ import annotations
@@ -20,13 +25,13 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, check_choice, check_component, check_integer
+from mstfilter.base.errors import InputError, check_choice, check_component, check_integer, naming
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.inference.metropolis import moved
 from mstfilter.smc.inputs import check_observations, split_input
 from mstfilter.smc.interfaces import DensityTransition, State
-from mstfilter.smc.models.state_space import moved
 from mstfilter.smc.population import Particles, Population, take
-from mstfilter.smc.resampling import draw_rows, independent_draws
+from mstfilter.smc.resampling import draw_log, independent_draws
 
 BackwardMethod = Literal["exact", "mcmc"]
 #: Largest number of pairs of particles in a call of `log_prob`.
@@ -47,18 +52,8 @@ class Record:
 
     def parents(self, t: int) -> np.ndarray:
         """(n,) indices in population t - 1 of the parents of the particles at time t."""
-        return known_parents(self.populations[t], t)
-
-
-def known_parents(population: Population, t: int) -> np.ndarray:
-    """(n,) indices of the parents in the previous population; InputError if a particle has no known parent."""
-    index = population.parents.get("previous")
-    if index is None or (index < 0).any():
-        raise InputError(
-            f"step {t}: {'no' if index is None else 'not every'} particle has a known parent",
-            "a filter with a proposal of new particles has no paths",
-        )
-    return index
+        with naming(f"step {t}"):
+            return self.populations[t].known_parents()
 
 
 def keep(filter: ParticleFilter, observations: Iterable[Any], seed: int | State = 0) -> Record:
@@ -173,7 +168,10 @@ class _Move:
         m, drawn = len(self.population), []
         for rows in np.split(np.arange(n), range(max(1, _PAIRS // m), n, max(1, _PAIRS // m))):
             density = self._log_density(np.tile(np.arange(m), len(rows)), np.repeat(rows, m))
-            drawn.append(draw_log(rng, self.population.log_weights + density.reshape(-1, m), self.t))
+            log_weights = self.population.log_weights + density.reshape(-1, m)
+            if (log_weights.max(axis=1) == -np.inf).any():
+                raise _impossible(self.t)
+            drawn.append(draw_log(rng, log_weights))
         return np.concatenate(drawn)
 
     def metropolis(self, rng: np.random.Generator, parents: np.ndarray, steps: int) -> np.ndarray:
@@ -198,17 +196,8 @@ def _by_weight(rng: np.random.Generator, population: Population, n: int) -> np.n
     return index
 
 
-def draw_log(rng: np.random.Generator, log_weights: np.ndarray, t: int | None = None) -> np.ndarray:
-    """Draw one index per row of (n, m) log weights."""
-    top = log_weights.max(axis=1, keepdims=True)
-    if not np.isfinite(top).all():
-        raise _impossible(t)
-    return draw_rows(np.exp(log_weights - top), rng.random(len(log_weights)))
-
-
-def _impossible(t: int | None) -> InputError:
-    where = "" if t is None else f"from step {t} to {t + 1}: "
+def _impossible(t: int) -> InputError:
     return InputError(
-        f"{where}a particle has no possible predecessor, or a density is NaN or +inf",
+        f"from step {t} to {t + 1}: a particle has no possible predecessor, or a density is NaN or +inf",
         "backward paths need the density of the transition that moved the particles",
     )

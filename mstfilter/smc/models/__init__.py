@@ -1,6 +1,6 @@
 """Models of number particles, and the filters that a model has.
 
-`state_space`    a model from densities or functions; bootstrap, guided, auxiliary and resample-move filters
+`state_space`    a model from densities or functions; bootstrap, guided and auxiliary filters
 `programs`       the same filters for a model written as a probabilistic program
 `distributions`  what models are made of; any distribution of scipy.stats fits in, too
 `exact`          linear-Gaussian and finite models, whose posterior is known

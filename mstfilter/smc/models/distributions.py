@@ -1,31 +1,31 @@
 """Distributions for models, drawn and evaluated for all particles together.
 
+A model says how x_t and y_t are distributed given a particle. A filter has many particles, so a distribution has one
+row of parameters for each of them, and draws or evaluates all rows in one call:
+
 >>> import numpy as np
 >>> rng = np.random.default_rng(0)
->>> x = Normal(np.zeros(5), 2.0).sample(rng, 5)          # one row per particle
->>> Normal(x, 1.0).log_prob(0.3).shape
+>>> x = Normal(np.zeros(5), 2.0).sample(rng, 5)          # x_0, one row per particle
+>>> Normal(x, 1.0).log_prob(0.3).shape                   # log p(y | x) of one observation for each particle
 (5,)
 
-The first axis is the axis of the particles. Parameters of shape () or (n,) give values of shape (n,): the event shape
-is (). Parameters (1, d) or (n, d) give values (n, d): the event shape is (d,). The entries of an event are
-independent, and their log densities are summed. `log_prob` returns (n,) values, or one value if no argument has rows.
+Parameters of shape () or (n,) give values of shape (n,); the event shape is then (). Parameters (1, d) or (n, d) give
+values (n, d) with the event shape (d,), as in Pyro or TensorFlow Probability. The entries of an event are
+independent, and their log densities are summed.
+
+A parameter that is one number is checked when the distribution is made. Rows are checked when values are drawn. The
+log density of a row that is out of range is NaN: an update refuses it, and a Metropolis move, which may propose such
+parameters, rejects it.
 
 Frozen distributions of scipy.stats, such as ``stats.poisson(rate)`` and ``stats.gamma(shape)``, can be used in place
-of the classes of this module (`as_distribution`). This module is three to six times as fast as scipy. For a
-distribution of another library, write a `Distribution` whose `sample` draws from the given generator.
-
-A parameter out of range, in any row, raises InputError when the distribution is made. Array parameters of `Normal`
-and `Student` are checked only when the distribution is sampled. The log density of a row with a parameter out of
-range is NaN. MCMC moves may propose values that make a parameter invalid. Inside `hypothetical`, such rows do not
-raise InputError, but have the log density NaN, so that the moves are rejected.
+of the classes of this module (`as_distribution`), which are three to six times as fast. For a distribution of another
+library, write a `Distribution` whose `sample` draws from the given generator.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -37,18 +37,6 @@ from mstfilter.smc.resampling import draw_rows, search
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _FLOAT64 = np.dtype(np.float64)
-_HYPOTHETICAL: ContextVar[bool] = ContextVar("parameters may be out of range", default=False)
-
-
-@contextmanager
-def hypothetical() -> Iterator[None]:
-    """In the block, rows whose parameters are out of range have the log density NaN instead of raising InputError."""
-    token = _HYPOTHETICAL.set(True)
-    try:
-        with np.errstate(invalid="ignore"):
-            yield
-    finally:
-        _HYPOTHETICAL.reset(token)
 
 
 class Range(NamedTuple):
@@ -77,32 +65,25 @@ POSITIVE = Range("a positive number", 0.0)
 
 
 class _Checked(Distribution):
-    """A distribution that checks its parameters, which are its fields.
-
-    Scalar parameters are checked when the distribution is made. Arrays are checked at the same time unless `lazy` is
-    True. Lazy arrays are checked when the distribution is sampled. The log density of a row with invalid parameters
-    is NaN.
-    """
+    """A distribution whose fields are parameters with the given `ranges`."""
 
     draws_numbers = True
     ranges: ClassVar[Mapping[str, Range]] = {}
-    lazy: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for name in self.ranges:
             value = getattr(self, name)
             if _may_wrap(value):
                 object.__setattr__(self, name, value.astype(np.float64))
-            if not (self.lazy and type(getattr(self, name)) is np.ndarray):
-                self._check(name, self.ranges[name])
+            if not np.ndim(value):
+                self._check(name)
 
     def check_parameters(self) -> None:
-        for name, parameters in self.ranges.items():
-            self._check(name, parameters)
+        for name in self.ranges:
+            self._check(name)
 
-    def _check(self, name: str, allowed: Range) -> None:
-        """Raise InputError if an entry of a parameter is out of range. In `hypothetical`, such rows become NaN."""
-        value = getattr(self, name)
+    def _check(self, name: str) -> None:
+        value, allowed = getattr(self, name), self.ranges[name]
         if allowed.surely_contains(value):  # a third of the time of the rest
             return
         array = np.asarray(value)
@@ -111,17 +92,16 @@ class _Checked(Distribution):
                 f"{name} of a {type(self).__name__} is {value!r}"[:200] + f", expected {allowed.expected}",
                 *(["None stands for a missing observation, or for previous at the first step"] * (value is None)),
             )
-        self._check_rows(name, array, ~allowed.contains(array), allowed.expected)
+        self._refuse(name, array, ~allowed.contains(array))
 
-    def _check_rows(self, name: str, array: np.ndarray, wrong: np.ndarray, expected: str) -> None:
+    def _refuse(self, name: str, array: np.ndarray, wrong: np.ndarray) -> None:
+        """Raise InputError if an entry of a parameter is `wrong`."""
         if not wrong.any():
             return
         array = np.broadcast_to(array, wrong.shape)
-        if _HYPOTHETICAL.get() and array.ndim:
-            object.__setattr__(self, name, np.where(wrong, np.nan, array))
-            return
         first = tuple(int(i) for i in np.argwhere(wrong)[0])
         row = f" in row {first[0]} ({int(wrong.sum())} of {array.size})" if first else ""
+        expected = self.ranges[name].expected
         raise InputError(f"{name} of a {type(self).__name__} is {array[first]}{row}, expected {expected}")
 
 
@@ -151,6 +131,11 @@ def _is_finite(value: Any) -> bool:
 def _impossible(value: np.ndarray) -> Any:
     """Log density of a value outside the support: -inf, or NaN if the value is NaN."""
     return np.where(np.isnan(value), np.nan, -np.inf) if value.dtype.kind == "f" else -np.inf
+
+
+def _where(valid: np.ndarray, log_prob: np.ndarray) -> np.ndarray:
+    """The log densities; NaN where a parameter is out of range."""
+    return log_prob if valid.all() else np.where(valid, log_prob, np.nan)
 
 
 def _broadcast_shape(*parameters: Any) -> tuple[int, ...]:
@@ -204,7 +189,6 @@ class Normal(_Independent):
     scale: Any = 1.0
 
     ranges: ClassVar = {"loc": FINITE, "scale": POSITIVE}
-    lazy: ClassVar = True
 
     def __post_init__(self) -> None:
         usual = type(self.scale) is float and 0.0 < self.scale < math.inf and type(self.loc) is np.ndarray
@@ -245,7 +229,6 @@ class Student(_Independent):
     scale: Any = 1.0
 
     ranges: ClassVar = {"df": POSITIVE, "loc": FINITE, "scale": POSITIVE}
-    lazy: ClassVar = True
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         self.check_parameters()
@@ -271,42 +254,46 @@ class Uniform(_Independent):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _broadcast_shape(self.low, self.high)
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        self._check_rows("high", high, ~(low < high), "a finite number above low")
+        if not _broadcast_shape(self.low, self.high):
+            self.check_parameters()
+
+    def check_parameters(self) -> None:
+        super().check_parameters()
+        self._refuse("high", np.asarray(self.high), np.logical_not(np.less(self.low, self.high)))
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        self.check_parameters()
         u = rng.random(self.value_shape(size))
         return self.low + (np.asarray(self.high) - self.low) * u
 
     def log_prob(self, value: Any) -> np.ndarray:
-        x = np.asarray(value)
+        x, width = np.asarray(value), np.asarray(self.high) - self.low
         inside = (x >= self.low) & (x < self.high)
-        return _sum_rows(np.where(inside, -np.log(np.asarray(self.high) - self.low), _impossible(x)))
+        return _sum_rows(_where(width > 0, np.where(inside, -np.log(width), _impossible(x))))
 
     def _mean(self) -> Any:
         return (np.asarray(self.low) + self.high) / 2
 
 
+def _symmetric(cov: np.ndarray) -> np.ndarray:
+    """Whether each covariance is symmetric and finite."""
+    asymmetry = abs(cov - np.swapaxes(cov, -1, -2)).max(axis=(-1, -2), initial=0.0)
+    return asymmetry <= 1e-6 * abs(cov).max(axis=(-1, -2), initial=0.0)
+
+
 def _cholesky(cov: np.ndarray) -> np.ndarray:
-    """Lower triangular root of each covariance; in `hypothetical`, NaN for one that is not positive definite."""
+    """Lower triangular root of each covariance; NaN for one that is not symmetric and positive definite."""
     if cov.ndim not in (2, 3) or cov.shape[-1] != cov.shape[-2]:
         raise InputError(f"covariance has shape {cov.shape}, expected (d, d) or (n, d, d)")
-    size = abs(cov).max(axis=(-1, -2), initial=0.0)
-    symmetric = abs(cov - np.swapaxes(cov, -1, -2)).max(axis=(-1, -2), initial=0.0) <= 1e-6 * size
+    symmetric = _symmetric(cov)
     if symmetric.all():
         try:
             return np.linalg.cholesky(cov)
         except np.linalg.LinAlgError:
             pass
-    valid = symmetric & (np.linalg.eigvalsh(np.nan_to_num(cov))[..., 0] > 0) & np.isfinite(size)
-    if _HYPOTHETICAL.get() and cov.ndim == 3:
-        root = np.linalg.cholesky(np.where(valid[:, None, None], cov, np.eye(cov.shape[-1])))
-        return np.where(valid[:, None, None], root, np.nan)
-    row = int(np.argmin(valid))
-    what = "positive definite" if symmetric.flat[row] else "symmetric"
-    where = f" in row {row}" if cov.ndim == 3 else ""
-    raise InputError(f"covariance is not {what}{where}: {cov.reshape(-1, *cov.shape[-2:])[row].tolist()}"[:300])
+    valid = symmetric & np.isfinite(cov).all(axis=(-1, -2)) & (np.linalg.eigvalsh(np.nan_to_num(cov))[..., 0] > 0)
+    valid = valid[..., None, None]
+    return np.where(valid, np.linalg.cholesky(np.where(valid, cov, np.eye(cov.shape[-1]))), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,12 +318,28 @@ class MultivariateNormal(_Checked):
                 "the mean is (d,), or (n, d) with one row per particle; x[:, None] makes (n, 1) of (n,)",
             )
         object.__setattr__(self, "_root", root)
+        if root.ndim == 2:
+            self._check_covariance()
+
+    def check_parameters(self) -> None:
+        super().check_parameters()
+        self._check_covariance()
+
+    def _check_covariance(self) -> None:
+        wrong = np.isnan(self.__dict__["_root"][..., :1, 0]).ravel()
+        if wrong.any():
+            row, cov = int(np.argmax(wrong)), np.asarray(self.cov, np.float64)
+            where = f" in row {row}" if cov.ndim == 3 else ""
+            cov = cov.reshape(-1, *cov.shape[-2:])[row]
+            what = "positive definite" if _symmetric(cov) else "symmetric"
+            raise InputError(f"covariance is not {what}{where}: {cov.tolist()}"[:300])
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
         return _broadcast_shape(np.zeros((1, 1)), self.loc, self.__dict__["_root"][..., 0])
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        self.check_parameters()
         root = self.__dict__["_root"]
         z = rng.standard_normal(self.value_shape(size))
         return self.loc + (z @ root.T if root.ndim == 2 else np.einsum("nij,nj->ni", root, z))
@@ -368,13 +371,15 @@ class Bernoulli(_Independent):
     ranges: ClassVar = {"p": Range("a probability from 0 to 1", 0.0, 1.0, open=False)}
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        self.check_parameters()
         return rng.random(self.value_shape(size)) < self.p
 
     def log_prob(self, value: Any) -> np.ndarray:
-        x = np.asarray(value)
-        with np.errstate(divide="ignore"):
-            log_p = np.where(x.astype(bool), np.log(self.p), np.log1p(-np.asarray(self.p, np.float64)))
-        return _sum_rows(np.where((x == 0) | (x == 1), log_p, _impossible(x)))
+        x, p = np.asarray(value), np.asarray(self.p, np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_p = np.where(x.astype(bool), np.log(p), np.log1p(-p))
+        possible = np.where((x == 0) | (x == 1), log_p, _impossible(x))
+        return _sum_rows(_where(self.ranges["p"].contains(p), possible))
 
     def _mean(self) -> Any:
         return self.p
@@ -394,16 +399,21 @@ class Categorical(Distribution):
             raise InputError(f"probabilities of a categorical have shape {p.shape}, expected (k,) or (n, k)")
         total = p.sum(axis=-1, keepdims=True)
         if p.size and not (p.min() >= 0 and total.min() > 0 and total.max() < np.inf):
-            wrong = ~((p >= 0).all(axis=-1) & (total[..., 0] > 0) & (total[..., 0] < np.inf))
-            if not (_HYPOTHETICAL.get() and p.ndim == 2):
-                row = int(np.argmax(wrong))
-                where = f" in row {row} ({int(wrong.sum())} of {len(p)})" if p.ndim == 2 else ""
-                raise InputError(
-                    f"probabilities of a categorical are {p.reshape(-1, p.shape[-1])[row].tolist()}{where}"[:300]
-                    + ", expected finite numbers, none negative, not all zero"
-                )
-            total = np.where(wrong[:, None], np.nan, total)
+            total[~((p >= 0).all(axis=-1) & (total[..., 0] > 0) & (total[..., 0] < np.inf))] = np.nan
+        object.__setattr__(self, "_given", p)
         object.__setattr__(self, "probs", p / total)
+        if p.ndim == 1:
+            self.check_parameters()
+
+    def check_parameters(self) -> None:
+        wrong = np.isnan(self.probs[..., 0])
+        if wrong.any():
+            given, row = np.atleast_2d(self.__dict__["_given"]), int(np.argmax(wrong))
+            where = f" in row {row} ({int(wrong.sum())} of {len(given)})" if wrong.ndim else ""
+            raise InputError(
+                f"probabilities of a categorical are {given[row].tolist()}{where}"[:300]
+                + ", expected finite numbers, none negative, not all zero"
+            )
 
     @property
     def parameter_shape(self) -> tuple[int, ...]:
@@ -411,6 +421,7 @@ class Categorical(Distribution):
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Draw categories. A category of probability zero is never drawn."""
+        self.check_parameters()
         u = rng.random(self.value_shape(size))
         return search(self.probs, u) if self.probs.ndim == 1 else draw_rows(self.probs, u)
 

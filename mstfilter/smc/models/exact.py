@@ -1,12 +1,18 @@
 """Linear-Gaussian and finite models, and their exact posteriors.
 
->>> filter = bootstrap(linear_gaussian(F, Q, H, R, m0, P0), n=1000)
->>> exact = kalman_filter(F, Q, H, R, m0, P0, observations)
->>> exact.means, exact.covariances, exact.log_evidence             # (T, d), (T, d, d), (T,)
+Two kinds of models have posteriors that can be computed: Kalman's recursions give the mean and covariance of a linear
+model with Gaussian noise, and sums over all states give the probabilities of a finite one. They tell how far a filter
+is from the truth:
 
->>> filter = bootstrap(hidden_markov(initial, transition, log_likelihood), n=1000)
->>> exact = forward_backward(initial, transition, log_likelihood, observations)
->>> exact.filtered, exact.smoothed, exact.log_evidence             # (T, K), (T, K), (T,)
+>>> import numpy as np
+>>> from mstfilter.smc import bootstrap, kalman_filter, linear_gaussian
+>>> model = {"F": [[0.9]], "Q": [[0.25]], "H": [[1.0]], "R": [[1.0]], "m0": [0.0], "P0": [[1.0]]}
+>>> exact = kalman_filter(**model, observations=[0.3, -0.1, 0.8])
+>>> state, _ = bootstrap(linear_gaussian(**model), n=10_000).run([0.3, -0.1, 0.8], seed=0)
+>>> bool(abs(state.log_evidence - exact.log_evidence[-1]) < 0.05)
+True
+
+`hidden_markov` and `forward_backward` do the same for a chain of K states (Rabiner 1989).
 
 A missing observation is None. Matrices that change with time have a first axis of length T. Entry t of F, Q and B
 belongs to the transition from x_{t-1} to x_t, and entry 0 is not used.
@@ -15,12 +21,13 @@ belongs to the transition from x_{t-1} to x_t, and entry 0 is not used.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from mstfilter.base.errors import InputError
-from mstfilter.smc.inputs import bind_step, check_observations, split_input, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep, check_observations, missing_input, split_input
 from mstfilter.smc.models.gaussian import entry, nonlinear_gaussian, vector_of
 from mstfilter.smc.models.state_space import StateSpaceModel
 
@@ -35,17 +42,37 @@ def linear_gaussian(F: Any, Q: Any, H: Any, R: Any, m0: Any, P0: Any, B: Any = N
     Raises InputError if shapes do not fit, if a matrix has no entry for a step, or if a required input is missing.
     """
     m = _matrices(F, Q, H, R, m0, P0, B)
+    model = _Linear(m["F"], m["H"], None if B is None else m["B"])
+    return nonlinear_gaussian(model.f, Q, model.h, R, m0, P0)
 
-    def f(x: np.ndarray, **step: Any) -> np.ndarray:
-        moved = x @ _entry("F", m["F"], **step).T
-        return moved if B is None else moved + _input_effect(_entry("B", m["B"], **step), step["u"])
 
-    def h(x: np.ndarray, **step: Any) -> np.ndarray:
-        return x @ _entry("H", m["H"], **step).T
+@dataclass(frozen=True, eq=False)
+class _Linear(AtStep):
+    """The functions f and h of a linear model, whose matrices may have a first axis of steps."""
 
-    moves = {**_varies(m["F"]), **({} if B is None else {**_varies(m["B"]), "u": True})}
-    functions = with_step(f, moves), with_step(h, _varies(m["H"]))
-    return nonlinear_gaussian(functions[0], Q, functions[1], R, m0, P0)
+    F: np.ndarray
+    H: np.ndarray
+    B: np.ndarray | None
+    t: int = 0
+    u: Any = None
+
+    @property
+    def depends_on_step(self) -> bool:
+        return self.B is not None or self.F.ndim == 3 or self.H.ndim == 3
+
+    def at_step(self, t: int, u: Any = None) -> _Linear:
+        return replace(self, t=t, u=u)
+
+    def f(self, x: np.ndarray) -> np.ndarray:
+        moved = x @ _entry("F", self.F, self.t).T
+        if self.B is None:
+            return moved
+        if self.u is None:
+            raise missing_input(self.t)
+        return moved + _input_effect(_entry("B", self.B, self.t), self.u)
+
+    def h(self, x: np.ndarray) -> np.ndarray:
+        return x @ _entry("H", self.H, self.t).T
 
 
 def _matrices(
@@ -67,12 +94,7 @@ def _matrices(
     return found
 
 
-def _varies(array: np.ndarray) -> dict[str, bool]:
-    """Step parameters of a function that uses a matrix: ``t`` if the matrix changes with time, else none."""
-    return {"t": True} if array.ndim == 3 else {}
-
-
-def _entry(name: str, given: np.ndarray, t: int = 0, u: Any = None) -> np.ndarray:
+def _entry(name: str, given: np.ndarray, t: int) -> np.ndarray:
     """The matrix of step t."""
     return given if given.ndim == 2 else entry(name, given, t)
 
@@ -180,13 +202,10 @@ def hidden_markov(initial: Any, transition: Any, log_likelihood: Callable[..., A
     with np.errstate(divide="ignore"):
         log_start, log_moves = np.log(start), np.log(moves)
 
-    def weigh(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
-        return _of_states(log_likelihood(y, **step), len(start))[x]
-
     return StateSpaceModel(
         lambda rng, n: (below_start <= rng.random(n)[:, None]).sum(axis=-1),
         lambda rng, x: (below[x] <= rng.random(len(x))[:, None]).sum(axis=-1),
-        with_step(weigh, step_parameters(log_likelihood, 1)),
+        _States(log_likelihood, len(start)).of_particles,
         lambda x: log_start[x],
         lambda old, new: log_moves[old, new],
     )
@@ -228,14 +247,13 @@ def forward_backward(
     with np.errstate(divide="ignore"):
         start, moves = map(np.log, _chain(initial, transition))
     ys = [split_input(y) for y in check_observations(observations)]
-    T, K, of_step = len(ys), len(start), step_parameters(log_likelihood, 1)
+    T, K, states = len(ys), len(start), _States(log_likelihood, len(start))
     log_filtered, seen, total = np.empty((T, K)), np.zeros((T, K)), np.zeros(T)
     for t, (y, u) in enumerate(ys):
         total[t] = total[t - 1] if t else 0.0
         predicted = logsumexp(log_filtered[t - 1][:, None] + moves, axis=0) if t else start
         if y is not None:
-            found = _of_states(bind_step(log_likelihood, of_step, t, u)(y), K)
-            seen[t] = np.where(predicted > -np.inf, found, -np.inf)
+            seen[t] = np.where(predicted > -np.inf, states.at_step(t, u).of_all(y), -np.inf)
         gain = logsumexp(predicted + seen[t])
         if not np.isfinite(gain):
             raise InputError(f"observation {t} is {y!r}: no state that is possible there explains it")
@@ -248,9 +266,23 @@ def forward_backward(
     return Marginals(np.exp(log_filtered), np.exp(log_smoothed), total)
 
 
-def _of_states(log_likelihood: Any, K: int) -> np.ndarray:
-    """(K,) the log likelihoods of the states."""
-    found = np.asarray(log_likelihood, dtype=np.float64)
-    if found.shape != (K,):
-        raise InputError(f"log_likelihood returned shape {found.shape}, expected ({K},): one number per state")
-    return found
+@dataclass(frozen=True)
+class _States(AtStep):
+    """The log likelihoods of K states."""
+
+    log_likelihood: Callable[..., Any]
+    K: int
+    step_functions: ClassVar = {"log_likelihood": 1}
+
+    def of_all(self, y: Any) -> np.ndarray:
+        """(K,) log p(y | x) of each state."""
+        found = np.asarray(self.log_likelihood(y), dtype=np.float64)
+        if found.shape != (self.K,):
+            raise InputError(
+                f"log_likelihood returned shape {found.shape}, expected ({self.K},): one number per state"
+            )
+        return found
+
+    def of_particles(self, x: np.ndarray, y: Any) -> np.ndarray:
+        """(n,) log p(y | x) of particles, which are states."""
+        return self.of_all(y)[x]

@@ -1,21 +1,24 @@
 """Models with Gaussian noise, filters guided by the unscented Kalman filter, and Rao-Blackwellised filters.
 
+If f and h are nonlinear, x_t = f(x_{t-1}) + N(0, Q) and y_t = h(x_t) + N(0, R) have no exact filter. The posterior of
+x_t that an unscented Kalman filter computes for each particle is a good proposal, because it has seen y_t, and the
+weights correct its error:
+
 >>> filter = guided(nonlinear_gaussian(f, Q, h, R, m0, P0), ukf_proposal(f, Q, h, R), n=100)
 
-The update of the unscented Kalman filter is a good proposal for a nonlinear model with Gaussian noise.
-
->>> filter = rao_blackwellised(model, n=100)
->>> state, infos = filter.run(observations, seed=0)
->>> state.population.particles["mean"].shape           # (n, d)
-
-A Rao-Blackwellised filter draws a part u_t of the state (a regime, a contact, an association). Given u_0 .. u_t, the
-other part z_t is linear and Gaussian:
+Often only a part u_t of the state is hard (a regime, a contact, an association). Given u_0 .. u_t, the other part z_t
+is linear and Gaussian:
 
     z_t = F(u_t) z_{t-1} + b(u_t) + N(0, Q(u_t)),    y_t = H(u_t) z_t + N(0, R(u_t))
 
-A particle holds u_t, and the mean and covariance of z_t given u_0 .. u_t and y_0 .. y_t. The particles are a mapping
-of arrays. The update weights by p(y_t | u_0 .. u_t, y_0 .. y_{t-1}). Reference: Doucet, de Freitas, Murphy, Russell
-(2000).
+Then particles are needed for u_t only. Each carries the Kalman mean and covariance of z_t, which are exact, so the
+weights p(y_t | u_0 .. u_t, y_0 .. y_{t-1}) vary less than those of particles of both parts:
+
+>>> filter = rao_blackwellised(ConditionallyLinear(sample_initial, sample_transition, linear, mean, cov), n=100)
+>>> state, infos = filter.run(observations, seed=0)
+>>> state.population.particles["mean"].shape           # (n, d)
+
+References: van der Merwe, Doucet, de Freitas, Wan (2000); Doucet, de Freitas, Murphy, Russell (2000).
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.smc.filter import ParticleFilter
-from mstfilter.smc.inputs import AtStep, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep
 from mstfilter.smc.interfaces import Proposal, Transition, Update
 from mstfilter.smc.models.distributions import MultivariateNormal
 from mstfilter.smc.models.state_space import StateSpaceModel
@@ -49,31 +52,47 @@ def nonlinear_gaussian(
     raise InputError. Without `log_transition`, `conditional_path` omits ancestor sampling.
     """
     m0 = np.asarray(m0, np.float64)
-    p, q, r = _Noise("P0", P0, len(m0), True), _Noises("Q", Q, len(m0), True), _Noises("R", R)
-    moved, seen = _OfStep("f", f, len(m0)), _OfStep("h", h, r.size)
-    moves, sees = _merged(moved, q), _merged(seen, r)
-
-    def transition(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
-        return moved(x, step) + q.at(**step).draw(rng, len(x))
-
-    def log_likelihood(x: np.ndarray, y: Any, **step: Any) -> np.ndarray:
-        noise = r.at(**step)
-        return noise.log_prob(vector_of("the observation", y, noise.size) - seen(x, step))
-
-    def log_transition(old: np.ndarray, new: np.ndarray, **step: Any) -> np.ndarray:
-        return q.at(**step).log_prob(new - moved(old, step))
-
-    def sample_observation(rng: np.random.Generator, x: np.ndarray, **step: Any) -> np.ndarray:
-        return seen(x, step) + r.at(**step).draw(rng, len(x))
-
+    prior, noise, error = _Noise("P0", P0, len(m0), True), _noise("Q", Q, len(m0), True), _noise("R", R)
+    model = _Nonlinear(f, h, noise, error)
     return StateSpaceModel(
-        lambda rng, n: m0 + p.draw(rng, n),
-        with_step(transition, moves),
-        with_step(log_likelihood, sees),
-        None if p.singular else lambda x: p.log_prob(x - m0),
-        None if any(noise.singular for noise in q.entries) else with_step(log_transition, moves),
-        sample_observation=with_step(sample_observation, sees),
+        lambda rng, n: m0 + prior.draw(rng, n),
+        model.sample_transition,
+        model.log_likelihood,
+        None if prior.singular else lambda x: prior.log_prob(x - m0),
+        None if noise.singular else model.log_transition,
+        model.sample_observation,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Nonlinear(AtStep):
+    """The functions of a nonlinear model with normal noise."""
+
+    f: Callable[..., Any]
+    h: Callable[..., Any]
+    q: _Noise | _NoiseOfStep
+    r: _Noise | _NoiseOfStep
+    step_functions: ClassVar = {"f": 1, "h": 1, "q": None, "r": None}
+
+    def moved(self, x: np.ndarray) -> np.ndarray:
+        """(n, d) next states without noise."""
+        return _of_size("f", self.f(x), len(x), self.q.size)
+
+    def seen(self, x: np.ndarray) -> np.ndarray:
+        """(n, k) observations without noise."""
+        return _of_size("h", self.h(x), len(x), self.r.size)
+
+    def sample_transition(self, rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
+        return self.moved(x) + self.q.draw(rng, len(x))
+
+    def log_transition(self, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        return self.q.log_prob(new - self.moved(old))
+
+    def log_likelihood(self, x: np.ndarray, y: Any) -> np.ndarray:
+        return self.r.log_prob(vector_of("the observation", y, self.r.size) - self.seen(x))
+
+    def sample_observation(self, rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
+        return self.seen(x) + self.r.draw(rng, len(x))
 
 
 class _Noise:
@@ -96,37 +115,49 @@ class _Noise:
         return self.constant - 0.5 * np.einsum("...j,...j->...", z, z)
 
 
-class _Noises:
+@dataclass(frozen=True, eq=False)
+class _NoiseOfStep(AtStep):
+    """Noise with a covariance for each step."""
+
+    name: str
+    entries: list[_Noise]
+    t: int = 0
+
+    def at_step(self, t: int, u: Any = None) -> _NoiseOfStep:
+        return _NoiseOfStep(self.name, self.entries, t)
+
+    @property
+    def singular(self) -> bool:
+        return any(noise.singular for noise in self.entries)
+
+    @property
+    def size(self) -> int:
+        return self.entries[0].size
+
+    @property
+    def covariance(self) -> np.ndarray:
+        return entry(self.name, self.entries, self.t).covariance
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        return entry(self.name, self.entries, self.t).draw(rng, n)
+
+    def log_prob(self, residual: np.ndarray) -> np.ndarray:
+        return entry(self.name, self.entries, self.t).log_prob(residual)
+
+
+def _noise(name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> _Noise | _NoiseOfStep:
     """Noise with one covariance (k, k) for all steps, or a covariance for each step, (T, k, k)."""
-
-    def __init__(self, name: str, given: Any, k: int | None = None, semidefinite: bool = False) -> None:
-        cov = np.asarray(given, np.float64)
-        self.name, self.parameters = name, {"t": True} if cov.ndim == 3 else {}
-        self.entries = [_Noise(name, m, k, semidefinite) for m in (cov if self.parameters else cov[None])]
-        self.size = cov.shape[-1]
-
-    def at(self, t: int = 0, u: Any = None) -> _Noise:
-        return entry(self.name, self.entries, t) if self.parameters else self.entries[0]
+    cov = np.asarray(given, np.float64)
+    if cov.ndim == 3:
+        return _NoiseOfStep(name, [_Noise(name, one, k, semidefinite) for one in cov])
+    return _Noise(name, cov, k, semidefinite)
 
 
-class _OfStep:
-    """A function of particles, (n, size), that may also have the parameters `t` (step) and `u` (input)."""
-
-    def __init__(self, name: str, function: Callable[..., Any], size: int) -> None:
-        self.name, self.function, self.size = name, function, size
-        self.parameters = step_parameters(function, 1)
-
-    def __call__(self, x: np.ndarray, step: dict[str, Any]) -> Any:
-        found = self.function(x, **{name: value for name, value in step.items() if name in self.parameters})
-        if np.shape(found) != (len(x), self.size):  # numpy might broadcast it
-            raise InputError(f"{self.name} returned shape {np.shape(found)}, expected ({len(x)}, {self.size})")
-        return found
-
-
-def _merged(*parts: _Noises | _OfStep) -> dict[str, bool]:
-    """The parameters ``t`` and ``u`` of several parts. A parameter is required if a part requires it."""
-    names = {name for part in parts for name in part.parameters}
-    return {name: any(part.parameters.get(name, False) for part in parts) for name in sorted(names)}
+def _of_size(name: str, found: Any, n: int, size: int) -> np.ndarray:
+    """What a function of the user returned, (n, size)."""
+    if np.shape(found) != (n, size):  # numpy might broadcast it
+        raise InputError(f"{name} returned shape {np.shape(found)}, expected ({n}, {size})")
+    return found
 
 
 def entry(name: str, given: Any, t: int) -> Any:
@@ -286,22 +317,29 @@ def ukf_proposal(
     """
     from filterpy.kalman import MerweScaledSigmaPoints
 
-    q, r = _Noises("Q", Q), _Noises("R", R)
-    moved, seen = _OfStep("f", f, q.size), _OfStep("h", h, r.size)
+    q, r = _noise("Q", Q), _noise("R", R)
     points = MerweScaledSigmaPoints(q.size, alpha, beta, kappa)
-    offsets_of = {noise: points.sigma_points(np.zeros(q.size), noise.covariance) for noise in q.entries}
+    return _Unscented(_Nonlinear(f, h, q, r), points)
 
-    def proposal(x: np.ndarray, y: Any, **step: Any) -> MultivariateNormal:
-        noise, R = q.at(**step), r.at(**step).covariance
-        offsets, Q, mean = offsets_of[noise], noise.covariance, moved(x, step)
+
+@dataclass(frozen=True, eq=False)
+class _Unscented(AtStep):
+    """The proposal of `ukf_proposal`."""
+
+    model: _Nonlinear
+    points: Any
+    step_functions: ClassVar = {"model": None}
+
+    def __call__(self, x: np.ndarray, y: Any) -> MultivariateNormal:
+        model, points = self.model, self.points
+        d, k, Q, R = model.q.size, model.r.size, model.q.covariance, model.r.covariance
+        mean, offsets = model.moved(x), points.sigma_points(np.zeros(d), Q)
         sigma = mean[:, None] + offsets
-        z = np.reshape(seen(sigma.reshape(-1, q.size), step), (*sigma.shape[:2], r.size))
+        z = np.reshape(model.seen(sigma.reshape(-1, d)), (*sigma.shape[:2], k))
         centre = np.einsum("s,nsk->nk", points.Wm, z)
         z = z - centre[:, None]
         S = np.einsum("s,nsi,nsj->nij", points.Wc, z, z) + R
         cross = np.einsum("s,si,nsj->nij", points.Wc, offsets, z)
         gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(cross, -1, -2)), -1, -2)
-        change = (gain @ (vector_of("the observation", y, r.size) - centre)[..., None])[..., 0]
+        change = (gain @ (vector_of("the observation", y, k) - centre)[..., None])[..., 0]
         return MultivariateNormal(mean + change, Q - gain @ S @ np.swapaxes(gain, -1, -2))
-
-    return with_step(proposal, _merged(moved, q, seen, r))

@@ -1,31 +1,39 @@
 """State-space models, the components made from them, and the textbook filters.
 
+The state is a Markov chain, x_0 ~ p(x_0) and x_t ~ f(x_t | x_{t-1}), and each observation depends on the present
+state, y_t ~ p(y_t | x_t). Three distributions are a model:
+
 >>> model = StateSpaceModel.of(
 ...     initial=Normal(0.0, 1.0),
 ...     transition=lambda x: Normal(0.9 * x, 0.5),
 ...     observation=lambda x: Normal(x, 1.0),
 ... )
 >>> state, infos = bootstrap(model, n=1000).run(observations, seed=0)           # Gordon, Salmond, Smith 1993
+
+The bootstrap filter moves particles by f, and so without regard to y_t. If the likelihood is narrow, few of them
+land where it is large. A guided filter draws them from a proposal q(x_t | x_{t-1}, y_t) and corrects the weights by
+f / q. An auxiliary filter selects the particles with an eye on y_t before it moves them:
+
 >>> guided(model, lambda x, y: Normal(0.5 * (0.9 * x + y), 0.4), n=100)         # Doucet, Godsill, Andrieu 2000
 >>> auxiliary(model, log_priority, n=100)                                       # Pitt and Shephard 1999
 >>> resample_move(model, RandomWalkMove(model, 0.5), n=100)                     # Gilks and Berzuini 2001
 
 Each filter is a `ParticleFilter`, so any component can be replaced: ``replace(bootstrap(model, 100),
-resampler=...)``. The first observation updates the initial state before any prediction.
+resampler=...)``. The first observation updates the initial state before any prediction. Reference: Chopin and
+Papaspiliopoulos (2020), chapter 10.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.fields import PositiveInt
 from mstfilter.smc.components import EssBelow, Reweight
 from mstfilter.smc.filter import ParticleFilter
 from mstfilter.smc.first_steps import (
@@ -40,7 +48,7 @@ from mstfilter.smc.first_steps import (
     first_difference,
     spread_rows,
 )
-from mstfilter.smc.inputs import AtStep, check_signature, step_parameters, with_step
+from mstfilter.smc.inputs import AtStep, check_signature
 from mstfilter.smc.interfaces import (
     DensityTransition,
     Distribution,
@@ -50,11 +58,9 @@ from mstfilter.smc.interfaces import (
     Resampler,
     Trigger,
 )
-from mstfilter.smc.models.distributions import as_distribution, hypothetical
+from mstfilter.smc.models.distributions import as_distribution
 from mstfilter.smc.population import Particles, Population, count_particles, take
 from mstfilter.smc.resampling import Systematic
-
-_Chains = TypeVar("_Chains")  # states of Markov chains
 
 
 @dataclass(frozen=True)
@@ -113,27 +119,14 @@ class StateSpaceModel(AtStep):
                 )
             check_signature(name, function, 1)
 
-        def sample(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
-            new = as_distribution(transition(x, **step)).sample(rng, count_particles(x))
-            return _of_shape("transition", new, x)
-
-        def log_density(previous: Any, new: Any, **step: Any) -> np.ndarray:
-            return _log_state(as_distribution(transition(previous, **step)), new)
-
-        def log_likelihood(x: Any, y: Any, **step: Any) -> np.ndarray:
-            return _log_likelihood(as_distribution(observation(x, **step)), y)
-
-        def sample_observation(rng: np.random.Generator, x: Any, **step: Any) -> np.ndarray:
-            return as_distribution(observation(x, **step)).sample(rng, count_particles(x))
-
-        moves, observes = step_parameters(transition, 1), step_parameters(observation, 1)
+        model = _Densities(transition, observation)
         return cls(
             first.sample,
-            with_step(sample, moves),
-            with_step(log_likelihood, observes),
+            model.sample_transition,
+            model.log_likelihood,
             partial(_log_state, first),
-            with_step(log_density, moves),
-            sample_observation=with_step(sample_observation, observes),
+            model.log_transition,
+            model.sample_observation,
         )
 
     def density(self, which: str) -> Callable[..., np.ndarray]:
@@ -148,6 +141,28 @@ class StateSpaceModel(AtStep):
                 "give StateSpaceModel its log densities, or use .of(); a singular covariance has none",
             )
         return found
+
+
+@dataclass(frozen=True)
+class _Densities(AtStep):
+    """The functions of a model whose x_t and y_t have distributions given the particles."""
+
+    transition: Callable[..., Any]
+    observation: Callable[..., Any]
+    step_functions: ClassVar = {"transition": 1, "observation": 1}
+
+    def sample_transition(self, rng: np.random.Generator, x: Any) -> np.ndarray:
+        new = as_distribution(self.transition(x)).sample(rng, count_particles(x))
+        return _of_shape("transition", new, x)
+
+    def log_transition(self, previous: Any, new: Any) -> np.ndarray:
+        return _log_state(as_distribution(self.transition(previous)), new)
+
+    def log_likelihood(self, x: Any, y: Any) -> np.ndarray:
+        return _log_likelihood(as_distribution(self.observation(x)), y)
+
+    def sample_observation(self, rng: np.random.Generator, x: Any) -> np.ndarray:
+        return as_distribution(self.observation(x)).sample(rng, count_particles(x))
 
 
 def _of_shape(what: str, new: np.ndarray, old: Any) -> np.ndarray:
@@ -322,116 +337,6 @@ class PriorityLookahead(Lookahead):
         few = Few.of(after.particles)
         compare_alone("the log priority", lambda x: self.function(x, observation), few)
         return few.differ
-
-
-@dataclass(frozen=True)
-class RandomWalkMove(Rejuvenation):
-    """Metropolis steps with Gaussian increments on an array of particles.
-
-    ``notes["accepted"]`` is the acceptance rate.
-
-    The Metropolis kernel leaves p(x_t | x_{t-1}, y_t) invariant. The weights do not change.
-
-    Parameters
-    ----------
-    model : StateSpaceModel
-        The model with its log densities. Particles are float arrays (n,) or (n, d), or mappings of such arrays.
-    scale : float or array_like
-        Standard deviation of a step, in the units of the state. A scale that does not depend on the particles keeps
-        the evidence unbiased.
-    steps : int
-        Number of Metropolis steps per move.
-    """
-
-    model: StateSpaceModel
-    scale: Any = 1.0
-    steps: PositiveInt = 1
-    step_functions: ClassVar = {"model": None}
-
-    def __post_init__(self) -> None:
-        scale = np.asarray(self.scale, dtype=np.float64)
-        if not (np.isfinite(scale).all() and (scale > 0).all()):
-            raise InputError(f"scale is {self.scale!r}, expected positive finite numbers")
-
-    def move(
-        self, rng: np.random.Generator, population: Population, previous: Population | None, observation: Any
-    ) -> Population:
-        def log_target(x: Any) -> np.ndarray:
-            if previous is None:
-                prior = self.model.density("log_initial")(x)
-            else:
-                prior = self.model.density("log_transition")(previous.particles, x)
-            return prior if observation is None else prior + self.model.log_likelihood(x, observation)
-
-        def propose(rng: np.random.Generator, now: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray]:
-            x = self._step(rng, now["x"])
-            with hypothetical():
-                log_p = log_target(x)
-                return {"x": x, "log_p": log_p}, log_p - now["log_p"]
-
-        start = {"x": population.particles, "log_p": log_target(population.particles)}
-        state, share = moved(rng, start, propose, self.steps)
-        return Population(state["x"], population.log_weights, population.parents, {"accepted": share})
-
-    def _step(self, rng: np.random.Generator, x: Particles) -> Particles:
-        if isinstance(x, np.ndarray):
-            if x.dtype.kind != "f":
-                raise InputError(
-                    f"particles are {x.dtype}, expected floats", "write a Rejuvenation for discrete states"
-                )
-            return x + self.scale * rng.standard_normal(x.shape)
-        return {name: self._step(rng, a) for name, a in x.items()}
-
-
-def choose_rows(accepted: np.ndarray, new: Any, old: Any) -> Any:
-    """Row i of `new` if ``accepted[i]``, otherwise row i of `old`. Both are arrays or mappings of arrays."""
-    if isinstance(old, Mapping):
-        return {name: choose_rows(accepted, new[name], a) for name, a in old.items()}
-    rows = accepted if old.ndim == 1 else accepted.reshape(-1, *(1,) * (old.ndim - 1))
-    return np.where(rows, new, old)
-
-
-def metropolis(
-    rng: np.random.Generator,
-    state: _Chains,
-    propose: Callable[[np.random.Generator, _Chains], tuple[_Chains, np.ndarray]],
-    steps: int = 1,
-) -> Iterator[tuple[_Chains, np.ndarray]]:
-    """Metropolis-Hastings steps of n chains.
-
-    Parameters
-    ----------
-    state
-        One row per chain: an array, or a mapping of arrays. The state can hold log densities, so that `propose`
-        need not evaluate those of the present state again.
-    propose : callable
-        ``(rng, state) -> (new, log_ratio)``: a proposed state, and (n,) the log of p(new) q(old | new) / (p(old)
-        q(new | old)). A proposal with a log ratio of NaN (both states are impossible) is rejected.
-
-    Yields
-    ------
-    state, accepted
-        After each step: the state, and (n,) bool whether the proposal of a chain was accepted.
-    """
-    for _ in range(steps):
-        new, log_ratio = propose(rng, state)
-        accepted = np.log1p(-rng.random(len(log_ratio))) < log_ratio
-        state = choose_rows(accepted, new, state)
-        yield state, accepted
-
-
-def moved(
-    rng: np.random.Generator,
-    state: _Chains,
-    propose: Callable[[np.random.Generator, _Chains], tuple[_Chains, np.ndarray]],
-    steps: int,
-) -> tuple[_Chains, float]:
-    """The state after `steps` steps of `metropolis`, and the share of accepted proposals."""
-    taken = proposed = 0
-    for after, accepted in metropolis(rng, state, propose, steps):
-        state = after
-        taken, proposed = taken + int(np.count_nonzero(accepted)), proposed + len(accepted)
-    return state, taken / proposed
 
 
 def bootstrap(

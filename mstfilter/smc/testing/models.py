@@ -37,13 +37,11 @@ from mstfilter.smc import (
     log_mean_exp,
     normalise,
 )
-from mstfilter.smc.first_steps import Few, compare_alone, is_numeric, unexamined
+from mstfilter.smc.first_steps import Few, compare_alone, is_numeric, recorded, unexamined
 from mstfilter.smc.inputs import split_input
-from mstfilter.smc.models.distributions import hypothetical
 from mstfilter.smc.models.programs.examination import examine_program
 from mstfilter.smc.models.programs.filters import ProgramInitial, ProgramTransition, program_step, run_once
 from mstfilter.smc.models.programs.handlers import SimulateHandler
-from mstfilter.smc.models.programs.sites import recorded
 from mstfilter.smc.population import Particles, count_particles, take
 from mstfilter.smc.testing.contract import FALSE_ALARM, prerequisite, same, seeded, statistical
 from mstfilter.smc.testing.exact import ExactContract, check_same_law
@@ -230,7 +228,7 @@ class ModelContract(ExactContract):
 
         def ratio(x: np.ndarray, other: Any) -> np.ndarray:
             """(n,) density of the model over that of another distribution; 0 for NaN."""
-            with np.errstate(all="ignore"), hypothetical():
+            with np.errstate(all="ignore"):
                 lw = np.asarray(log_density(x.reshape(draws.shape).astype(draws.dtype)), float) - other.logpdf(x)
             return np.exp(np.where(np.isnan(lw), -np.inf, lw))
 

@@ -72,7 +72,8 @@ class ResamplerContract(ScaleContract):
         m, found, n = len(inputs["population"]), len(result), inputs["n"]
         wrong = ancestors[(ancestors < 0) | (ancestors >= m)]
         assert not len(wrong), f"ancestor {wrong[0]} is out of range: there are {m} particles; off by one?"
-        enough = found == n if self.make().exact_size else 1 <= found <= n
+        scheme = self.make()
+        enough = found == n if scheme.exact_size else found >= 1 and (found <= n or scheme.chooses_n)
         assert enough, f"asked to make {n} particles of {m} it returns {found}"
 
     def features(self, result: Population, given: Population) -> np.ndarray:

@@ -1,12 +1,12 @@
 """Examines whether a program treats particles independently and draws random numbers only by `sample`.
 
 By mistake a program may mix particles (``x.mean()``, ``previous["x"][0]``), draw from another generator, or keep
-values between steps. An examination runs the program on some of the particles:
+values between steps. The filter records the calls that the program made in a step, and then runs it once more:
 
-1. Twice with the same random numbers, if a distribution is not from this package or if something else is suspicious.
-   Values and log weights must agree up to rounding.
-2. On a few of these particles alone, with the values that they have drawn. Distributions and returned values of a
+1. On a few of the particles alone, with the values that they have drawn. Distributions and returned values of a
    particle must not change. So an event axis that is used as the particle axis is found, too.
+2. If a distribution is not from this package or if something is suspicious, again with the same random numbers.
+   Values and log weights must agree up to rounding.
 3. If there is a guide, it must be able to draw what the model draws (`mstfilter.smc.first_steps.check_reach`).
 
 A filter examines the first steps of a run, and ``mstfilter check`` every step (`mstfilter.smc.first_steps`).
@@ -14,31 +14,33 @@ A filter examines the first steps of a run, and ``mstfilter check`` every step (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from mstfilter.base.errors import InputError, describe_error as reason
+from mstfilter.base.errors import InputError
 from mstfilter.base.fields import copied
 from mstfilter.smc.first_steps import (
     DRAWS,
-    MOST,
-    Few,
+    LOG_DENSITY,
+    VALUE,
     check_own_noise,
     check_reach,
+    first_column,
+    first_difference,
+    made_runs,
     nearly_equal,
+    recorded,
     spread,
     spread_rows,
 )
 from mstfilter.smc.models.programs.handlers import GivenHandler, GuideHandler, ReplayHandler, SampleHandler
-from mstfilter.smc.models.programs.sites import Call, ProgramRun, recorded
+from mstfilter.smc.models.programs.sites import Call, ProgramRun
 from mstfilter.smc.population import Population, take
-from mstfilter.smc.streams import child
+from mstfilter.smc.streams import child, key_of
 
-#: Differences that count as rounding: single-precision networks give other digits for other numbers of rows.
-_LOG_DENSITY, _VALUE = 1e-3, 1e-5
 _ALONE = (
     "each particle is processed as if it were alone: reduce over entries with axis=1, not over the particles",
     'previous["x"] has one row for each particle, in a branch of switch as an argument; draw by sample(...) only',
@@ -64,39 +66,31 @@ def examine_program(
 ) -> bool:
     """Examine one step of a program; InputError if a fault is found. Returns whether the particles differ.
 
-    A `thorough` examination takes all particles, and several groups that it runs alone.
+    Called in the block `recorded` in which the step was made. A `thorough` examination runs several groups alone.
     """
     n = len(after)
     fresh = {id(f): copied(f) for f in (model, guide) if f is not None}  # objects may keep values between calls
-    few = Few.of(after.particles, n if thorough else MOST)
-    rows = few.rows
-    previous = None if past is None else take(past.particles, rows)
+    previous = None if past is None else past.particles
 
-    def step() -> list[ProgramRun]:
-        return _runs(run, child(rng, "examine"), model, guide, previous, observation, len(rows))
+    def step(rng: np.random.Generator) -> list[ProgramRun]:
+        return _runs(run, rng, model, guide, previous, observation, n)
 
-    try:
-        runs = step()
-    except Exception as error:
-        hints = error.hints if isinstance(error, InputError) else ()
-        message = f"the step fails for {len(rows)} of {n} particles alone: {reason(error)}"
-        raise InputError(message, *hints, *_ALONE) from error
+    runs = made_runs() or step(key_of(rng).generator())
     kinds = {type(call.distribution).__module__.split(".")[0] for whole in runs for call in whole.calls or ()}
     if thorough or not kinds <= {"builtins", "mstfilter"}:  # a distribution of the user may draw as it likes
-        _check_repeated(runs, step)
-    check_own_noise(
-        "a site", runs[0].values, lambda: _runs(run, rng, model, guide, previous, observation, len(rows))[0].values
-    )
+        _check_repeated(runs, lambda: step(key_of(rng).generator()))
+    check_own_noise("a site", runs[0].values, lambda: step(child(rng, "examine"))[0].values)
     for whole in runs:
-        for group in _groups(whole, thorough) if whole.n > 1 else ():
+        for group in _groups(whole, thorough) if n > 1 else ():
             try:
                 _check_alone(run, fresh, previous, observation, whole, group, thorough)
             except InputError:
-                _check_repeated(runs, step)
+                _check_repeated(runs, lambda: step(key_of(rng).generator()))
                 raise
     if guide is not None:
         _check_guide(run, rng, model, guide, past, observation, max(DRAWS, n if thorough else 0))
-    return few.differ
+    column = first_column(after.particles, n)
+    return bool(column.min() != column.max())
 
 
 def _runs(
@@ -121,18 +115,9 @@ def _check_repeated(runs: list[ProgramRun], step: Callable[[], list[ProgramRun]]
         message = f"the step fails when it is repeated with the same random numbers: {error}"
         raise InputError(message, *_REPEAT) from error
     for one, other in zip(runs, again, strict=True):
-        what = _first_difference(*({**r.values, **r.returned, "log weights": r.gain} for r in (one, other)))
+        what = first_difference(*({**r.values, **r.returned, "log weights": r.gain} for r in (one, other)))
         if what is not None:
             raise InputError(f"{what} differ when the step is repeated with the same random numbers", *_REPEAT)
-
-
-def _first_difference(particles: Mapping[str, np.ndarray], again: Mapping[str, np.ndarray]) -> str | None:
-    """The first name with different values in two populations."""
-    if list(particles) != list(again):
-        return f"the names {sorted(set(particles) ^ set(again))}"
-    pairs = ((name, np.asarray(a), np.asarray(again[name])) for name, a in particles.items())
-    different = (name for name, a, b in pairs if a.shape != b.shape or not nearly_equal(a, b, 1e-9).all())
-    return next((f"values of {name!r}" for name in different), None)
 
 
 # --- a few particles alone ------------------------------------------------------------------------------------------
@@ -215,7 +200,7 @@ def _compare(call: Call, alone: Call | None, rows: np.ndarray, thorough: bool) -
         values = [np.full(c.value.shape, other, c.value.dtype) for c in (call, alone)]
         pairs.append((call.densities(values[0]), alone.densities(values[1])))
     for found, expected in pairs:
-        different = ~nearly_equal(found[k], expected, _LOG_DENSITY, 1.0)
+        different = ~nearly_equal(found[k], expected, LOG_DENSITY, 1.0)
         if different.any():
             i = int(np.argmax(different))
             raise InputError(
@@ -229,7 +214,7 @@ def _compare_returned(name: str, values: np.ndarray, alone: np.ndarray, rows: np
     """Raise InputError unless the particles `rows` have the same returned values among all particles and alone."""
     if alone.shape[1:] != values.shape[1:]:
         raise InputError(f"returned {name!r} has rows of shape {values.shape[1:]}, alone {alone.shape[1:]}", *_ALONE)
-    different = ~nearly_equal(values[rows], alone, _VALUE, spread(values))
+    different = ~nearly_equal(values[rows], alone, VALUE, spread(values))
     if different.any():
         i = tuple(np.argwhere(different)[0])
         raise InputError(

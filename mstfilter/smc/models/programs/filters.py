@@ -13,6 +13,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError
 from mstfilter.smc.filter import ParticleFilter
+from mstfilter.smc.first_steps import recorded
 from mstfilter.smc.inputs import usual_slip
 from mstfilter.smc.interfaces import Component, Proposal, Transition
 from mstfilter.smc.models.programs.examination import examine_program
@@ -23,7 +24,7 @@ from mstfilter.smc.models.programs.handlers import (
     SampleHandler,
     SiteHandler,
 )
-from mstfilter.smc.models.programs.sites import ProgramRun, active_run, recorded
+from mstfilter.smc.models.programs.sites import ProgramRun, active_run
 from mstfilter.smc.population import Particles, Population
 
 Model = Callable[..., Any]

@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mstfilter.base.errors import InputError
+from mstfilter.smc.first_steps import made_runs
 from mstfilter.smc.interfaces import Distribution
 from mstfilter.smc.models.distributions import Categorical, as_distribution
 from mstfilter.smc.models.programs.handlers import Site, SiteHandler, check_shape
 from mstfilter.smc.population import frozen_view, take
 
 active_run: ContextVar[ProgramRun | None] = ContextVar("run of a program", default=None)
-_RECORDED: ContextVar[list[ProgramRun] | None] = ContextVar("runs that record their calls", default=None)
-
-
-@contextmanager
-def recorded() -> Iterator[list[ProgramRun]]:
-    """Yields a list with a `ProgramRun` for each run of a program in the block. Each run stores its `calls`."""
-    runs: list[ProgramRun] = []
-    token = _RECORDED.set(runs)
-    try:
-        yield runs
-    finally:
-        _RECORDED.reset(token)
 
 
 def sample(name: str, distribution: Any) -> Any:
@@ -126,7 +114,7 @@ class ProgramRun:
         self.returned: dict[str, Any] = {}
         self.gain = np.zeros(n)
         self._last, self.inside = ("", "", ""), False  # the last call, and whether it is being processed
-        runs = _RECORDED.get()
+        runs = made_runs()
         self.calls: list[Call] | None = None if runs is None else []  # if they are recorded
         self.function: Any = None  # of the program
         if runs is not None:
