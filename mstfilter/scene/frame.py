@@ -348,8 +348,8 @@ class Clip:
     grid : VoxelGrid
         The workspace.
     index : int
-        Number of the pause at the end of the clip, counted from 0. It becomes a part of the identities of new objects,
-        so the numbers of successive clips have to ascend.
+        Number of the pause at the end of the clip, counted from 0. It is a part of the identities of new objects, so
+        the numbers of successive clips have to ascend.
     times : tuple of float, optional
         Time of each frame in seconds.
     """

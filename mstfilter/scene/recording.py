@@ -78,8 +78,8 @@ class LazyFrames(Sequence[Frame]):
 class Recording:
     """An RGB-D video, the pauses at which nothing moves in it, and the workspace.
 
-    `Recording.from_arrays` makes one of your own images, `mstfilter.open_recording` reads files, and `clips` divides it
-    into what a filter observes step by step. A simulated recording also knows the truth.
+    `Recording.from_arrays` makes one of your own images, and `mstfilter.open_recording` reads files. `clips` divides
+    it into what a filter observes step by step. A simulated recording also knows the truth.
 
     Parameters
     ----------
@@ -168,9 +168,9 @@ class Recording:
         K : (3, 3) array, or four numbers
             Intrinsics in pixels: the camera matrix, or fx, fy, cx, cy.
         pauses : sequence of int, str or PauseRule, optional
-            Frames at which nothing moves; the filter gives hypotheses at each of them. Instead of listing them, name a
-            rule that finds them: a `PauseRule`, or a text such as "still", "ends", "every" or "0s,4.2s". The default
-            is "still" if `times` are given for more than two frames, else "ends".
+            Frames at which nothing moves; the filter gives hypotheses at each of them. Instead of listing them, name
+            a rule that finds them: a `PauseRule`, or a text such as "still", "ends", "every" or "0s,4.2s". The
+            default is "still" if `times` are given for more than two frames, else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
             Pose of the camera, or one pose per frame if the camera moves. z of the world must point up; a world whose
             table is not at z = 0 is shifted. By default, the pose is found from the support plane at the first

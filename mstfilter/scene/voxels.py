@@ -311,14 +311,14 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 class Hypothesis:
     """One answer to "what is on the table?": an object, or none, for every voxel. It is the particle of the filter.
 
-    A hypothesis is frozen. `from_labels` makes one of a label grid; `with_labels` and `without` return changed copies,
-    which keep the identities of the objects.
+    A hypothesis is frozen. `from_labels` makes one of a label grid; `with_labels` and `without` return changed
+    copies, in which the objects keep their identities.
 
     Parameters
     ----------
     labels : (X, Y, Z) uint16
-        0 is free or unknown space, and k >= 1 an object. The numbers need not be consecutive, and mean nothing outside
-        the hypothesis; it is the `id` of an `ObjectRecord` by which an object is followed over time.
+        0 is free or unknown space, and k >= 1 an object. The numbers need not be consecutive, and mean nothing
+        outside the hypothesis: what follows an object over time is the `id` of its `ObjectRecord`.
     grid : VoxelGrid
         Where the voxels are.
     objects : tuple of ObjectRecord

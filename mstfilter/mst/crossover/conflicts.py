@@ -17,8 +17,8 @@ rule           probability                    source
 ``share``      min(1, I n2 / n1^2)            the authors' program: (covered share of the child) x (size
                                               ratio); about even odds on real conflicts
 
-``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension is 1 /
-voxels, so objects are almost never merged
+``printed``    min(1, IoU n2 / n1^2)          the formula as printed (paper, section IV-D); its dimension
+                                              is 1 / voxels, so objects are almost never merged
 
 ``always``     1                              a control
 
