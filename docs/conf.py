@@ -1,6 +1,7 @@
 """Sphinx configuration. Pages with ``file_format: mystnb`` are notebooks as text: the build executes them."""
 
 import os
+import pkgutil
 import re
 from copy import deepcopy
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import latex2mathml.converter
 from docutils import nodes
 
+import mstfilter
 from mstfilter import __version__
 
 project = "mstfilter"
@@ -27,6 +29,9 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+autosummary_context = {  # a front door only re-exports, so its page has no members
+    "front_doors": {m.name for m in pkgutil.walk_packages(mstfilter.__path__, "mstfilter.") if m.ispkg}
+}
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True

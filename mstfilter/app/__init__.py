@@ -3,6 +3,6 @@
 >>> from mstfilter.app.report import write_report
 >>> write_report("runs/mine")                         # runs/mine/report.html  # doctest: +SKIP
 
-Only this room parses arguments, prints, and draws. Everything that it shows can be had from the rooms below as
+This room alone parses arguments, prints and draws. What it shows comes from the rooms below, where you can have it as
 arrays and tables.
 """

@@ -1,4 +1,17 @@
-"""What all rooms share: errors, checks of fields, files, processes, lazy imports, and the registry of components.
+"""What all rooms share: errors, checks of fields and results, files, processes, and the registry of components.
 
 Nothing here knows about particles or images.
+
+============  =========================================================================================
+`errors`      `InputError`: a fact, and hints what to do
+`fields`      bounds of the fields of a component, checked when it is made
+`results`     checks of what the methods of a component return
+`registry`    components by name, and components from a configuration
+`reading`     files of unknown origin, read safely
+`files`       files that are complete or absent
+`processes`   processes and threads
+`lazy`        names that are imported when they are first used
+`resources`   the presets, weights and examples that belong to the package
+`trained`     trained networks in folders
+============  =========================================================================================
 """

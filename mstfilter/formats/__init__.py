@@ -1,12 +1,21 @@
-"""Readers and writers of recordings: the recording folder of mstfilter, and readers for other layouts.
+"""Readers and writers of recordings: the folder of mstfilter, and the layouts of others.
 
 >>> from mstfilter.formats import Tum, open_recording, save_recording
->>> recording = Tum(K=(525, 525, 319.5, 239.5)).open(path)  # doctest: +SKIP
+>>> recording = open_recording("session.mcap")  # any format  # doctest: +SKIP
+>>> recording = Tum(K=(525, 525, 319.5, 239.5)).open(path)  # one format, with its fields  # doctest: +SKIP
 >>> save_recording(recording, "recordings/mine")  # doctest: +SKIP
->>> recording = open_recording("recordings/mine")  # any format  # doctest: +SKIP
 
-A reader is a `RecordingFormat`: a frozen dataclass with ``detects(path)`` and ``open(path)``. A `PauseRule` finds the
-pauses at which a long video is divided into clips.
+A reader is a `RecordingFormat`, a frozen dataclass with ``detects(path)`` and ``open(path)``. To read another layout,
+write one more of them. A long video is divided into clips at its pauses, which a `PauseRule` finds.
+
+===============  ======================================================================================
+`sources`        `open_recording`: finds out the format of a path and opens it
+`folder`         the recording folder of mstfilter: reader and writer
+`image_folders`  folders of colour and depth images: pairs, TUM, Redwood and Open3D
+`bag`            ROS 1 and ROS 2 bags, MCAP
+`video`          what all readers of videos share
+`pauses`         rules that find the pauses
+===============  ======================================================================================
 """
 
 from mstfilter.base.lazy import attach

@@ -1,6 +1,10 @@
 """Worlds whose truth is known, and methods to compare with.
 
-`simulation` makes tables of objects, pushes them with a simulated robot and renders the images. `oracles` replace one
-stage of the filter by the truth, so a study can say what the others lose. `baselines` are simpler methods that use
-the same images.
+>>> from mstfilter.lab.simulation import cached_recording
+>>> recording = mstfilter.open_recording(cached_recording("demo", seed=3))
+>>> recording.truth(0)                                # true labels (X, Y, Z) at the first pause
+
+`simulation` sets objects on a table, pushes them with a simulated robot and renders the images. `oracles` replace one
+stage of a filter by the truth, so that a study can say how much this stage costs. `baselines` are simpler methods
+that get the same images.
 """

@@ -1,4 +1,6 @@
-"""Runs: `filter_recording` filters a recording and stores the results in a run folder.
+"""Filters at work: presets, one run in its folder, live streams, and studies of many runs.
+
+`filter_recording` filters a recording and stores the results in a run folder:
 
 >>> from mstfilter.runs.presets import load_config
 >>> from mstfilter.runs import filter_recording
@@ -8,8 +10,16 @@
 >>> run.n_pauses, run.hypotheses(0), run.info(0)["ess"]
 >>> rows = score_pauses(run.estimates(), read_truth(recording))
 
-A repeated call resumes an interrupted run from ``pauses/NNN/state.npz`` of the last complete pause. A resumed run and
-an uninterrupted run have the same result. The module `run` filters, and `run_folder` reads and writes files.
+If the run is interrupted, the same call resumes it from ``pauses/NNN/state.npz`` of the last complete pause, with the
+result that an uninterrupted run has.
+
+============  =========================================================================================
+`presets`     filters by name, from TOML files
+`run`         `filter_recording`
+`run_folder`  `RunFolder`: reads and writes the folder of a run
+`live`        `Stream`: frames that arrive one by one
+`study`       many runs, compared in pairs
+============  =========================================================================================
 """
 
 from mstfilter.base.lazy import attach

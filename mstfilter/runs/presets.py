@@ -1,12 +1,13 @@
-"""Presets: filters that are assembled from components and have names.
+"""Presets: filters with a name, assembled from components.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst")
 >>> mst = mstfilter.preset("mst", "n=10", "resampler=multinomial", "transition.rule=paper")
 
-``mst`` is the default, ``paper`` is the published algorithm, and ``authors`` is the program of its authors. A preset
-is a TOML file with the fields of `ParticleFilter`, one table for each component. A preset may extend another preset,
-or ``models/base.toml``, which has the common parts of `mst` and its baselines:
+``mst`` is the default, ``paper`` the published algorithm, and ``authors`` the program of its authors. A preset is a
+TOML file with the fields of `ParticleFilter`, one table for each component, and it can extend another one, so that it
+lists only the differences. ``models/base.toml`` has what `mst` and its baselines share; without an update, it is no
+preset by itself. In a file that extends another,
 
 =======================================  =============================================================================
 ``base = "base"``                        fields that are not named in the file are those of the base
@@ -14,8 +15,6 @@ or ``models/base.toml``, which has the common parts of `mst` and its baselines:
 ``proposal.completer = "extrude"``       naming a field keeps the other fields
 ``wrap = { proposal = "first_pause" }``  the base's proposal becomes the field `proposal` of this component
 =======================================  =============================================================================
-
-``base`` has no update, so it can be extended but is not a preset.
 """
 
 from __future__ import annotations
@@ -48,7 +47,23 @@ _FIELDS = (
 
 
 def preset(name: str = "mst", *overrides: str, allow_files: bool = True) -> ParticleFilter:
-    """The filter of a preset, by its name or by the path of a TOML file, with overrides ``path=value``."""
+    """The filter of a preset.
+
+    Parameters
+    ----------
+    name : str
+        The preset, such as "mst", or the path of a TOML file.
+    *overrides : str
+        Changes ``path=value``, such as "n=10", "resampler=systematic" or "transition.rule=paper". Naming a component
+        resets its fields. A component of your own is ``./mine.py:Mine``, the file of which is executed.
+    allow_files : bool
+        Whether components may be named by files.
+
+    Raises
+    ------
+    InputError
+        If a preset, component or field is unknown, or a library that a component needs is missing.
+    """
     return build_filter(load_config(name, overrides, allow_files=allow_files), allow_files=allow_files)
 
 

@@ -1,13 +1,27 @@
-"""RGB-D scenes: cameras, frames, clips, voxel grids, hypotheses, recordings.
+"""RGB-D scenes: what a camera saw, and hypotheses about what is there.
 
 >>> from mstfilter.scene import Hypothesis, Recording, project
->>> recording = Recording.from_arrays(rgb, depth, K)  # doctest: +SKIP
+>>> recording = Recording.from_arrays(rgb, depth, K)  # depth in metres  # doctest: +SKIP
 >>> clip = recording.clips()[-1]                      # the frames from one pause to the next  # doctest: +SKIP
->>> hypothesis = Hypothesis.from_labels(labels, clip.grid)  # doctest: +SKIP
->>> project(hypothesis, clip.after.camera)            # label image of the hypothesis  # doctest: +SKIP
+>>> clip.after.points                                 # (H, W, 3) world points in metres  # doctest: +SKIP
+>>> hypothesis = Hypothesis.from_labels(labels, clip.grid)  # an object for every voxel  # doctest: +SKIP
+>>> project(hypothesis, clip.after.camera)            # the label image that it predicts  # doctest: +SKIP
 
-Units are metres, radians and seconds. A rigid motion is a scipy `RigidTransform`, named ``T_to_from`` after its axes.
-`mstfilter.scene` does not depend on filters or file formats.
+A `Recording` is a video with pauses, at which nothing moves. What a filter observes is a `Clip`, the frames from one
+pause to the next, and each `Frame` is an image with its `Camera`. Hypotheses live on a `VoxelGrid` above the table.
+
+Units are metres, radians and seconds. A rigid motion is a scipy `RigidTransform`, named ``T_to_from`` after its axes;
+z of the world points up, and the table is at z = 0. This room depends neither on filters nor on file formats.
+
+=====================================  ===============================================================
+`camera`, `frame`, `recording`         pinhole cameras; images, clips; videos with pauses
+`voxels`, `occupancy`, `partitions`    grids and hypotheses; probabilities; renumbered and refined labels
+`geometry`, `support`                  the table; which pixels belong to objects
+`rendering`, `evidence`                hypotheses seen by a camera; free space, scores
+`plausibility`                         faults of the input, found before a run
+`encoding`, `arrays`                   hypotheses as arrays; content keys
+`cache`, `disk_cache`                  results that depend on the images alone, computed once
+=====================================  ===============================================================
 """
 
 from mstfilter.base.lazy import attach

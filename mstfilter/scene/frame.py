@@ -5,8 +5,8 @@
 >>> clip = Clip([frame, frame_2], grid, 1)     # the frames from pause 0 to pause 1
 >>> clip.before, clip.after                    # its first and its last frame
 
-If several cameras observe the scene, only the images of a main camera are segmented and tracked. A frame of
-the main camera has the simultaneous frames of the other cameras as `views`. Free space is computed from all cameras:
+If several cameras see the scene, one of them is the main camera, and only its images are segmented and tracked. The
+others help to see what is free. Their simultaneous frames are the `views` of the main camera's frame:
 
 >>> frame = Frame(rgb, depth, camera, views=(Frame(rgb_2, depth_2, camera_2),))
 """
@@ -215,20 +215,21 @@ def grey_blocks(rgb: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One RGB-D image with its camera.
+    """One RGB-D image with its camera: colour, and depth in metres that is registered to it.
 
     Parameters
     ----------
     rgb : (H, W, 3) uint8
         Colour image. A fourth channel (alpha) is dropped.
     depth : (H, W) float
-        z-depth in metres. A value that is not positive and finite (NaN, 0) means that the pixel has no reading.
+        z-depth in metres, that is, along the optical axis. NaN, 0 and whatever is not positive and finite means that
+        the pixel has no reading.
     camera : Camera
         Intrinsics and pose.
     robot_mask : (H, W) bool, optional
-        Pixels that show the robot. The depth at robot pixels is treated as unknown.
+        Pixels that show the robot. What is behind them is unknown, not free.
     views : tuple of Frame
-        Simultaneous frames of other cameras. With views, all cameras need a pose in the same world axes.
+        Simultaneous frames of other cameras, which add free space. All cameras then need a pose in one world.
     estimated : (H, W) bool, optional
         Pixels whose depth is an estimate, not a reading (`mstfilter.scene.foreground`).
     """
@@ -335,19 +336,20 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """The observation of a step: frames from one pause to the next, and the workspace. At a pause nothing moves.
+    """What a filter observes in one step: the frames from one pause to the next, and the workspace.
 
-    The frames between the pauses show the action. The first clip of a recording has one frame.
+    At a pause nothing moves, so the first frame (`before`) and the last one (`after`) can be segmented; those between
+    show the action, through which objects are tracked. The first clip of a recording has a single frame.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Frames in time order. The first and the last frame show the scene at rest. Frames may be read on access.
+        The frames in time order. The first and the last show the scene at rest. They may be read on access.
     grid : VoxelGrid
         The workspace.
     index : int
-        Number of the pause at the end of the clip, starting from 0. The identities of new objects depend on this
-        number, so the numbers of successive clips have to ascend.
+        Number of the pause at the end of the clip, counted from 0. It is a part of the identities of new objects, so
+        the numbers of successive clips have to ascend.
     times : tuple of float, optional
         Time of each frame in seconds.
     """

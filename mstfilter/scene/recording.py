@@ -5,7 +5,8 @@
 >>> for clip in recording.clips():
 ...     clip.before, clip.after                              # Frames, read when they are used
 
-If the camera pose is not given, the support plane at the first pause defines the world axes.
+In the world of a recording, z points up and the table is at z = 0. If the pose of the camera is not given, it is
+found from the support plane at the first pause.
 """
 
 from __future__ import annotations
@@ -75,14 +76,17 @@ class LazyFrames(Sequence[Frame]):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """An RGB-D video with pauses.
+    """An RGB-D video, the pauses at which nothing moves in it, and the workspace.
+
+    `Recording.from_arrays` makes one of your own images, and `mstfilter.open_recording` reads files. `clips` divides
+    it into what a filter observes step by step. A simulated recording also knows the truth.
 
     Parameters
     ----------
     frames : sequence of Frame
-        Frames in time order, in memory or read on access.
+        The frames in time order. They are in memory, or read on access (`LazyFrames`).
     grid : VoxelGrid
-        Workspace.
+        The workspace.
     pauses : tuple of int
         Indices of the frames at the pauses, ascending.
     times : tuple of float
@@ -92,7 +96,7 @@ class Recording:
     path : Path, optional
         The folder or file from which the recording was read.
     depth_scale : float
-        Metres per unit of the stored depth images, used when the recording is saved.
+        Metres per unit of the depth images, if the recording is saved.
     manifest : dict
         Content of manifest.json, for recordings read from a folder.
     truth : callable
@@ -153,7 +157,7 @@ class Recording:
         times: Sequence[float] | None = None,
         name: str = "arrays",
     ) -> Recording:
-        """A recording from arrays.
+        """A recording from images in memory: a video, or a single image.
 
         Parameters
         ----------
@@ -164,12 +168,12 @@ class Recording:
         K : (3, 3) array, or four numbers
             Intrinsics in pixels: the camera matrix, or fx, fy, cx, cy.
         pauses : sequence of int, str or PauseRule, optional
-            Frames at which nothing moves. The filter estimates hypotheses at each pause. A `PauseRule`, or a text
-            such as "still", "ends", "every" or "0s,4.2s", selects the pauses. The default rule is "still" if `times`
-            are given for more than two frames, else "ends".
+            Frames at which nothing moves; the filter gives hypotheses at each of them. Instead of listing them, name
+            a rule that finds them: a `PauseRule`, or a text such as "still", "ends", "every" or "0s,4.2s". The
+            default is "still" if `times` are given for more than two frames, else "ends".
         T_world_camera : (4, 4) or (T, 4, 4) array, RigidTransform or T of them, optional
-            Pose of the camera, or one pose per frame if the camera moves. z of the world must point up. A world
-            whose table is not at z = 0 is shifted. The default pose is computed from the support plane at the first
+            Pose of the camera, or one pose per frame if the camera moves. z of the world must point up; a world whose
+            table is not at z = 0 is shifted. By default, the pose is found from the support plane at the first
             pause.
         grid : VoxelGrid or float
             Workspace, or the voxel size in metres of one that covers the table (sides of 1 to 2 m, height 0.5 m).
@@ -270,12 +274,11 @@ class Recording:
         return len(self.frames)
 
     def clips(self) -> tuple[Clip, ...]:
-        """One clip per pause.
+        """One clip per pause: what a filter observes, step by step.
 
-        The first clip has the frame at the first pause. Each other clip has the frames from one pause to the next.
-
-        The first call warns if the input is not plausible, and raises InputError if no hypothesis can be correct
-        (`mstfilter.scene.examine`).
+        The first clip has the one frame at the first pause, each other clip the frames from one pause to the next.
+        The first call examines the input (`mstfilter.scene.examine`). It warns if something is not plausible, and
+        raises InputError if no hypothesis can be correct.
         """
         self._examined  # noqa: B018
         clips = []
@@ -287,9 +290,9 @@ class Recording:
     def in_world_of(self, other: Recording) -> Recording:
         """A copy with the workspace and the first camera pose of another recording, without true volumes and poses.
 
-        Use `in_world_of` for two recordings of a session if the camera has the same pose at the first pause of each
-        recording: ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. The clips of one recording can
-        then update hypotheses of the other recording.
+        The clips of the one recording can then update hypotheses of the other, as in
+        ``open_recording(path, options=["start_s=30"]).in_world_of(first)``. This is right only if the camera really
+        had the same pose at the first pause of each.
         """
         own = self.frames[self.pauses[0]].camera.pose
         moved = other.frames[other.pauses[0]].camera.pose * own.inv()

@@ -1,6 +1,6 @@
-"""Voxel grids and hypotheses.
+"""Voxel grids, and hypotheses on them.
 
-A `Hypothesis` is a particle of the filter. A hypothesis has an object label for every voxel; 0 is free space. The z
+A `Hypothesis` is the particle of a filter of scenes: an object label for every voxel, where 0 is free space. The z
 axis of the world points up, and the table is at z = 0.
 
 >>> import numpy as np
@@ -309,19 +309,22 @@ def labels_on(grid: VoxelGrid, labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A 3-D instance segmentation of the workspace; a particle of the filter.
+    """One answer to "what is on the table?": an object, or none, for every voxel. It is the particle of the filter.
+
+    A hypothesis is frozen. `from_labels` makes one of a label grid; `with_labels` and `without` return changed
+    copies, in which the objects keep their identities.
 
     Parameters
     ----------
     labels : (X, Y, Z) uint16
-        Label 0 is free or unknown space, and a label k >= 1 is an object. Labels need not be consecutive.
+        0 is free or unknown space, and k >= 1 an object. The numbers need not be consecutive, and mean nothing
+        outside the hypothesis: what follows an object over time is the `id` of its `ObjectRecord`.
     grid : VoxelGrid
-        Positions of the voxels.
+        Where the voxels are.
     objects : tuple of ObjectRecord
-        One `ObjectRecord` for each label, in ascending order of labels, with different ids. `Hypothesis.from_labels`
-        makes the records.
+        One record for each label, in ascending order of labels, with different ids.
     occupancy : Occupancy, optional
-        Occupancy probability of each voxel. By default, all probabilities are 0 or 1.
+        How probable it is that each voxel is occupied. By default, this is 0 or 1, as the labels say.
     """
 
     labels: np.ndarray

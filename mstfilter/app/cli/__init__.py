@@ -1,8 +1,8 @@
-"""The command line, which parses arguments, calls the package and prints results.
+"""The command line: it parses arguments, calls the package and prints.
 
-``mstfilter demo`` makes a simulated recording, filters it and writes a report. ``mstfilter --help`` lists the other
-commands. Each module has one group of commands. The import of a module adds its commands to
-`mstfilter.app.cli.root.app`.
+``mstfilter demo`` simulates a recording, filters it and writes a report; ``mstfilter --help`` lists the other
+commands. Each module has one group of commands, which are added to `mstfilter.app.cli.root.app` when the module is
+imported. A command does no work of its own, so whatever it does can be done in Python too.
 """
 
 from __future__ import annotations

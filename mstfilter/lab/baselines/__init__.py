@@ -1,10 +1,10 @@
-"""Baselines: filters with which MST is compared.
+"""Baselines: simpler filters, with which MST is compared.
 
 >>> mstfilter.preset("tracking_only").run(recording.clips(), seed=0)
 
-The updates use samples alone, predictions alone, or their union. The proposals are trivial baselines (floors).
-``models/published/object_fusion.py`` has a baseline in the style of MID-Fusion.
-``docs/baselines.md`` lists all presets.
+Each leaves out something that MST has. The updates use samples alone, predictions alone, or their union without
+fusing them; the proposals are trivial (floors). They share all else with `mst`, so a comparison changes one thing.
+``models/published/object_fusion.py`` is one in the style of MID-Fusion, and ``docs/baselines.md`` lists all presets.
 """
 
 from mstfilter.base.lazy import attach

@@ -1,13 +1,13 @@
-"""Oracles replace stages of a filter by the ground truth of a recording.
+"""Oracles: components that use the truth of a recording, so as to measure how much each stage loses.
 
-A simulated recording contains its true voxels, instance images and poses. Components named ``true_...`` use the
-truth instead of an estimate. The gain in quality shows how much quality each stage loses:
+A simulated recording knows its true voxels, instance images and poses. If a stage is replaced by its oracle, named
+``true_...``, the gain in quality is what the errors of this stage cost:
 
 >>> filter = mstfilter.preset("mst", "update.completer=true_completion", "transition=true_motions")
 >>> filter = bind_truth(filter, recording)                  # a clip holds no truth; the recording does
 >>> state, infos = filter.run(recording.clips(), seed=0)
 
-`STAGES` lists, for each stage, the overrides that replace the stage of the preset ``mst`` by its oracle.
+`STAGES` has the overrides that replace each stage of the preset ``mst``.
 """
 
 from mstfilter.base.lazy import attach

@@ -1,27 +1,26 @@
-"""Simulated recordings of a robot finger that pushes objects on a table, with true volumes.
+"""Simulated recordings: a robot finger pushes objects on a table, and the true volumes are known.
 
-A scene family and a seed define a recording:
+A scene family and a seed determine a recording:
 
 >>> from mstfilter.lab.simulation import cached_recording, scene_family, simulate_recording
 >>> recording = simulate_recording(scene_family("demo"), seed=7, path="recordings/demo-7")  # doctest: +SKIP
 >>> folder = cached_recording("s1", seed=7)  # found again by the next call  # doctest: +SKIP
 
-A scene can also be simulated step by step:
+The world can also be simulated step by step. With a `PushLoop`, your program chooses each push from the belief of a
+filter:
 
 >>> from mstfilter.lab.simulation import SimulatedScene, play_push
 >>> scene = SimulatedScene(scene_family("demo"), seed=7)  # doctest: +SKIP
 >>> images, labels = scene.frame_images(0), scene.truth()  # doctest: +SKIP
 >>> effect = play_push(scene.world, scene.choose_push(0), scene.family)  # doctest: +SKIP
 
-With a `PushLoop`, a program chooses each push from the belief of a filter.
+From bottom to top, the modules are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
+(MuJoCo physics, pushes), `printing` and `textures` (appearance), `arrangement` (placement), `lighting` and `renderer`
+(ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
 
-The lower modules, from bottom to top, are `solids` and `shapes` (objects), `families` (parameters of scenes), `world`
-(MuJoCo physics, pushes), `printing` and `textures` (appearance). The higher modules are `arrangement` (placement),
-`lighting` and `renderer` (ray casting), `sensor` (noise), `recorder` (recordings and their cache) and `push_loop`.
-
-The simulation has no camera motion, no glossy or transparent surfaces, no light reflected between objects, no
-articulated or soft objects, and no hand. Depth noise, the shadow of the projector and missing readings at edges are
-calibrated to real frames. Within a surface, depth noise is not correlated between pixels.
+Depth noise, the shadow of the projector and missing readings at edges are calibrated to real frames. What real scenes
+have and these do not: a moving camera, glossy or transparent surfaces, light reflected between objects, articulated
+or soft objects, a hand, and depth noise that is correlated within a surface.
 """
 
 from mstfilter.base.lazy import attach

@@ -1,10 +1,11 @@
-"""Queries of a weighted population of hypotheses, for planners, and similarities of hypotheses.
+"""Questions to a weighted set of hypotheses, as a planner asks them, and similarities of hypotheses.
 
->>> belief = Belief(resampler.resample(rng, fused, 5))
+>>> belief = Belief(state.population)
 >>> belief.occupancy()                                        # (X, Y, Z) probability
+>>> belief.estimate()                                         # the best single hypothesis
 
 =============  =========================================================================================
-`queries`      `Belief`: probabilities and expected information
+`queries`      `Belief`: probabilities, expected information, the estimate
 `information`  entropies and mutual information of weighted outcomes
 `similarity`   similarity and equality of hypotheses, for resamplers that compare particles
 =============  =========================================================================================

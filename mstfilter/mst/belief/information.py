@@ -1,8 +1,8 @@
 """Entropies and mutual information of weighted hypotheses, in nats.
 
-An action has one outcome under each hypothesis. The expected information of an action is the mutual information
-between the hypothesis and the outcome. The hypothesis determines the outcome, so the mutual information is the
-entropy of the distribution of the outcomes. The information is at most the entropy of the weights.
+How much would an action tell? Its expected information is the mutual information between the hypothesis and the
+outcome. Under each hypothesis the action has one outcome, so this is simply the entropy of the distribution of the
+outcomes. It is at most the entropy of the weights.
 
 >>> import numpy as np
 >>> rows = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])    # outcomes of three hypotheses in three groups of cells
@@ -10,16 +10,16 @@ entropy of the distribution of the outcomes. The information is at most the entr
 >>> bool(np.isclose(outcome_information(weights, rows, hamming, sizes), np.log(2)))
 True
 
-**Tolerance.** Without noise, two outcomes that differ in one cell of 10,000 are different. A `tolerance` tau
-replaces the information by I_tau, where outcomes i and j differ in d_ij cells:
+**Tolerance.** This counts two outcomes as different even if they differ in one cell of 10,000, which no measurement
+would show. A `tolerance` tau replaces the information by I_tau, where outcomes i and j differ in d_ij cells:
 
     ``I_tau = - sum_i w_i log sum_j w_j exp(-d_ij / tau)``
 
-Outcomes that differ in far fewer than tau cells count as identical, outcomes that differ in far more as different.
-I_0 is the information without noise. I_tau decreases to 0 as tau grows. Suppose that every cell is measured with an
-independent error of probability e. Then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual
-information of hypothesis and measurement. Kolchinsky and Tracey (2017), *Estimating mixture entropy with pairwise
-distances*, derive the bound with the Bhattacharyya distance.
+Outcomes that differ in far fewer than tau cells count as identical, those that differ in far more as different. I_0
+is the information without noise, and I_tau decreases to 0 as tau grows. If every cell is measured with an independent
+error of probability e, then I_tau with tau = -1 / log(2 sqrt(e (1 - e))) is a lower bound of the mutual information
+of hypothesis and measurement (Kolchinsky and Tracey 2017, *Estimating mixture entropy with pairwise distances*, by
+the Bhattacharyya distance).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Queries of a weighted population of hypotheses, for planners: probabilities, entropies, expected information.
+"""Questions to weighted hypotheses, as a planner asks them: probabilities, entropies, expected information.
 
 >>> belief = Belief(state.population)
 >>> belief.occupancy()[tuple(belief.voxel([0.1, 0.0, 0.02]))]     # probability that the voxel is occupied
@@ -9,13 +9,15 @@
 >>> belief.estimate()                                             # the hypothesis of least expected loss
 >>> belief.push_map(tolerance=50)                                 # information of a push at each voxel
 
-Hypothesis i has labels L_i and the normalised weight w_i. Labels of different hypotheses are unrelated, so renaming
-the labels of a hypothesis changes no result. Probabilities of voxels also use the occupancy probabilities of each
-hypothesis (`Hypothesis.occupancy`). Queries about segmentations and actions use only the labels. Voxels are integer
-indices (x, y, z); `Belief.voxel` converts metres. Pixels are (column, row). A region is a bool array of the grid's
-shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2 for bits).
-`mstfilter.mst.belief.information` defines the expected information of an action and its `tolerance` (voxels or
-pixels).
+The probability of a statement is the total weight of the hypotheses in which it holds: hypothesis i has labels L_i
+and the normalised weight w_i. Each hypothesis numbers its objects as it likes, so no answer depends on the numbers.
+Questions about the occupancy of voxels also use the occupancy probabilities of each hypothesis
+(`Hypothesis.occupancy`); those about segmentations and actions use the labels alone.
+
+Voxels are integer indices (x, y, z), which `Belief.voxel` finds for points in metres. Pixels are (column, row). A
+region is a bool array of the grid's shape, or voxels (..., 3). Entropy and information are in nats (divide by log 2
+for bits). What the information of an action is, and its `tolerance` (in voxels or pixels), is explained in
+`mstfilter.mst.belief.information`.
 """
 
 from __future__ import annotations
@@ -73,13 +75,16 @@ class Border(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A posterior over scenes, represented by weighted hypotheses.
+    """What the filter believes about the scene: a posterior, represented by weighted hypotheses.
+
+    Its methods answer with probabilities, or with the expected information of an action, and `estimate` names the one
+    hypothesis to use if only one can be used.
 
     Parameters
     ----------
     population : Population
-        Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Equal hypotheses are
-        merged, and hypotheses of weight 0 are ignored.
+        Hypotheses on one grid with unnormalised log weights, such as ``state.population``. Those that are equal are
+        merged, and those of weight 0 are ignored.
     """
 
     population: Population

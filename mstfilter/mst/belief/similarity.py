@@ -3,8 +3,8 @@
 >>> WeightedCoverage().matrix(population.particles)      # (n, n), 1 on the diagonal
 >>> SameSegmentation().classes(population.particles)     # (n,) classes of equal segmentations
 
-The resamplers of `mstfilter.smc` that compare particles use these components:
-``ClusterStratified(similarity=WeightedCoverage())``, ``Coalesced(equivalence=SameSegmentation())``.
+They are for the resamplers of `mstfilter.smc` that compare particles, such as
+``ClusterStratified(similarity=WeightedCoverage())`` and ``Coalesced(equivalence=SameSegmentation())``.
 """
 
 from __future__ import annotations

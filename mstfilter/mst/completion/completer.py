@@ -1,24 +1,24 @@
-"""Completion estimates the space that an object fills from its visible part (paper, section IV-B).
+"""Completion: the space that an object fills, from the part of its surface that was seen (paper, section IV-B).
 
-A segment of a depth image shows only the front surface of an object. A `Completer` estimates the hidden part of the
-object, for one mask at a time. The completion depends only on the frame and the mask, not on other segments.
-Hypotheses with a common segment use the same completion.
+A segment of a depth image shows only the front of an object. A `Completer` estimates the hidden part, for one mask at
+a time and without regard to other segments, so hypotheses that have a segment in common share its completion.
 
 >>> completions = Extrude().complete(rng, frame, [mask_a, mask_b], grid)
 >>> labels = arbitrate(completions, grid)            # (X, Y, Z), 1 for mask_a, 2 for mask_b
 
-To add a method, inherit `Completer` and override `fill`. The argument of `fill` is an `ObservedBox`, a small box of
-the grid; the result is the probability of each voxel. `complete` clears voxels that are observed as free and keeps
-the visible surface. If a method is faster for many boxes together, override `fill_many`. An array with a wrong shape,
-or with numbers that are not probabilities, is an error (`mstfilter.base.results`).
+To add a method, inherit `Completer` and override `fill`. It gets an `ObservedBox`, a small box of the grid around the
+object, and returns the probability of each voxel. `complete` takes care of the rest: it clears the voxels that are
+observed as free, and keeps the visible surface. If your method is faster for many boxes together, override
+`fill_many`. An array of the wrong shape, or with numbers that are not probabilities, is an error
+(`mstfilter.base.results`).
 
-`arbitrate` makes the label grid. If several completions contain a voxel, three rules decide:
+`arbitrate` makes the label grid. If several completions contain a voxel,
 
-1. A voxel with depth readings belongs to the object with most readings in the voxel.
-2. A voxel without readings belongs to the object of largest probability, if this probability reaches the threshold.
-3. A tied voxel belongs to the object with the nearest visible surface.
+1. it belongs to the object with most depth readings in it;
+2. without readings, to the object of largest probability, if this reaches the threshold;
+3. if tied, to the object with the nearest visible surface.
 
-The labels do not depend on the order of the objects: renumbered completions give renumbered labels.
+So the labels do not depend on the order of the objects: renumbered completions give renumbered labels.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
 >>> NetworkCompleter(weights="trained/mine", architecture=MyArchitecture())  # an `Architecture` of the user
 >>> NetworkCompleter(weights="mine.onnx")                                    # needs the extra `onnx`
 
-The network uses a grid with voxels of 1 cm (the lattice). If the voxels of the workspace have another size, the
-object is completed on the lattice, and the result is interpolated. `Extrude` completes objects larger than 64 cm,
-because the network was trained on smaller objects.
+The network works on a grid with voxels of 1 cm (the lattice). If those of the workspace have another size, the object
+is completed on the lattice, and the result is interpolated. Objects larger than 64 cm are completed by `Extrude`,
+because the network was trained on smaller ones.
 """
 
 from __future__ import annotations

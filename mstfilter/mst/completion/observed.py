@@ -4,10 +4,10 @@
 >>> bits, signed = encode_box(seen)                               # packed: the contents of an `ObjectView`
 >>> offset, now, seen, views = observed_again(frame, mask, views, grid, completer)     # and of earlier frames
 
-**Earlier frames.** When an object moves, the views of the object move with it. Values of a view are read at the
-nearest voxel. A view contributes the surface of the object, the space behind this surface and the free space around
-it. Surfaces of other objects, and the space that they occlude, are ignored, because the other objects may have moved.
-If the latest frame and a view differ about the object's surface, the latest frame takes precedence.
+**Earlier frames.** When an object moves, its views move with it, and their values are read at the nearest voxel. A
+view contributes the surface of the object, the space behind this surface, and the free space around it. Surfaces of
+other objects, and the space that they occlude, are left out, because the other objects may have moved since. Where
+the latest frame and a view differ about the surface, the latest frame decides.
 """
 
 from __future__ import annotations

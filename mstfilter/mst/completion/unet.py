@@ -3,13 +3,13 @@
 >>> network = load_network("completion")
 >>> p = network.probabilities([seen], edge=32)      # (1, 32, 32, 32)
 
-The input is a crop of the workspace's voxel grid (`mstfilter.mst.completion.crops`). The output is a logit for each
-voxel. The residual blocks work at a half, a quarter and an eighth of the resolution. At the input and the output, 2 x
-2 x 2 voxels are packed as channels. A vector z of global features scales and shifts the features at the two coarse
-levels (FiLM; Perez et al., "FiLM: visual reasoning with a general conditioning layer", AAAI 2018). The vector z is a
-linear function of the mean features at an eighth of the resolution.
+From a crop of the voxel grid around an object (`mstfilter.mst.completion.crops`), it makes a logit for each voxel.
+Its residual blocks work at a half, a quarter and an eighth of the resolution; at input and output, 2 x 2 x 2 voxels
+are packed as channels. A vector z of global features, a linear function of the mean features at an eighth of the
+resolution, scales and shifts the features at the two coarse levels (FiLM; Perez et al., "FiLM: visual reasoning with
+a general conditioning layer", AAAI 2018).
 
-`load_network` also loads a user's network: an `Architecture` with weights in a folder, or an ONNX file.
+`load_network` also loads a network of yours: an `Architecture` with weights in a folder, or an ONNX file.
 """
 
 from __future__ import annotations

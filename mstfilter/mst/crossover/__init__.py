@@ -2,9 +2,12 @@
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)     # candidates, with weights
 
+A sample and a prediction share voxels where their objects overlap. The conflict graph has these overlaps as edges,
+and along each edge two objects are merged, or one is painted over the other, at random.
+
 =============  =========================================================================================
-`update`       `CrossoverUpdate`: all pairs, with weights; `Crossover`: makes one hypothesis from two
-`conflicts`    the conflict graph of two hypotheses (networkx), painting orders, merge probabilities
+`update`       `CrossoverUpdate`: all pairs, with weights; `Crossover`: makes one hypothesis of two
+`conflicts`    the conflict graph (networkx), painting orders, merge probabilities
 `mode_filter`  `ModeFilter`: smooths the result
 =============  =========================================================================================
 """

@@ -4,12 +4,12 @@
 >>> graph.edges, graph.components()
 >>> networkx.draw(graph.networkx(), with_labels=True)
 
-A vertex is an object of one of the two hypotheses. An edge joins a proposed and a predicted object that overlap. The
-graph is bipartite, because objects of one hypothesis never overlap.
+A vertex is an object of one of the two hypotheses, and an edge joins a proposed and a predicted object that overlap.
+The graph is bipartite, because objects of one hypothesis never overlap.
 
-For each connected component of the conflict graph, a `Structure` draws the order in which objects are painted, and
-directed edges from a child to its parent. The parent is painted later than the child. The table has the probability
-that a child with n1 voxels is merged into a parent with n2 voxels and I common voxels (`merge_probability`):
+In each connected component, a `Structure` draws the order in which objects are painted, and directed edges from a
+child to its parent, which is painted later. Along such an edge, a child with n1 voxels is merged into a parent with
+n2 voxels and I common voxels, with a probability that `merge_probability` computes by one of these rules:
 
 =============  =============================  ========================================================
 rule           probability                    source

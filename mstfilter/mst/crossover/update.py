@@ -1,28 +1,28 @@
-"""The published measurement update, which makes weighted candidates from predicted and proposed hypotheses.
+"""The published measurement update: weighted candidates, each made of one prediction and one sample.
 
 >>> fused = CrossoverUpdate().update(rng, predicted, proposed, clip)
 
-1. Free-space projection clears voxels of every predicted hypothesis j, and the share Q_j of the voxels remains.
-2. Every sample i and every predicted hypothesis j make `eta` candidates by crossover. The weight of a candidate
-   depends only on its parents (section IV-E):
+1. Free-space projection clears the voxels of every prediction j that the frame observes as free, and leaves the share
+   Q_j of its voxels.
+2. Every sample i and every prediction j make `eta` candidates by crossover. The weight of a candidate depends only on
+   the weights w_i and w_j of its parents (section IV-E; lambda is `quality_exponent`):
 
        ``log w = log w_i + log w_j + lambda log Q_j``
 
-   The weights of the parents are w_i and w_j, and lambda is `quality_exponent`. The weights are
-   known in advance, so candidates are resampled first, and only the selected candidates are built.
+   So the weights are known in advance, candidates can be resampled first, and only the selected ones are built.
 
-Without a proposal, the update only projects and weights the predictions. The projection follows the manifold filter
-of Koval, Pollard and Srinivasa (2015). If few states agree with an observation, hardly any prediction agrees. So
-every particle is projected onto the set of states that agree with the observation.
+Without a proposal, the update only projects and weights the predictions. This is the manifold filter of Koval,
+Pollard and Srinivasa (2015): if few states agree with an observation, hardly any prediction does, so every particle
+is projected onto the set of those that agree.
 
 A crossover has four steps (paper, figure 5):
 
 >>> child = Crossover().cross(rng, proposed, predicted)
 
 1. `graph_of` builds the conflict graph, in which two objects that share voxels are in conflict.
-2. `resolve` draws, for each connected component of the graph, which objects are merged, and the painting order of all
-   objects. Objects that are painted later cover earlier objects.
-3. `assign_labels` paints the objects into one label grid. Objects without conflict are copied.
+2. `resolve` draws, for each connected component of the graph, which objects are merged, and the order in which all
+   objects are painted. Later ones cover earlier ones.
+3. `assign_labels` paints the objects into one label grid. Those without conflict are copied.
 4. `mstfilter.mst.crossover.ModeFilter` removes speckle from the painted labels.
 """
 

@@ -1,4 +1,4 @@
-"""Front ends that use other programs: segmentations and shapes in folders, and networks in files.
+"""Front ends that use other programs: their segmentations and shapes, which lie in folders, and their networks.
 
 >>> import mstfilter
 >>> mst = mstfilter.preset("mst_rules", "proposal=mask_folder", "proposal.folder=masks")        # doctest: +SKIP
@@ -10,8 +10,8 @@
 `completions`       meshes, point clouds and voxels of other programs as completions
 ==================  ===================================================================
 
-The networks of the published system, COB and SiamMask, and the tracker SAM 2 are files in ``models/published``. The
-registry loads these files like component files of users. The package has no weights of these networks.
+The networks of the published system, COB and SiamMask, and the tracker SAM 2 are files in ``models/published``, which
+the registry loads as it loads a component file of yours. Their weights are not part of the package.
 """
 
 from mstfilter.base.lazy import attach

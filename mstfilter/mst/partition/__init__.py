@@ -1,12 +1,15 @@
-"""The default measurement update: `PartitionUpdate` partitions the image, and completes objects from all their views.
+"""The default measurement update: it partitions the image, and completes objects from all their views.
 
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)     # candidates, with weights
 
+Samples and predictions often disagree about which depth readings belong to one object. The update weighs what they
+say and gives partitions of the readings their probabilities. Shapes come last, and only for what resampling selects.
+
 =============  =========================================================================================
-`update`       `PartitionUpdate`: weighted candidates, shapes completed from all views
-`candidates`   descriptions of candidates with their probabilities, before anything is completed
-`cells`        the common refinement of partitions, odds of pairs of cells, and probabilities of partitions
+`update`       `PartitionUpdate`: the five steps, from free space to completed objects
+`cells`        the common refinement of all partitions, odds of pairs of cells, probabilities of partitions
+`candidates`   choices of a prediction, a partition and the hidden objects that stay, with their weights
 `association`  which segment of the image continues which predicted object
 =============  =========================================================================================
 """

@@ -1,26 +1,25 @@
-"""Associates the segments of an image partition with the objects of a prediction.
+"""Which segment of a partition of the image continues which predicted object.
 
 >>> overlaps = Overlaps.of(partition, counts, 60)   # segment (K,) and readings (K, objects + 1) of each cell
 >>> for component in overlaps.components():         # of the conflict graph
 ...     overlaps.tracks(component)                  # segment -> predicted objects that it continues
 
-A segment and a predicted object are *in conflict* if they share more than a tenth of the depth readings of the
-smaller of the two. The segment may then show the object. Conflicts are the edges of the conflict graph. (In the
-paper, section IV-D, edges join objects that share voxels.) The *main object* of a segment is the predicted object
-that shares most readings with the segment. An object that is the main object of no segment and has fewer than about
-60 readings is in no conflict. The few depth readings of a hidden object measure nearby objects.
+A segment may show a predicted object if it shares more than a tenth of the readings of the smaller of the two. They
+are then *in conflict*, and the conflicts are the edges of the conflict graph. (In the paper, section IV-D, edges join
+objects that share voxels.) The predicted object with which a segment shares most readings is its *main object*.
 
-A predicted object is continued by at most one segment of its connected component. Two rules are applied in order:
+Hidden objects catch a few stray readings of their neighbours. So an object that is the main object of no segment and
+has fewer than about 60 readings is in no conflict; it counts as *occluded*, as does an object without readings.
 
-1. The first rule considers only segments whose main object is the predicted object. A considered segment continues
-   the object if it has more than half of those readings of the object that lie in considered segments. The first rule
-   ignores readings at which another object now occludes the predicted object.
-2. The second rule considers all segments. A segment continues the object if it has more than half of those readings
-   of the object that lie in any segment.
+In each connected component, a predicted object is continued by at most one segment: one that is in conflict with it
+and has more than half of its readings. Readings outside all segments never count. Two rules are tried in order:
 
-A predicted object in no conflict is *occluded*. Depth readings that belong to no segment are never counted.
+1. Only the segments whose main object it is are considered, and only its readings in these. So readings where another
+   object now stands in front of it do not count against it.
+2. If none of these has more than half, all segments are considered.
 
-A predicted object is *lost* if the frame refutes it or if no segment continues it. See `recognised`.
+A predicted object that no segment continues, and that does not stay as an occluded one, is *lost*; a refuted one
+always is. It may still be `recognised` elsewhere.
 """
 
 from __future__ import annotations

@@ -1,18 +1,18 @@
-"""Describes and weights the candidates of the update before any object is completed.
+"""Candidates of the update, described and weighed before any object is completed.
 
 >>> choices = Choices.of(cells, log_weights, log_odds, 100)   # for n predictions: log_weights (n,), log_odds (n, e)
 >>> choices.prediction[0], choices.partitions[0]             # prediction j, and the segment (K,) of each cell
 >>> choices = choices.with_occluded(probabilities_to_stay, 100)
 >>> choices.log_weights, choices.staying[0]                  # log probability, occluded objects of j that stay
 
-A candidate consists of a prediction j, an alternative a_c for each component c of the cells, and the set of occluded
-objects k that stay (e_k = 1). Object k stays with probability r_k. The probability of a candidate is a product:
+A candidate is a series of choices: a prediction j, an alternative a_c for each component c of the cells, and for each
+occluded object k whether it stays (e_k = 1), which it does with probability r_k. Its probability is the product
 
     ``w_j Q_j^lambda  prod_c P(a_c | image, j)  prod_k r_k^{e_k} (1 - r_k)^{1 - e_k},         e_k in {0, 1}``
 
-The components are independent given the prediction. Therefore the factors are multiplied one after the other, and
-only the n largest products are kept after each factor (`largest_products`). The probabilities of all candidates sum
-to 1. The total probability of the omitted candidates is reported as the *discarded mass*.
+because the components are independent given the prediction. So the factors can be multiplied one after the other, and
+after each of them all but the n largest products are dropped (`largest_products`). Over all candidates the
+probabilities sum to 1, so what the kept ones lack is the *discarded mass*, which is reported.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Readings and cells of a depth image, and probabilities of partitions of the cells into objects.
+"""Readings and cells of a depth image, and probabilities of the partitions of the cells into objects.
 
 >>> readings = Readings.of(frame, grid)
 >>> cells = Cells.of(readings, samples, predictions)
@@ -6,27 +6,27 @@
 >>> component = cells.alternatives()[0]                           # the partitions of the cells of one component
 >>> cells.probabilities(log_odds, component)                      # (p,) probability of each of these partitions
 
-A sample groups the depth readings by segment. A prediction groups the readings by the predicted object at each
-reading. A cell is a set of readings that no sample and no prediction separates: the cells are the common refinement
-of all partitions. Two cells are connected if they belong to one object in a sample or a prediction. A component is a
-connected set of cells.
+A sample groups the depth readings by segment, a prediction by the predicted object at each reading. Readings that no
+sample and no prediction separates form a cell, so the cells are the common refinement of all these partitions, and a
+partition need only be decided between cells. Cells that belong to one object in some sample or prediction are
+connected; a component is a connected set of them, and is decided on its own.
 
-For two cells, f_image is the share of the samples in which the cells belong to one object. The share
-f_prediction is the corresponding weighted share of the predictions. The log odds l of "one object" are a sum:
+Are two cells one object? Let f_image be the share of the samples in which they are, and f_prediction the
+corresponding weighted share of the predictions. The log odds l of "one object" are a sum:
 
     ``l = (1 - R) (image_only_constant + image_only logit(f_image))
     + R (constant + image logit(f_image)) + W (prediction logit(f_prediction) + prediction_constant)``
 
-R is the probability that a prediction is valid. The update gives one prediction at a time a weight above 0, so
-f_prediction is 0 or 1 there. W <= R is the total weight of the predictions with an object at both
-cells. In the logit, 0.02 is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`. By default,
-logit(f_image) is not scaled. The coefficient of the predictions was fitted to pairs of cells, and the constants were
-chosen in `experiments/weights` (docs/history.md).
+R is the probability that a prediction is valid, and W <= R the total weight of the predictions with an object at both
+cells. The update gives one prediction at a time a weight above 0, so there f_prediction is 0 or 1. In the logit, 0.02
+is added to f and to 1 - f. The coefficients are the fields of `PairEvidence`; by default, logit(f_image) is not
+scaled. That of the predictions was fitted to pairs of cells, and the constants were chosen in `experiments/weights`
+(docs/history.md).
 
-The alternatives of a component are its partitions in the samples and in the predictions. If a prediction has no
-object at a cell, each sample in turn determines which predicted object the cell joins. A mixture of the alternatives
-gives each pair of cells a probability of "one object". The mixture is fitted to the probabilities of the log odds l
-by least cross entropy over the pairs of readings.
+The alternatives of a component are its partitions in the samples and in the predictions. Where a prediction has no
+object at a cell, each sample in turn says which predicted object the cell joins. The alternatives then get
+probabilities such that their mixture agrees as well as possible with the log odds of all pairs: by least cross
+entropy over the pairs of readings.
 """
 
 from __future__ import annotations

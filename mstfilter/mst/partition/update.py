@@ -1,38 +1,38 @@
-"""The measurement update, which weights partitions of the image and completes every object from all its views.
+"""The measurement update: it weighs partitions of the image, and completes every object from all its views.
 
 >>> update = PartitionUpdate(completer=NetworkCompleter())
 >>> fused = update.update(rng, predicted, proposed, clip)       # weighted candidates, built on access
 
-The update replaces section IV-D of the paper. Samples and predictions are partitions of the depth readings of the
-last frame. The voxels of an object are estimated again from all observations of the object.
+This update takes the place of section IV-D of the paper. It treats samples and predictions as what they say about the
+last frame: which of its depth readings belong together. Voxels are not fused at all; those of an object are estimated
+anew from everything that was seen of it.
 
-1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not
-   observe as free. The visible surface is tested too: A_j is the share of the surface of prediction j with which
-   the depth readings agree. A_j^lambda is the probability that prediction j is valid, which means that the
-   prediction shows the present scene. A predicted object is *refuted* if the readings agree with less than the
-   share `least_agreement` of the object's visible surface. No candidate contains a refuted object.
-2. **Partitions.** A sample groups the readings by segment. A prediction groups the readings by the predicted object
-   at each reading. The samples and prediction j give the odds that two readings belong to one object. The odds
-   determine the probabilities of the partitions of each part of the image (`mstfilter.mst.partition.cells`). A
-   candidate consists of a prediction j, one partition of each part, and the occluded objects that stay (step 4). The
-   weight of a candidate is w_j Q_j^lambda times the probabilities of these choices
-   (`mstfilter.mst.partition.candidates`). Only the most probable candidates are described. The resampler of the
-   filter selects some candidates, and only selected candidates are completed.
-3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each *component* of the
-   graph, segments continue predicted objects by the rules in `mstfilter.mst.partition.association`. In the paper,
-   merges are drawn at random. In this update, the partition determines the merges.
-4. **Occluded objects.** A predicted object without conflict has few readings or none. An occluded object stays with
-   probability (A_j q)^lambda, so some candidates contain the object and others do not. The factor q is the share of
-   the object's voxels that the frame does not observe as free. A_j is the same for all objects of prediction j.
+1. **Free space.** As in the paper, Q_j is the share of the voxels of prediction j that the frame does not observe as
+   free. Its visible surface is tested too: the readings agree with the share A_j of it, and A_j^lambda is the
+   probability that the prediction is *valid*, which means that it shows the present scene. A single object can fail
+   as well. If the readings agree with less than the share `least_agreement` of its visible surface, it is *refuted*,
+   and no candidate contains it.
+2. **Partitions.** A sample groups the readings by segment, a prediction by the predicted object at each reading. The
+   samples and prediction j together give the odds that two readings belong to one object, and these determine the
+   probabilities of the partitions of each part of the image (`mstfilter.mst.partition.cells`). A candidate is a
+   prediction j, one partition of each part, and the occluded objects that stay (step 4). Its weight is w_j Q_j^lambda
+   times the probabilities of these choices (`mstfilter.mst.partition.candidates`). Only the most probable candidates
+   are described, and only those that the resampler of the filter selects are completed.
+3. **Association.** Segments and predicted objects are the vertices of a *conflict graph*. In each of its components,
+   the rules in `mstfilter.mst.partition.association` decide which segment continues which object. Merges follow from
+   the partition; in the paper, they are drawn at random.
+4. **Occluded objects.** A predicted object without conflict has few readings or none. If q is the share of its voxels
+   that the frame does not observe as free, it stays with probability (A_j q)^lambda, so it is in some candidates and
+   not in others. (A_j is that of the whole prediction.)
 5. **Completion.** An object keeps its views, which are its observations in earlier frames
-   (`mstfilter.scene.ObjectView`). A visible object is completed from its readings in the last frame and from the
-   views of the predicted objects that the visible object continues. An occluded object is completed from its views
-   only. The completer drops views that contradict the frame. An object without any voxel is removed. Completions of
-   earlier pauses are not used again, with one exception. If the completer does not use views, an occluded object has
-   no views and keeps its predicted voxels outside free space.
+   (`mstfilter.scene.ObjectView`). A visible object is completed from its readings and from the views of the predicted
+   objects that it continues, an occluded one from its views alone. The completer drops views that contradict the
+   frame, and an object without any voxel is removed. Completions of earlier pauses are not used again, so their
+   errors do not add up. The one exception are completers that do not use views: without any, an occluded object keeps
+   its predicted voxels outside free space.
 
-At the first pause the candidates are the distinct samples, so every segment is a new object. A hypothesis contains
-only objects that some frame has shown.
+At the first pause the candidates are the distinct samples, and every segment is a new object. So a hypothesis
+contains only objects that some frame has shown.
 """
 
 from __future__ import annotations
@@ -113,25 +113,25 @@ class PartitionUpdate(Update):
     completer : Completer
         Completes the objects. The completions of the proposal are not used, so the proposal can use `SurfaceOnly`.
     free_space : Projection
-        Computes the share Q of a prediction that the frame does not observe as free, and the remaining voxels.
+        Computes the voxels of a prediction that the frame does not observe as free, and their share Q.
     pairs : PairOdds
         The log odds that two cells belong to one object.
     temperature : float
-        T. The probability of a partition is proportional to P^(1/T), where P is the probability from the pairs of
-        cells. A higher T makes the probabilities more even (`experiments/weights` compares several T).
+        T. A partition gets a probability in proportion to P^(1/T), where P is that from the pairs of cells. So a
+        higher T makes the probabilities more even (`experiments/weights` compares several T).
     evidence : tuple of Evidence
-        Terms that are added to the log weights of built candidates. Without terms, only candidates that are selected
-        are built.
+        Terms that are added to the log weights of candidates, which have to be built for this. Without terms, only
+        the candidates that resampling selects are built.
     quality_exponent : float
         Exponent lambda of Q, A and q. If lambda is 0, every occluded object is kept.
     n_candidates : int
         Largest number of candidates after the first pause. 0 means 20 for each predicted hypothesis.
     n_scored : int
-        Number of candidates that are built and scored by `evidence`. The other candidates are discarded.
+        With `evidence`, this number of candidates is built and scored, and the others are discarded.
     reach : float
         Largest distance in voxels between a reading and the predicted object to which the reading belongs.
     n_views : int
-        Number of latest views that an object keeps.
+        Number of its latest views that an object keeps.
     threshold : float
         Smallest probability of an occupied voxel.
     mend : bool

@@ -1,4 +1,4 @@
-"""Segmentation of one image into hypotheses: boundaries -> tree -> cuts -> hypotheses (paper IV-B).
+"""Segmentations of one image, sampled: boundaries -> tree -> cuts -> hypotheses (paper, section IV-B).
 
 >>> from mstfilter.mst.segmentation import ColourDepthBoundary, LearnedTree, MergeLogOdds, MetropolisHastingsCuts
 >>> boundary = ColourDepthBoundary().boundary(frame)                                  # doctest: +SKIP
@@ -6,13 +6,16 @@
 >>> w = MergeLogOdds().values(tree, frame)                                            # doctest: +SKIP
 >>> cuts = MetropolisHastingsCuts(temperature=1).sample(rng, tree, w, 10).cuts        # doctest: +SKIP
 
-`TreeCutProposal` performs all four steps and completes the segments to 3-D shapes.
+A boundary map says where the image may be divided. Small regions between the boundaries are merged in pairs into a
+tree, and each cut of the tree is a segmentation. Where the image is ambiguous, sampled cuts differ. `TreeCutProposal`
+does all this and completes the segments to 3-D shapes.
 
 ================  ====================================================================
 `boundary`        boundary maps from colour and depth
 `tree`            the tree and its helpers; the ultrametric contour map
 `regions`         measurements of regions and of their borders
-`learned_tree`    trees from learned log odds, also with the evidence of a trained network, `border_network`
+`learned_tree`    trees from learned log odds
+`border_network`  the trained network that corrects these log odds
 `cuts`            node values, the optimal cut, exact samples
 `mh`              Metropolis-Hastings samples
 `proposal`        which regions are objects; the proposal of the filter

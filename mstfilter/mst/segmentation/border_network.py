@@ -4,11 +4,12 @@
 >>> seen = network.look(frame)                     # maps of the frame's size
 >>> seen.border[row, column], seen.foreground[row, column], seen.centre[row, column]
 
-A frame is reduced to 320 pixels per row (`encode_image`), and the output maps are interpolated to the size of the
-frame. The three levels of the U-Net have a half, a quarter and an eighth of the reduced resolution. In the input and
-the output, blocks of 2 x 2 pixels are packed into channels. Two outputs are log odds: that a pixel is at an object's
-border, and that a pixel belongs to an object. Two other outputs are the offset from the pixel to the object's centre
-(Neven et al., "Instance segmentation by jointly optimizing spatial embeddings and clustering bandwidth", CVPR 2019).
+For each pixel, the network gives the log odds that it is at an object's border, the log odds that it belongs to an
+object, and the offset to the centre of this object (Neven et al., "Instance segmentation by jointly optimizing
+spatial embeddings and clustering bandwidth", CVPR 2019). A frame is reduced to 320 pixels per row for this
+(`encode_image`), and the maps are interpolated to the size of the frame. The three levels of the U-Net work at a
+half, a quarter and an eighth of the reduced resolution; at its input and output, blocks of 2 x 2 pixels are packed
+into channels.
 
 A model may also have a `PairNetwork`, which corrects the linear log odds of the tree `border`.
 """

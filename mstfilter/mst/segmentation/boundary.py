@@ -2,11 +2,11 @@
 
 >>> boundary = ColourDepthBoundary().boundary(frame)       # (H, W) float32 in 0 .. 1
 
-Most objects are convex, so depth has a concave crease or a step between two touching objects, or between object and
-table. A convex crease, such as the edge of a box, lies inside one object. On a plane, disparity D = 8 f b / z (f
-focal length, b baseline, z depth) is affine in the pixel coordinates. The noise of D does not depend on depth. The
-largest eigenvalue of the Hessian of disparity responds to creases and steps only. Colour adds boundaries that are not
-visible in depth. The weight of colour is low, because print on a box is not a boundary.
+Most objects are convex. So where two of them touch, or where one stands on the table, depth has a concave crease or a
+step, while a convex crease, such as the edge of a box, lies inside one object. Both are looked for in disparity, D =
+8 f b / z (f focal length, b baseline, z depth), because D is affine in the pixel coordinates on a plane and its noise
+does not depend on depth: the largest eigenvalue of its Hessian responds to creases and steps only. Colour adds the
+boundaries that depth does not show, with a low weight, because print on a box is no boundary.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """Cuts of a segmentation tree: node values, the optimal cut, and exact samples.
 
-A `CutValue` gives every node a value w. The value of a cut is the sum of the values of its nodes, v(c) = sum w.
-`optimal_cut` maximises this value, and a `CutSampler` draws cuts at random.
+A `CutValue` gives every node a value w, and a cut has the sum of the values of its nodes, v(c) = sum w. `optimal_cut`
+finds the cut of largest value; a `CutSampler` draws cuts at random.
 
 >>> w = MergeLogOdds().values(tree, frame)                     # (N,), higher is better
 >>> best = optimal_cut(tree, w)                                # ascending nodes
 >>> sample = ExactCuts().sample(np.random.default_rng(0), tree, w, 10)
 
-In a Gibbs distribution with inverse temperature b, a cut has probability proportional to exp(b v(c)). One pass up the
-tree computes ``stop[n]``, the probability that a cut contains node n if the cut contains no ancestor of n. A random
-walk down from the root with the probabilities ``stop`` draws an exact sample.
+In a Gibbs distribution with inverse temperature b, a cut has a probability in proportion to exp(b v(c)). Trees allow
+exact samples of it: one pass up the tree computes ``stop[n]``, the probability that a cut contains node n if it
+contains no ancestor of n, and a random walk down from the root, which stops with these probabilities, draws a cut.
 """
 
 from __future__ import annotations

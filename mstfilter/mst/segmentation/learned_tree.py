@@ -1,9 +1,9 @@
 """Segmentation trees that merge regions by learned log odds that two regions are different objects.
 
-Watershed regions of a boundary map are merged in pairs. The pair with the lowest log odds is merged first. The log
-odds are linear in `FEATURES` of the border and of the union of two regions. `BorderTree` adds the correction of a
-small network (`PairNetwork`). The features are recomputed when a region grows. A model file has the weights of the
-features. The weights were fitted on simulated scenes only, and the correction also on real frames.
+Watershed regions of a boundary map are merged pair by pair, always the pair with the lowest log odds. These are
+linear in `FEATURES` of the border and of the union of the two regions, which are recomputed when a region grows;
+`BorderTree` adds the correction of a small network (`PairNetwork`). The weights of the features are in a model file.
+They were fitted on simulated scenes only, the correction also on real frames.
 
 >>> tree = LearnedTree().build(boundary, frame)
 >>> tree = BorderTree().build(boundary, frame)         # also with what a trained border network sees

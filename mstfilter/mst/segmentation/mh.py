@@ -1,8 +1,8 @@
 """Segmentations drawn from a tree by Metropolis-Hastings (paper IV-B, Algorithm 1).
 
-The chain starts at the optimal cut c*. The target of the chain is ``p(c) = exp(-(v(c*) - v(c))^2 / s2)`` with ``s2 =
-sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temperature)``. The target with a
-`temperature` is for values that are log odds (`MergeLogOdds`), which need no scale.
+The chain starts at the optimal cut c*. If values are log odds (`MergeLogOdds`), a `temperature` gives the target
+``p(c) = exp((v(c) - v(c*)) / temperature)``. Other values need a scale, and the published target has one: ``p(c) =
+exp(-(v(c*) - v(c))^2 / s2)`` with ``s2 = sigma2 v(c*)^2``.
 
 - ``mst`` uses ``MetropolisHastingsCuts(temperature=1)``, one chain with MoveNode and subtree redraws.
 - ``paper`` uses ``MetropolisHastingsCuts(0.25, burn_in=0, thinning=20)``.
@@ -13,10 +13,10 @@ sigma2 v(c*)^2``, or, with a `temperature`, ``p(c) = exp((v(c) - v(c*)) / temper
 >>> sample.diagnostics["acceptance"], sample.diagnostics["autocorrelation_steps"]
 
 A `MoveRule` proposes the next cut. MoveNode (`NodeMoves`) draws one of the n nodes of the cut, and then *up* or
-*down* with equal probability. A move up replaces the node and all its siblings, which must be in the cut, by their
-parent. A move down replaces the node by its children. Each of the m siblings proposes the same move up, so the
-probability of this move is ``g(up) = m / (2 n)``. The reverse move has probability ``1 / (2 n')``, where n' is the
-number of nodes after the move up. A rule first draws a choice at random, which determines the move:
+*down* with equal probability. Down replaces the node by its children; up replaces it and all its siblings, which must
+be in the cut, by their parent. Since each of the m siblings proposes the same move up, this has the probability
+``g(up) = m / (2 n)``, and the reverse move ``1 / (2 n')``, where n' is the number of nodes after the move up. A rule
+first draws a choice at random, which then determines the move:
 
 >>> state = CutState(tree, cut)
 >>> rule = NodeMoves()

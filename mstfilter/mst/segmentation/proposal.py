@@ -4,8 +4,8 @@
 >>> population = proposal.sample(np.random.default_rng(0), clip, 10)
 >>> population.particles[0].n_objects, population.notes["distinct_segments"]
 
-There is one boundary map and one tree per frame. Each distinct segment of the sampled cuts is completed once to a 3-D
-shape. If several shapes contain the same voxel, the voxel is assigned to one of the objects.
+All samples share one boundary map and one tree, and a segment that occurs in several cuts is completed only once. If
+several shapes contain a voxel, it is given to one of the objects.
 
 An `ObjectRule` decides which regions of a cut are objects:
 

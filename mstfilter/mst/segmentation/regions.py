@@ -1,7 +1,7 @@
 """Measurements of image regions and of their common borders.
 
-The row of a region has sums over pixels, so the row of a merged region is the sum of the rows of its parts. Disparity
-is in sensor units (1/8 px at f = 525 px), and lengths are in metres.
+A region is described by a row of sums over its pixels, so the row of a merged region is the sum of the rows of its
+parts. Disparity is in sensor units (1/8 px at f = 525 px), and lengths are in metres.
 
 >>> leaves = object_leaves(watershed, pixels)                 # objects do not share a leaf with the table
 >>> regions = measure_regions(leaves, frame, boundary)

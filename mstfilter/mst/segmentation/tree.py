@@ -1,8 +1,8 @@
 """The segmentation tree: a hierarchy of image regions, and its construction from a boundary map.
 
-A tree is stored as a parent array. Leaves come first (0 .. n_leaves - 1), and the root is last. Every parent has a
-larger index than its children, so a loop over ascending indices visits children first. A *cut* is an ascending array
-of nodes that covers every leaf exactly once, so a cut is a segmentation of the image.
+A tree is a parent array. Leaves come first (0 .. n_leaves - 1), the root is last, and every parent has a larger index
+than its children, so a loop over ascending indices visits children first. A *cut* is an ascending array of nodes that
+covers every leaf exactly once; in other words, it is a segmentation of the image.
 
 >>> import numpy as np
 >>> from mstfilter.mst.segmentation import Tree
@@ -14,10 +14,9 @@ array([[1, 1],
        [1, 0]])
 
 `UcmTree` builds the ultrametric contour map (Arbelaez et al. 2011). Watershed regions of the boundary map are merged
-in order of the mean strength of their common border, the *height* of the merge. A logistic curve maps the height
+in order of the mean strength of their common border, the *height* of the merge, and a logistic curve maps the height
 to P(boundary), the probability that the merge joins different objects. The field `start` of a node is P(boundary) of
-the merge that makes the node. `start` is near 0 for a node inside one object, and near 1 for a node with several
-objects.
+the merge that makes it. So it is near 0 for a node inside one object, and near 1 for a node with several objects.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Contracts of components that process scenes, and a function that checks any component (``mstfilter check``).
+"""Contracts of components that work on scenes, and what ``mstfilter check`` runs to test any component.
 
 >>> for result in run_contract(MyRule()):
 ...     print(result.statement, "-", result.failure or result.skipped or "holds")
 
-`mstfilter.smc.testing` has the contracts of components that process numbers, and describes how to use a contract as a
-test. `scene_example` returns hypotheses and a clip as an example input. ``mstfilter new resampler mine.py`` writes a
-starting file for a component (`write_starter`).
+`mstfilter.smc.testing` has the contracts of components that work on numbers, and shows how to use one as a test.
+`scene_example` returns hypotheses and a clip to try a component on. `write_starter` writes the file with which
+``mstfilter new resampler mine.py`` starts.
 """
 
 from mstfilter.base.lazy import attach

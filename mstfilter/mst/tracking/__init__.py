@@ -1,8 +1,11 @@
-"""Prediction: hypotheses are moved according to the video of a clip (paper IV-C).
+"""Prediction: the objects of every hypothesis move as the video of the clip shows (paper, section IV-C).
 
 >>> from mstfilter.mst.tracking import MstRule, TrackingTransition
 >>> transition = TrackingTransition(MstRule(select="sample"))
 >>> transition.predict(rng, population, clip)                        # doctest: +SKIP
+
+Each object gets one rigid motion. Flow, features and registration suggest several, a rule chooses by what a motion
+leaves unexplained in the last frame, and all voxels of the object move along, hidden ones too.
 
 =====================  ====================================================================
 `transition`           the motion model `TrackingTransition`; `Warp` moves the voxels

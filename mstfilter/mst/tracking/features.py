@@ -3,11 +3,11 @@
 >>> matches = SiftMatching().match(clip.before, clip.after)     # doctest: +SKIP
 >>> matches.p, matches.q                                        # doctest: +SKIP
 
-Features are detected once in the whole image and shared by all hypotheses and segments.
+Features are detected once, in the whole image, and shared by all hypotheses and segments.
 
-Automatic exposure and white balance change the colour of the whole image when something moves. In real clips, most of
-an untouched table differs by more than 12 grey levels. `matched_colour` removes this change. The function fits a gain
-and an offset per channel where the depth is unchanged.
+When something moves, automatic exposure and white balance change the colour of everything: in real clips, most of an
+untouched table differs by more than 12 grey levels. `matched_colour` removes this change by a gain and an offset for
+each channel, fitted where the depth is unchanged.
 """
 
 from __future__ import annotations

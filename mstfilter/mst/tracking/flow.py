@@ -1,16 +1,17 @@
 """Dense optical flow through a clip, computed once for all hypotheses.
 
-Two results are accumulated over the frames of the clip:
+Flow from the first frame directly to the last one fails for long motions, so it is accumulated over the frames of the
+clip, in two forms:
 
-- The first result is a grid of points of the first frame, followed forward (for rigid fits).
-- The second result is a pull map. For every pixel of the last frame, the pull map has its position in the first
-  frame. A label image of ``clip.before`` is indexed by the pull map to give the label image of ``clip.after``.
+- a grid of points of the first frame, followed forward, for rigid fits;
+- a pull map, which has for every pixel of the last frame its position in the first one. A label image of
+  ``clip.before``, indexed by the pull map, becomes that of ``clip.after``.
 
 >>> tracks = DenseFlow().track(clip)                     # doctest: +SKIP
 >>> labels_after = tracks.warp(project(hypothesis, clip.before.camera))   # doctest: +SKIP
 
 A point or pixel is valid if the backward flow returns it to its start, its depth and colour do not jump, and it is
-not on the robot. Flow that is computed only from the first and the last frame fails for long motions.
+not on the robot.
 """
 
 from __future__ import annotations

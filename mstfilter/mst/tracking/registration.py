@@ -4,9 +4,9 @@
 >>> result = SmallGicp().register(source, target, np.eye(4), reach=0.02)           # doctest: +SKIP
 >>> result.T, result.overlap                                                       # doctest: +SKIP
 
-A `Surface` holds the downsampled cloud with normals, covariances and search tree. A surface is prepared once for all
-registrations of the segment. The library small_gicp runs on one thread, because with several threads the order of a
-sum changes the last digits of the result.
+A `Surface` is a downsampled cloud with normals, covariances and a search tree, prepared once for all registrations of
+a segment. small_gicp runs on one thread, because with several, the order of a sum changes the last digits of the
+result.
 """
 
 from __future__ import annotations

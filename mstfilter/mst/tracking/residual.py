@@ -8,15 +8,14 @@ depth m, the cost of a point is
 - a larger constant outside the image;
 - 0, and not counted, without a reading, on the robot, or if the point is occluded and its surface faces away.
 
-The score S is the mean cost of the counted points, plus two terms. The first term grows with the fraction of visible
-points on pixels that the flow traces back to another object. It distinguishes two objects that look the same. The
-second term grows with the fraction of the surface that the flow traces back to this object but that is far from the
-moved object. Without this term, a hidden position behind another object has as good a score as a visible position. A
-lower score is better.
+The score S, of which less is better, is the mean cost of the counted points plus two terms. One grows with the
+fraction of visible points on pixels that the flow traces back to another object, and so tells two objects apart that
+look the same. The other grows with the fraction of the surface that the flow traces back to this object but that is
+far from the moved one. Without it, a position hidden behind another object would score as well as a visible one.
 
-`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour.
-`refine_motion` compares every moved point with the measurement at its pixel, so errors of the tracked mask have no
-effect. Colour determines motions that depth does not determine, for example the rotation of a can about its axis.
+`refine_motion` improves a motion by Gauss-Newton steps on projective point-to-plane distances and colour. It compares
+every moved point with the measurement at its pixel, so errors of the tracked mask have no effect. Colour is needed
+where depth leaves a motion open, such as the rotation of a can about its axis.
 
 >>> MotionResidual().score(track, T)                      # doctest: +SKIP
 >>> refine_motion(track, T)                               # doctest: +SKIP

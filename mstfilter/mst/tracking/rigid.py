@@ -10,10 +10,10 @@ Components exchange single motions as scipy `RigidTransform`. `rigid_transform` 
 >>> bool(np.allclose(T[:3, 3], [0.1, 0.0, 0.0]))
 True
 
-J-Linkage (Toldo and Fusiello, ECCV 2008) finds an unknown number of rigid motions among point matches. The
-preference set of a match contains the sampled motions that explain it. Matches are merged bottom-up by the Jaccard
-distance of their sets. A cluster has the intersection of its members' sets, so at least one motion explains all
-members. Merging ends when all sets are disjoint.
+J-Linkage (Toldo and Fusiello, ECCV 2008) finds an unknown number of rigid motions among point matches. Many motions
+are sampled, and the preference set of a match contains those that explain it. Matches are merged bottom-up by the
+Jaccard distance of their sets, until all sets are disjoint. A cluster has the intersection of its members' sets, so
+at least one motion explains all of them.
 
 >>> q = np.where(np.arange(40)[:, None] < 20, p + [0.5, 0, 0], p - [0, 0.5, 0])
 >>> [len(m.inliers) for m in jlinkage(rng, p, q)]

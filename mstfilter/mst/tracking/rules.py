@@ -1,7 +1,7 @@
-"""Motion rules, which estimate the rigid motion of one object in a clip.
+"""Motion rules: the rigid motion of one object in a clip.
 
-A rule has two stages. `candidates` computes motions once per distinct segment, for all hypotheses. `choose` selects
-one motion per particle, possibly at random.
+A rule has two stages, because hypotheses share most of their segments. `candidates` computes motions once for each
+distinct segment; `choose` then selects one of them for each particle, possibly at random.
 
 ================  ===========================================================================
 `PaperRule`       paper, Algorithm 2: SIFT if it has more than 5 inliers, else ICP if its error
@@ -11,8 +11,8 @@ one motion per particle, possibly at random.
 `MstRule`         candidates from flow, registration and SIFT, ranked by one robust residual
 ================  ===========================================================================
 
-`MstRule` combines several estimators because each of them fails on some objects. Flow fails on uniform surfaces,
-registration fails for rotations of symmetric objects, and SIFT fails without texture.
+`MstRule` combines several estimators because each fails on some objects: flow on uniform surfaces, registration on
+symmetric objects that rotate, and SIFT without texture.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Tracked segments: the visible part of each object, the data about its motion, and the test for objects at rest.
 
-Hypotheses share most of their objects, so there are far fewer distinct segments than hypotheses times objects. The
-key of a `Segment` is the hash of its projected mask and of its voxels. Segments with equal keys are tracked once.
+Hypotheses share most of their objects, so there are far fewer distinct segments than hypotheses times objects, and
+each is tracked once. The key by which they are told apart is the hash of the projected mask and of the voxels.
 
 >>> segments = segments_of(hypothesis, clip.before)                       # doctest: +SKIP
 >>> track = Track(segments[label], clip, DenseFlow().track(clip))         # doctest: +SKIP
 >>> StaticTest().rests(track)                                             # doctest: +SKIP
 
-A `Track` combines a segment with the flow and the features of the clip, which are the data of the motion rules.
+A `Track` is what a motion rule works on: a segment, with the flow and the features of the clip.
 """
 
 from __future__ import annotations

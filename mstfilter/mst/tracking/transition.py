@@ -5,8 +5,8 @@
 {'static': 52, 'icp': 9, ...}
 
 Optical flow tracks the visible part of each object, a rule chooses a rigid motion, and a `Warp` moves the voxels.
-Flow and features are computed once per clip. Segments of several hypotheses with nearly the same pixels are tracked
-once.
+Flow and features are computed once for a clip, and segments of several hypotheses with nearly the same pixels are
+tracked once.
 """
 
 from __future__ import annotations

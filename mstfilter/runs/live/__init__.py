@@ -1,10 +1,10 @@
-"""Live use: a stream takes frames of a camera and returns hypotheses at every pause.
+"""Live use: a stream takes the frames of a camera and gives hypotheses at every pause.
 
 >>> with mstfilter.Stream(K, on_pause=lambda pause: print(pause.hypotheses[0])) as stream:
 ...     for rgb, depth in camera:
 ...         stream.push(rgb, depth)
 
-Modules: `stream` defines `Stream`, and `folder` filters a folder while another program adds images.
+`Stream` is in `stream`; `folder` filters a folder to which another program adds images.
 """
 
 from mstfilter.base.lazy import attach

@@ -1,4 +1,4 @@
-"""Filter the frames of a camera one by one.
+"""Frames of a camera, filtered while they arrive.
 
 >>> with mstfilter.Stream(K) as stream:
 ...     for rgb, depth in camera:
@@ -6,8 +6,9 @@
 ...     stream.wait()
 ...     stream.hypotheses, stream.belief
 
-One thread finds the pauses and advances the optical flow of the current clip. A second thread filters the last
-complete clip. The results are identical to those of a run on the recorded frames with the same pauses.
+`push` only queues a frame. One thread looks for pauses and follows the optical flow of the clip that is being
+recorded; another filters the last complete clip. The hypotheses are the same as those of a run on the recorded frames
+with the same pauses.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class _Item:
 
 
 class Stream:
-    """Filters frames while they arrive.
+    """Filters frames while they arrive, and has hypotheses after every pause.
 
     Parameters
     ----------
@@ -100,16 +101,16 @@ class Stream:
     filter : ParticleFilter or str
         The filter, or the name of a preset.
     pauses : Settled or None
-        The rule that finds the pauses. If None, only frames that are pushed with ``pause=True`` are pauses.
+        The rule that finds the pauses. With None, only frames that are pushed with ``pause=True`` are pauses.
     grid : VoxelGrid or float
-        Workspace, or the size of its voxels in metres. With a size, the stream finds the workspace at the first
-        pause, as for a recording. A camera without a pose gets its pose from the support plane of the first pause.
+        Workspace, or the size of its voxels in metres. With a size, the workspace is found at the first pause, as for
+        a recording. A camera without a pose gets one from the support plane of the first pause.
     seed : int
         Seed of all random streams.
     on_pause : callable, optional
-        Function that is called with a `Pause` after each step, in the thread of the filter.
+        Called with a `Pause` after each step, in the thread of the filter.
     max_frames : int
-        Maximum number of queued frames, and maximum number of frames of a clip. See Notes.
+        Most frames that wait in the queue, and most frames of a clip. See Notes.
     max_pixels : int
         Images with more pixels are reduced to this number. 0 means no limit.
     threads : int
@@ -117,10 +118,12 @@ class Stream:
 
     Notes
     -----
-    If `max_frames` frames are queued, new frames are dropped. If a clip reaches `max_frames`, frames with little
-    motion are removed from the clip. `counts` has the numbers. At most four times `max_frames` frames are in memory.
-    An exception that leaves the ``with`` block of a stream, such as Ctrl-C, drops the queued frames; the step that is
-    being computed is completed. An error in a thread is raised by the next call of `push`, `wait` or `close`.
+    A filter that is slower than the camera loses frames instead of falling behind: if `max_frames` frames are queued,
+    new ones are dropped, and from a clip that reaches `max_frames`, frames with little motion are removed. `counts`
+    says how many. At most four times `max_frames` frames are in memory.
+
+    If an exception such as Ctrl-C leaves the ``with`` block, the step that is being computed is completed, and the
+    queued frames are dropped. An error in a thread is raised by the next call of `push`, `wait` or `close`.
     """
 
     def __init__(

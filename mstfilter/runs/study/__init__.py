@@ -1,13 +1,13 @@
-"""Studies, which compare filters on many scenes.
+"""Studies: several filters on many scenes, compared scene by scene.
 
 >>> from mstfilter.runs.study import Local, load_study, run_study
 >>> study = load_study("experiments/main/study.toml", smoke=True)
 >>> result = run_study(study, Path("studies/main"), Local(workers=2))
 >>> result.folder.summary().compared()[0].words
 
-`run_study` plans the runs: every arm (configuration of the filter) on every scene with every seed. An executor
-(`Local`, or an executor of the user) makes the missing runs. Then `run_study` writes the tables of the study folder.
-Each run is a `mstfilter.runs.RunFolder`.
+`run_study` plans the runs, which are every arm (configuration of the filter) on every scene with every seed. An
+executor (`Local`, or one of yours) makes those that are missing, each as a `mstfilter.runs.RunFolder`, and the tables
+of the study folder are written from them.
 """
 
 from mstfilter.base.lazy import attach
