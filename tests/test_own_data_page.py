@@ -17,20 +17,8 @@ import pytest
 
 import mstfilter
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats import PairedImages, open_recording
-from mstfilter.scene import (
-    Camera,
-    Frame,
-    Hypothesis,
-    Recording,
-    VoxelGrid,
-    examine_hypotheses,
-    read_depth,
-    read_labels,
-    read_rgb,
-    report_findings,
-    write_image,
-)
+from mstfilter.formats import PairedImages, open_recording, read_depth, read_labels, read_rgb, write_image
+from mstfilter.scene import Camera, Frame, Hypothesis, Recording, VoxelGrid, examine_hypotheses, report_findings
 from tests.app.test_cli import call
 from tests.conftest import REPOSITORY
 from tests.formats import layouts

@@ -102,7 +102,7 @@ def two_cameras() -> Iterator[tuple[str, Scene]]:
     """Two cameras with known poses, and the second camera with a pose that is estimated from the table."""
     import json
 
-    from mstfilter.scene import read_depth, read_rgb
+    from mstfilter.formats import read_depth, read_rgb
 
     folder = REAL / "two_cameras"
     if not folder.is_dir():

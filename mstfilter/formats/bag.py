@@ -31,8 +31,9 @@ import numpy as np
 from mstfilter.base.errors import InputError, missing_library, warn_user
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, open_regular
+from mstfilter.formats.images import decode_image
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
-from mstfilter.scene import check_depth, decode_image
+from mstfilter.scene import check_depth
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from mstfilter.base.errors import InputError, check_choice, check_number, naming
 from mstfilter.base.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.base.reading import read_arrays, read_json, read_model
-from mstfilter.formats.video import RecordingFormat, check_images, read_optional, warn_of_unread
+from mstfilter.formats.images import read_depth, read_optional, read_rgb, write_image
+from mstfilter.formats.video import RecordingFormat, check_images, warn_of_unread
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -38,13 +39,10 @@ from mstfilter.scene import (
     as_labels,
     examine,
     find_world,
-    read_depth,
-    read_rgb,
     report_findings,
     rigid_from_matrix,
     truth_reader,
     world_shift,
-    write_image,
 )
 
 VERSION = 1  #: Version of the layout

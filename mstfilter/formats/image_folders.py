@@ -25,8 +25,9 @@ from mstfilter.base.errors import InputError, check_number, warn_user
 from mstfilter.base.fields import NonNegativeFloat
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, read_bytes, read_json, read_text
+from mstfilter.formats.images import read_optional
 from mstfilter.formats.pauses import EveryNth
-from mstfilter.formats.video import Video, VideoFormat, object_numbers, pair_stamps, read_optional, warn_of_unread
+from mstfilter.formats.video import Video, VideoFormat, object_numbers, pair_stamps, warn_of_unread
 from mstfilter.scene import Frame, PauseRule, Recording, table_residual
 
 

@@ -28,20 +28,17 @@ from mstfilter.scene.evidence import (
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
+    areas_of_colours as areas_of_colours,
     check_depth as check_depth,
-    decode_image as decode_image,
     depth_sigma as depth_sigma,
     grey_blocks as grey_blocks,
-    read_depth as read_depth,
-    read_labels as read_labels,
-    read_rgb as read_rgb,
-    write_image as write_image,
 )
 from mstfilter.scene.geometry import (
     BASELINE as BASELINE,
     TABLE_TOLERANCE as TABLE_TOLERANCE,
     fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
+    frame_points as frame_points,
     table_residual as table_residual,
 )
 from mstfilter.scene.occupancy import Occupancy as Occupancy

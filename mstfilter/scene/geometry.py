@@ -67,6 +67,17 @@ def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray,
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
 
 
+def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices (k,) of the pixels with a reading inside the grid, and the voxels (k, 3) of these readings."""
+
+    def compute() -> tuple[np.ndarray, np.ndarray]:
+        index = grid.index_of(frame.points)
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
+
+    return memo("frame_points", (frame.key, grid.key), compute)
+
+
 BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity
 _FOCAL = 525.0  # focal length of a Kinect v1 in pixels; sets the unit of disparity only
 #: Readings up to this much above the table are table, in sensor disparity units.

@@ -13,18 +13,16 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.scene import (
-    TABLE_TOLERANCE,
-    Frame,
-    Hypothesis,
-    check_grid,
-    find_world,
+from mstfilter.formats import (
+    PairedImages,
+    RecordingWriter,
+    open_recording,
     read_depth,
     read_rgb,
-    render,
+    save_recording,
     write_image,
 )
+from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, find_world, render
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording

@@ -18,11 +18,11 @@ from scipy.spatial.transform import RigidTransform
 import mstfilter
 from mstfilter.app.report import write_report
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats import Redwood, Settled, Still, open_format
+from mstfilter.formats import Redwood, Settled, Still, open_format, write_image
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.runs.live import filter_folder
 from mstfilter.runs.presets import load_config
-from mstfilter.scene import Finding, Recording, encode_hypotheses, scene_cache, write_image
+from mstfilter.scene import Finding, Recording, encode_hypotheses, scene_cache
 from mstfilter.smc import Proposal
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
