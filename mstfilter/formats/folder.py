@@ -224,9 +224,7 @@ def save_recording(
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further keyword arguments, such as the generator, are stored in manifest.json.
     """
-    report_findings(
-        examine(recording.frames, recording.pauses, recording.grid, recording.times), f"recording {recording.name}"
-    )
+    report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
     with RecordingWriter(path, camera, recording.grid, **manifest) as writer:

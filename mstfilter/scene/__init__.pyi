@@ -51,7 +51,6 @@ from mstfilter.scene.plausibility import (
     Finding as Finding,
     Look as Look,
     examine as examine,
-    examine_hypotheses as examine_hypotheses,
     examine_next as examine_next,
     report_findings as report_findings,
 )

@@ -29,8 +29,8 @@ from mstfilter.base.lazy import late
 from mstfilter.scene.arrays import content_key
 from mstfilter.scene.camera import Camera, rigid_from_matrix
 from mstfilter.scene.frame import Clip, Frame, check_depth, without_alpha
-from mstfilter.scene.geometry import fit_support_plane, workspace
-from mstfilter.scene.plausibility import examine, report_findings, table_height, unreadable
+from mstfilter.scene.geometry import fit_support_plane, table_height, workspace
+from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
 
 _NEAR_S = 0.25  # half of the time that the rule `still` demands of a pause
@@ -310,7 +310,7 @@ class Recording:
     @cached_property
     def _examined(self) -> None:
         """Check the frames at the pauses (`examine`), and warn or raise InputError. The checks run once."""
-        report_findings(examine(self.frames, self.pauses, self.grid, self.times), f"recording {self.name}")
+        report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
 class UsesFiles(ABC):

@@ -22,7 +22,7 @@ from mstfilter.formats import Redwood, Settled, Still, open_format, write_image
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.runs.live import filter_folder
 from mstfilter.runs.presets import load_config
-from mstfilter.scene import Finding, Recording, encode_hypotheses, scene_cache
+from mstfilter.scene import Recording, encode_hypotheses, scene_cache
 from mstfilter.smc import Proposal
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
@@ -317,18 +317,6 @@ def test_all_frames_have_poses_or_none():
             with pytest.raises(InputError, match=f"frame 1 has {'no' if second is None else 'a'} pose"):
                 stream.push(RGB[1], DEPTH[1], 1.0, pose=second)
             assert stream.push(RGB[1], DEPTH[1], 2.0, pose=first)
-
-
-def test_doubts_about_the_hypotheses_are_said_once(monkeypatch):
-    doubt = Finding(False, "an object is the table", ())
-    monkeypatch.setattr("mstfilter.runs.live.stream.examine_hypotheses", lambda hypotheses, frame: [doubt])
-    with warnings.catch_warnings(record=True) as caught, mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
-        warnings.simplefilter("always")
-        for k in range(2):
-            stream.push(RGB[k], DEPTH[k], float(k), pause=True)
-        stream.wait()
-    said = [str(one.message) for one in caught if one.category is InputWarning]
-    assert [text for text in said if "the table" in text] == ["pause 0 of the stream: an object is the table"]
 
 
 def test_an_error_while_libraries_are_loaded_is_no_error_of_the_stream():
