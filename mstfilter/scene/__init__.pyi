@@ -47,6 +47,7 @@ from mstfilter.scene.partitions import (
     canonical as canonical,
     common_refinement as common_refinement,
 )
+from mstfilter.scene.pauses import PauseRule as PauseRule, pauses_with_depth as pauses_with_depth
 from mstfilter.scene.plausibility import (
     Finding as Finding,
     Look as Look,
@@ -56,11 +57,9 @@ from mstfilter.scene.plausibility import (
 )
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
-    PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
     find_world as find_world,
-    pauses_with_depth as pauses_with_depth,
     truth_reader as truth_reader,
     world_shift as world_shift,
 )

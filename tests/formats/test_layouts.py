@@ -16,8 +16,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import open_recording, read_depth, read_rgb, write_image
 from mstfilter.formats.folder import RecordingWriter, save_recording
-from mstfilter.formats.image_folders import Redwood, Tum
 from mstfilter.formats.pauses import Ends
+from mstfilter.formats.redwood import Redwood
+from mstfilter.formats.tum import Tum
 from mstfilter.formats.video import KnownWorld, _undistort, pair_stamps, undistortion_map
 from mstfilter.scene import Recording
 from tests.formats.layouts import (

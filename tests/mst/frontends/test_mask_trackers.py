@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mstfilter.base.errors import InputError, MissingLibraryError
-from mstfilter.base.registry import load_file
 from mstfilter.base.resources import models_folder
+from mstfilter.base.user_files import load_file
 from mstfilter.formats import read_rgb
 from mstfilter.mst.testing import scene_example
 from mstfilter.mst.testing.scenes import _labels

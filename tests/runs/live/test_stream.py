@@ -255,7 +255,7 @@ def test_a_live_folder_has_the_robot_masks(tmp_path):
 
 
 def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
+    monkeypatch.setattr("mstfilter.formats.redwood._PARTNER_S", 0.6)
     path = write_redwood(tmp_path / "data", (0, 1, 2, 3, 4))
     late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
     (path / "depth" / "00003.png").write_bytes(b"no image")
@@ -272,7 +272,7 @@ def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_p
 @pytest.mark.parametrize("hours", [-5, 5])
 def test_a_live_folder_does_not_trust_the_times_of_files(tmp_path, monkeypatch, hours):
     """Files of a computer whose clock differs: without the depth image of frame 1, the others are read."""
-    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
+    monkeypatch.setattr("mstfilter.formats.redwood._PARTNER_S", 0.6)
     path = write_redwood(tmp_path / "data", (0, 1, 2, 3))
     late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
     when = time.time() + 3600 * hours
@@ -281,7 +281,7 @@ def test_a_live_folder_does_not_trust_the_times_of_files(tmp_path, monkeypatch, 
     times = [when for when, _ in Redwood(fps=10).arriving(path, idle_s=5)]
     assert times == pytest.approx([0, 0.1, 0.2])
     threading.Timer(0.1, lambda: late.rename(path / "depth" / "00001.png")).start()
-    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 60)
+    monkeypatch.setattr("mstfilter.formats.redwood._PARTNER_S", 60)
     assert len(list(Redwood(fps=10).arriving(path, idle_s=5))) == 4
 
 
