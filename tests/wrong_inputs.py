@@ -124,6 +124,7 @@ WRONG = {
     "the camera or its pose leaves the table": lambda: changed(
         T_world_camera=np.stack([right()[1].as_matrix(), np.eye(4), np.eye(4)])
     ),
+    "workspace beside the table": lambda: posed(grid=VoxelGrid((2.0, -3.0, 0.0), 0.01, (80, 80, 30))),
     "the same images at all pauses": lambda: changed(
         rgb=right()[0]["rgb"][[0, 0, 0]], depth=right()[0]["depth"][[0, 0, 0]]
     ),

@@ -77,7 +77,7 @@ class Scene:
         n, height, width = self.depth.shape
         masks = [None] * n if self.masks is None else list(self.masks)
         cameras = [Camera(self.K, width, height, None if self.poses is None else self.poses[k]) for k in range(n)]
-        camera, grid = find_world(Frame(self.rgb[0], self.depth[0], cameras[0], masks[0]), self.grid)
+        camera, grid, _ = find_world(Frame(self.rgb[0], self.depth[0], cameras[0], masks[0]), self.grid)
         cameras = cameras if self.poses is not None else [camera] * n
         return [Frame(*images) for images in zip(self.rgb, self.depth, cameras, masks, strict=True)], grid
 

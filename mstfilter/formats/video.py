@@ -42,7 +42,6 @@ from mstfilter.scene import (
     find_world,
     pauses_with_depth,
     rigid_from_matrix,
-    world_shift,
 )
 
 
@@ -207,9 +206,7 @@ class Video:
         found = pauses_with_depth(found, self.times, has_depth, str(self.path))
         first_pause = found[0]
         camera = camera if world.pose is None else camera.at(world.pose)
-        given = camera
-        camera, grid = find_world(read(first_pause, given), world.grid)
-        world_shift(given, camera)  # notes that the world is not that of the given pose
+        camera, grid, _ = find_world(read(first_pause, camera), world.grid)
         cameras: dict[int, Camera] = {}
 
         def camera_at(index: int) -> Camera:

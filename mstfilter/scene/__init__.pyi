@@ -61,7 +61,6 @@ from mstfilter.scene.recording import (
     UsesFiles as UsesFiles,
     find_world as find_world,
     truth_reader as truth_reader,
-    world_shift as world_shift,
 )
 from mstfilter.scene.rendering import (
     Rendering as Rendering,

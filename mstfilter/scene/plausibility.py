@@ -64,7 +64,8 @@ def examine(frames: Sequence[Frame], pauses: Sequence[int], grid: VoxelGrid) -> 
         looks = [Look(frames[p], grid, p) for p in pauses]
         found += [finding for look in looks for finding in unreadable(look.frame, f"frame {look.index}")]
     if not any(finding.stop for finding in found):
-        found += [*_pose(looks[0]), *_units(looks[0]), *_moved(looks), *_registration(looks), *_repeated(looks)]
+        found += [*_pose(looks[0]), *_units(looks[0]), *_outside(looks), *_moved(looks)]
+        found += [*_registration(looks), *_repeated(looks)]
         for view in frames[pauses[0]].views:
             doubts = [*_camera_matrix(view.camera), *unreadable(view, "the image")]
             doubts = doubts or [*_pose(look := Look(view, grid)), *_units(look)]
@@ -221,6 +222,16 @@ def _level(first: Look) -> Plane | None:
     counts, edges = np.histogram(heights, np.arange(_TALL, np.clip(heights.max(), _TALL, 30.0) + 0.1, 0.05))
     k = counts.argmax()
     return plane_of(first.frame, (heights > edges[k] - 0.05) & (heights < edges[k + 1] + 0.05))
+
+
+def _outside(looks: Sequence[Look]) -> Iterator[Finding]:
+    """A finding if no reading at any pause is in the workspace, which the pose places."""
+    grid = looks[0].grid
+    if not any(grid.contains(grid.index_of(look.points)).any() for look in looks):
+        low, high = grid.origin.round(2).tolist(), grid.upper.round(2).tolist()
+        text = f"no depth reading is in the workspace from {low} to {high} m, so no object can be found"
+        hint = "give a workspace around the objects, or none: it is then placed around the objects on the table"
+        yield Finding(True, text, (hint, "check the pose: z of the world is up, the table is at z = 0"))
 
 
 def drift(first: Look, look: Look) -> tuple[float, float, float]:

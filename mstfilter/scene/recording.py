@@ -178,11 +178,10 @@ class Recording:
         readings = lambda k: bool(np.any(np.isfinite(depth[k]) & (depth[k] > 0)))  # noqa: E731
         chosen = pauses_with_depth(chosen, stamps, readings, name)
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
-        first = frames[chosen[0]]
-        posed, grid = find_world(first, grid)
+        posed, grid, shift = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:
             frames = [replace(frame, camera=posed) for frame in frames]
-        elif (shift := world_shift(first.camera, posed)) is not None:
+        elif shift is not None:
             frames = [replace(frame, camera=frame.camera.at(shift * frame.camera.pose)) for frame in frames]
         made = cls(frames, grid, chosen, stamps, name)
         made._examined  # noqa: B018
@@ -260,41 +259,31 @@ class UsesFiles(ABC):
         """Raise InputError before a run if a file is missing or cannot be used for a recording."""
 
 
-def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid]:
+def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid, RigidTransform | None]:
     """The camera with a pose, and the workspace. What is missing is computed from the `first` frame.
 
     The table of the returned world is at z = 0. If it is not in the world of the given pose, as in the world of a
-    robot's base, the world is shifted along z (`world_shift`).
+    robot's base, the world is shifted along z. The third value is the motion from the given world to the returned
+    one, or None if they are the same.
     """
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
-    camera = first.camera
+    camera, shift = first.camera, None
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
     elif height := table_height(first):
-        shift = np.array([0.0, 0.0, -height])
-        camera = camera.at(RigidTransform.from_translation(shift) * camera.pose)
+        down = np.array([0.0, 0.0, -height])
+        camera = camera.at(RigidTransform.from_translation(down) * camera.pose)
+        shift = camera.pose * first.camera.pose.inv()
         if isinstance(grid, VoxelGrid) and abs(grid.origin[2]) > abs(grid.origin[2] - height):  # not yet on the table
-            grid = VoxelGrid(grid.origin + shift, grid.voxel_size, grid.shape)
+            grid = VoxelGrid(grid.origin + down, grid.voxel_size, grid.shape)
+        warn_user(
+            f"the table is at z = {height:.3f} m in the world of the given pose: the world is shifted, so it is at 0",
+            f"results are in the shifted world: add {height:.3f} m to z for the world of the given pose",
+            "if the table is at z = 0 in the world of the pose: check the pose, and the depth scale",
+        )
     if not isinstance(grid, VoxelGrid):
         grid = workspace(Frame(first.rgb, first.depth, camera, first.robot_mask), 0.01 if grid is None else grid)
-    return camera, grid
-
-
-def world_shift(given: Camera, found: Camera) -> RigidTransform | None:
-    """The motion from the world of a `given` camera to the world of the camera that `find_world` returns.
-
-    None if the world did not move, or the given camera has no pose. A warning notes a motion.
-    """
-    if given.T_world_camera is None or np.array_equal(given.position, found.position):
-        return None
-    shift = found.pose * given.pose.inv()
-    height = -shift.translation[2]
-    warn_user(
-        f"the table is at z = {height:.3f} m in the world of the given pose: the world is shifted, so z = 0 there",
-        f"results are in the shifted world: add {height:.3f} m to z for the world of the given pose",
-        "if the table is at z = 0 in the world of the pose: check the pose, and the depth scale",
-    )
-    return shift
+    return camera, grid, shift
 
 
 def truth_reader(

@@ -492,7 +492,7 @@ def test_the_floor_and_a_tray_do_not_shift_the_world():
     tray = depth * (CAMERA.position[2] - 0.06) / CAMERA.position[2]
     for other, inside in ((floor, np.abs(points[..., :2]).max(axis=-1) < 0.25), (tray, points[..., 1] > 0.05)):
         changed = np.where(inside | (points[..., 2] > 0.02), depth, other).astype(np.float32)
-        camera, _ = find_world(Frame(rgb, changed, CAMERA), GRID)
+        camera, _, _ = find_world(Frame(rgb, changed, CAMERA), GRID)
         assert camera is CAMERA
 
 

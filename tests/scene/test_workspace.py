@@ -14,7 +14,6 @@ from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.frame import depth_sigma
-from mstfilter.scene.geometry import _without_strips
 from mstfilter.scene.recording import Recording
 from tests.app.test_cli import call
 from tests.formats.layouts import video
@@ -231,15 +230,3 @@ def test_a_floor_is_recognised_also_before_a_large_wall():
     rgb, depth, camera = room(1.0, -0.6)
     with pytest.raises(InputError, match="the floor is taken for the table: a second plane is 0.6"):
         Recording.from_arrays(rgb, depth, camera.K)
-
-
-def test_strips_of_walls_are_thin_and_apart():
-    rng = np.random.default_rng(0)
-    table = rng.uniform((-0.4, 0.5), (0.4, 1.2), (5000, 2))
-    wall = np.stack([rng.uniform(-1, 1, 300), rng.normal(3.5, 0.025, 300)], axis=1)  # depth noise at 3.5 m
-    part = rng.uniform((-0.4, 1.6), (0.4, 2.2), (300, 2))  # of a table behind a box
-    camera = np.zeros(2)
-    for given, kept in (((table,), 5000), ((table, wall), 5000), ((table, part), 5300), ((table, wall, part), 5300)):
-        assert len(_without_strips(np.concatenate(given), camera)) == kept
-    for few in (np.zeros((0, 2)), np.array([[0.0, 0.0], [100.0, 100.0]]), np.full((3, 2), 50.0)):
-        assert len(_without_strips(few, camera)) in (1, len(few))

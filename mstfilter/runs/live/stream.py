@@ -48,7 +48,6 @@ from mstfilter.scene import (
     report_findings,
     rigid_from_matrix,
     scene_cache,
-    world_shift,
 )
 from mstfilter.smc import Info, ParticleFilter, State
 
@@ -366,8 +365,7 @@ class Stream:
                 if self._step is None:
                     self._step = self._pool.submit(self._load, item.frame, self._state)
                 return
-            self._world, self._grid = find_world(item.frame, self._grid)
-            self._shift = world_shift(item.frame.camera, self._world)
+            self._world, self._grid, self._shift = find_world(item.frame, self._grid)
         camera = item.frame.camera
         if camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
@@ -433,7 +431,7 @@ class Stream:
     def _load(self, frame: Frame, state: State) -> None:
         """Filter a frame before the first pause to load libraries and networks, and discard the result."""
         with contextlib.suppress(Exception):  # the frame need not show the scene at rest
-            camera, grid = find_world(frame, self._grid)
+            camera, grid, _ = find_world(frame, self._grid)
             self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
 
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
