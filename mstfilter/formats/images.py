@@ -111,10 +111,12 @@ def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarr
 
 def _size(data: bytes) -> tuple[int, int] | None:
     """Width and height in the header of a PNG, JPEG or TIFF file; None for other files."""
-    from PIL import Image
+    from PIL import Image, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
+    # Pillow imports the readers of all formats if it does not know one of these.
+    readers = (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, TiffImagePlugin.TiffImageFile)
     try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF")) as image:
+        with Image.open(io.BytesIO(data), formats=[reader.format for reader in readers]) as image:
             return image.size
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         return MAX_PIXELS, 2  # at least
