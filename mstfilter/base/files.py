@@ -23,7 +23,6 @@ import re
 import shutil
 import socket
 import struct
-import tempfile
 import time
 import tokenize
 import uuid
@@ -306,11 +305,22 @@ def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
         for name in place.relative_to(existing).parts:  # a part may be too long
             with contextlib.suppress(FileNotFoundError):
                 _temporary(existing / name, "partial").lstat()
-        with tempfile.TemporaryFile(dir=existing):
-            pass
+        _try_to_write(existing)
     except OSError as error:
         problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
         raise InputError(f"cannot write {path}: {problem} in {existing}", "choose another place") from error
+
+
+def _try_to_write(folder: Path) -> None:
+    """Make a file in a folder and remove it. If possible the file has no name, so a killed process leaves no file."""
+    try:
+        os.close(os.open(folder, os.O_WRONLY | os.O_TMPFILE))
+    except (AttributeError, OSError) as error:
+        if getattr(error, "errno", None) not in (None, errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT):
+            raise
+        temporary = _temporary(folder / "trial", "partial")
+        temporary.touch()
+        temporary.unlink()
 
 
 def write_text(path: str | Path, text: str) -> None:
