@@ -29,14 +29,14 @@ from mstfilter.app.report import run_page, write_report, write_study_report
 from mstfilter.base.errors import InputError
 from mstfilter.base.reading import read_bytes
 from mstfilter.base.trained import open_model, write_model
-from mstfilter.formats import RecordingWriter, open_recording
+from mstfilter.formats import RecordingWriter, open_recording, write_image
 from mstfilter.mst.completion import NetworkCompleter
 from mstfilter.mst.frontends import read_masks, write_masks
 from mstfilter.mst.frontends.completions import place_shape, read_shapes
 from mstfilter.runs import RunFolder
 from mstfilter.runs.presets import build_filter, load_config
 from mstfilter.runs.study import StudyFolder, check_arm_names, load_study
-from mstfilter.scene import DiskCache, write_image
+from mstfilter.scene import DiskCache
 from mstfilter.scoring import NO_COUNTS
 from mstfilter.smc import Key, Population, State, load_state, save_state
 from tests.app.report.runs import make_run

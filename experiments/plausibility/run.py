@@ -26,7 +26,7 @@ from mstfilter.base.files import write_csv
 from mstfilter.formats import PairedImages, open_recording
 from mstfilter.lab.simulation import cached_recording
 from mstfilter.scene import Camera, Frame, Recording, VoxelGrid, examine, find_world
-from mstfilter.scene.geometry import edge_agreement
+from mstfilter.scene.alignment import edge_agreement
 from mstfilter.scene.plausibility import Look, drift
 
 HERE = Path(__file__).resolve().parent
@@ -77,7 +77,7 @@ class Scene:
         n, height, width = self.depth.shape
         masks = [None] * n if self.masks is None else list(self.masks)
         cameras = [Camera(self.K, width, height, None if self.poses is None else self.poses[k]) for k in range(n)]
-        camera, grid = find_world(Frame(self.rgb[0], self.depth[0], cameras[0], masks[0]), self.grid)
+        camera, grid, _ = find_world(Frame(self.rgb[0], self.depth[0], cameras[0], masks[0]), self.grid)
         cameras = cameras if self.poses is not None else [camera] * n
         return [Frame(*images) for images in zip(self.rgb, self.depth, cameras, masks, strict=True)], grid
 
@@ -102,7 +102,7 @@ def two_cameras() -> Iterator[tuple[str, Scene]]:
     """Two cameras with known poses, and the second camera with a pose that is estimated from the table."""
     import json
 
-    from mstfilter.scene import read_depth, read_rgb
+    from mstfilter.formats import read_depth, read_rgb
 
     folder = REAL / "two_cameras"
     if not folder.is_dir():
@@ -204,13 +204,6 @@ def with_poses(change: Callable[[Scene], Scene]) -> Callable[[Scene], Scene | No
     return lambda scene: None if scene.poses is None else change(scene)
 
 
-def marked(depth: np.ndarray) -> np.ndarray:
-    """Depth with 8 m at all pixels without readings and at the left twentieth of the image."""
-    found = np.where(np.isfinite(depth), depth, np.float32(8))
-    found[..., : depth.shape[-1] // 20] = 8
-    return found
-
-
 def several(change: Callable[[Scene], Scene]) -> Callable[[Scene], Scene | None]:
     return lambda scene: None if len(scene.rgb) < 2 else change(scene)
 
@@ -238,24 +231,14 @@ INPUTS: dict[str, Callable[[Scene], Scene | None]] = {
     "workspace in millimetres": with_poses(
         lambda s: replace(s, grid=VoxelGrid(1000 * s.grid.origin, 10.0, s.grid.shape)) if s.grid else s
     ),
-    "workspace elsewhere": with_poses(
-        lambda s: replace(s, grid=VoxelGrid(s.grid.origin + 3, 0.01, s.grid.shape)) if s.grid else s
-    ),
     "floor around the table, without pose": lambda s: None if s.poses is not None else on_floor(s),
     "depth shifted by 3 % of the width": shifted(x=0.03),
     "depth shifted by -2.5 % and 2 %": shifted(-0.025, 0.02),
     "depth enlarged by 20 %": shifted(scale=1.2),
-    "depth in reverse order": several(lambda s: replace(s, depth=s.depth[::-1])),
-    "depth of the next pause": several(lambda s: replace(s, depth=np.roll(s.depth, -1, axis=0))),
     "robot mask everywhere": with_poses(lambda s: replace(s, masks=np.ones(s.depth.shape, bool))),
     "constant depth": with_poses(lambda s: replace(s, depth=np.full_like(s.depth, 0.8))),
-    "8 m for missing depth": lambda s: replace(s, depth=marked(s.depth)),
-    "inverse depth, without pose": lambda s: None if s.poses else replace(s, depth=np.float32(0.5) / s.depth),
     "no pose from pause 1 on": with_poses(
         several(lambda s: replace(s, poses=(s.poses or ())[:1] + (RigidTransform.identity(),) * (len(s.rgb) - 1)))
-    ),
-    "workspace 5 cm above the table": with_poses(
-        lambda s: replace(s, grid=VoxelGrid(s.grid.origin + [0, 0, 0.05], 0.01, s.grid.shape)) if s.grid else s
     ),
     "uniform colour": lambda s: replace(s, rgb=np.full_like(s.rgb, 120)),
     "pauses all identical": several(
@@ -267,10 +250,10 @@ INPUTS: dict[str, Callable[[Scene], Scene | None]] = {
 def statistics(looks: list[Look]) -> dict[str, float]:
     """The statistics that the examination compares with its limits."""
     first, camera = looks[0], looks[0].frame.camera
-    tilt, height = first.table or (np.nan, np.nan)
+    tilt, height = (first.table.tilt, first.table.height) if first.table else (np.nan, np.nan)
     drifts = np.array([drift(first, look) for look in looks[1:]]).reshape(-1, 3)
     corners = [first.corners.moved(look.corners) for look in looks[1:]]
-    peak, lost, _, rise = edge_agreement([look.edges for look in looks])
+    peak, lost, _ = edge_agreement([look.edges for look in looks])
     return {
         "distance": float(np.median(first.frame.depth[first.frame.valid])),
         "tilt": tilt,
@@ -282,7 +265,6 @@ def statistics(looks: list[Look]) -> dict[str, float]:
         "drift_shift": max(drifts[:, 2], default=np.nan),
         "corners_moved": max((m for _, m, _ in corners), default=np.nan),
         "edge_lost": lost if peak >= 0.15 else np.nan,
-        "edge_rise": rise if peak >= 0.15 and len(looks) > 1 else np.nan,
     }
 
 

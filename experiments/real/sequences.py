@@ -21,8 +21,8 @@ from scipy import ndimage
 from scipy.spatial.transform import RigidTransform
 
 from mstfilter import open_recording
-from mstfilter.formats import PairedImages
-from mstfilter.scene import Camera, Frame, Recording, VoxelGrid, read_depth, read_labels, read_rgb
+from mstfilter.formats import PairedImages, read_depth, read_labels, read_rgb
+from mstfilter.scene import Camera, Frame, Recording, VoxelGrid
 
 SHARED = Path(os.environ.get("MSTFILTER_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "real"
 HOTS = ("mix_1", "office_6", "office_9", "table_7")

@@ -21,8 +21,8 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, naming
 from mstfilter.base.fields import NonNegativeFloat, PositiveInt
-from mstfilter.base.files import weights_file
-from mstfilter.base.registry import load_file
+from mstfilter.base.trained import weights_file
+from mstfilter.base.user_files import load_file
 from mstfilter.mst.segmentation import BoundaryModel, Tree, TreeBuilder
 from mstfilter.mst.segmentation.tree import linkage_tree, prune
 from mstfilter.scene import Frame, Recording, UsesFiles, memo

@@ -25,7 +25,7 @@ import numpy as np
 
 from mstfilter.base.errors import InputError, MissingLibraryError, describe_error
 from mstfilter.base.fields import PositiveInt
-from mstfilter.base.files import weights_file
+from mstfilter.base.trained import weights_file
 from mstfilter.mst.tracking import MaskTracker
 from mstfilter.scene import Clip, Recording, UsesFiles
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from mstfilter.base.errors import naming
 from mstfilter.base.fields import NonNegativeFloat, PositiveInt, Share
-from mstfilter.base.files import weights_file
-from mstfilter.base.registry import load_file
+from mstfilter.base.trained import weights_file
+from mstfilter.base.user_files import load_file
 from mstfilter.mst.tracking import MaskTracker
 from mstfilter.scene import Clip, Frame, Recording, UsesFiles, component_key, content_key, memo
 

@@ -30,35 +30,30 @@ _Error = TypeVar("_Error", bound="_WithHints")
 
 
 class _WithHints(Exception):
-    message: str
     hints: tuple[str, ...] = ()
 
-    def __new__(cls, *args: Any, **named: Any) -> Self:
-        new = super().__new__(cls, *args)
-        new.message = printable(Exception.__str__(new))  # of a subclass whose constructor does not call the one below
-        return new
-
     def __init__(self, message: str, *hints: str) -> None:
-        self.message, self.hints = printable(message), tuple(map(printable, hints))
-        super().__init__(self.message)
+        super().__init__(printable(message))
+        self.hints = tuple(map(printable, hints))
         for hint in self.hints:
             self.add_note(f"hint: {hint}")
+
+    @property
+    def message(self) -> str:
+        """The text without hints, also of a subclass whose constructor does not call the one above."""
+        return printable(Exception.__str__(self))
+
+    def with_message(self, message: str) -> Self:
+        """The same error, of the same class and with the same attributes and hints, with another message."""
+        return _rebuilt(type(self), (printable(message),), self.__dict__)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (type(self), self.args, self.__dict__)
 
-    def with_message(self, message: str) -> Self:
-        """The same error, of the same class and with the same attributes and hints, with another message.
-
-        A subclass may have a constructor with other parameters, so the constructor is not called.
-        """
-        message = printable(message)
-        return _rebuilt(type(self), (message,), {**self.__dict__, "message": message})
-
 
 def _rebuilt(cls: type[_Error], args: tuple[Any, ...], attributes: dict[str, Any]) -> _Error:
-    """An error with the given arguments and attributes, made without its constructor."""
-    new = _WithHints.__new__(cls, *args)  # whatever the constructor of the class takes
+    """An error made without its constructor, which may have other parameters in a subclass."""
+    new = cls.__new__(cls, *args)
     new.__dict__.update(attributes)
     new.args = args
     if notes := attributes.get("__notes__"):

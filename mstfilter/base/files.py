@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import errno
-import functools
 import hashlib
 import math
 import numbers
@@ -284,42 +283,42 @@ def writing(what: str, *hints: str) -> Iterator[None]:
 def check_output(path: Path, folder: bool = False, empty: bool = True) -> None:
     """Raise InputError if a file, or with `folder` a folder, cannot be written at `path`.
 
-    An existing folder must be empty, unless `empty` is false. For each missing part of `path`, a test file is made
-    and removed, because permissions do not reveal read-only file systems, too long names, or a full disk.
+    An existing folder must be empty, unless `empty` is false. A file is made and removed beside `path`, because
+    permissions do not reveal read-only file systems or a full disk.
     """
-    if os.path.isdir(path) and not folder:
-        raise InputError(f"{path} is a folder, expected the name of a file to write")
-    if folder and os.path.isdir(path) and (os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve())):
-        raise InputError(f"cannot write {path}: it is a mount point or the working folder", "name a folder below it")
-    if folder and os.path.isfile(path):
+    if os.path.isdir(path):
+        if not folder:
+            raise InputError(f"{path} is a folder, expected the name of a file to write")
+        if os.path.ismount(path) or Path.cwd().is_relative_to(path.resolve()):
+            fact = f"cannot write {path}: it is a mount point or the working folder"
+            raise InputError(fact, "name a folder below it")
+        if empty and any(path.iterdir()):
+            fact = f"cannot write {path}: it exists and is not an empty folder"
+            raise InputError(fact, "choose another name, or remove it")
+    elif folder and os.path.isfile(path):
         raise InputError(f"cannot write {path}: it is a file, expected a folder", "choose another name")
-    if folder and empty and os.path.isdir(path) and any(path.iterdir()):
-        raise InputError(
-            f"cannot write {path}: it exists and is not an empty folder", "choose another name, or remove it"
-        )
-    target = path.absolute().parent if folder and os.path.exists(path) else path.absolute()  # a folder is renamed
-    places = [target, *target.parents]
-    existing = next(place for place in places if os.path.exists(place))
-    if existing.is_file() and (folder or existing != target):
+    place = path.absolute()
+    existing = next(parent for parent in place.parents if os.path.exists(parent))
+    if os.path.isfile(existing):
         raise InputError(f"cannot write {path}: {existing} is a file", "choose another place")
-    made_in = existing.parent if existing.is_file() else existing
-    for name in [place.name for place in places[: places.index(existing)]] or [existing.name]:
-        try:
-            _try_to_write(made_in, _temporary(made_in / name, "partial"))
-        except OSError as error:
-            problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
-            raise InputError(f"cannot write {path}: {problem} in {made_in}", "choose another place") from error
+    try:
+        for name in place.relative_to(existing).parts:  # a part may be too long
+            with contextlib.suppress(FileNotFoundError):
+                _temporary(existing / name, "partial").lstat()
+        _try_to_write(existing)
+    except OSError as error:
+        problem = "no permission to write" if error.errno in (errno.EACCES, errno.EPERM) else error.strerror
+        raise InputError(f"cannot write {path}: {problem} in {existing}", "choose another place") from error
 
 
-def _try_to_write(folder: Path, temporary: Path) -> None:
+def _try_to_write(folder: Path) -> None:
     """Make a file in a folder and remove it. If possible the file has no name, so a killed process leaves no file."""
-    if hasattr(os, "pathconf") and len(os.fsencode(temporary.name)) > os.pathconf(folder, "PC_NAME_MAX"):
-        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     try:
         os.close(os.open(folder, os.O_WRONLY | os.O_TMPFILE))
     except (AttributeError, OSError) as error:
         if getattr(error, "errno", None) not in (None, errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT):
             raise
+        temporary = _temporary(folder / "trial", "partial")
         temporary.touch()
         temporary.unlink()
 
@@ -359,25 +358,6 @@ def read_csv(path: str | Path) -> list[dict[str, str]]:
     """Rows of a CSV file with a header: column name -> text."""
     with Path(path).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
-
-
-def weights_file(given: str, name: str, where: str) -> tuple[str, str]:
-    """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
-
-    Raises InputError if the file is not given or does not exist. The hint refers to the address `where`. The hash of
-    an unchanged file is computed once.
-    """
-    path = Path(given)
-    if not given or not path.is_file():
-        problem = f"do not exist: {path}" if given else "are not given"
-        raise InputError(f"the weights of {name} {problem}", f"set the field to the path of a file, see {where}")
-    status = path.stat()
-    return str(path.resolve()), _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
-
-
-@functools.lru_cache(maxsize=8)
-def _sha256(path: str, modified: int, size: int) -> str:
-    return _digest(path)
 
 
 def _digest(path: str | Path) -> str:

@@ -20,19 +20,15 @@ and fields. The annotation of a field determines the kind of its component. A fi
 
 A component is imported when it is first built. Looking up a name imports no component. Users name their own class as
 ``./file.py:Class`` (if `allow_files` is True), or add the class by an entry point ``kind.name`` of the group
-``mstfilter.components``. A relative path is relative to the working folder. A file is executed once per process, and
-again if its content has changed.
+``mstfilter.components``. A relative path is relative to the working folder.
 """
 
 from __future__ import annotations
 
-import copyreg
 import dataclasses
 import difflib
 import functools
-import hashlib
 import importlib
-import importlib.util
 import inspect
 import sys
 import tomllib
@@ -44,14 +40,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mstfilter.base.errors import (
-    InputError,
-    install_hint,
-    missing_library,
-    place_in_user_file,
-    short_path,
-    suggestion,
-)
+from mstfilter.base.errors import InputError, missing_library, short_path, suggestion
+from mstfilter.base.user_files import load_class
 
 _ENTRY_POINTS = "mstfilter.components"
 
@@ -121,7 +111,7 @@ class Registry:
         location = self._locate(kind, name, where or kind, allow_files)
         path, _, attribute = location.partition(":")
         if path.endswith(".py"):
-            found = _from_file(path, attribute)
+            found = load_class(path, attribute)
             if kind in self.kinds and not issubclass(found, self.interface(kind)):
                 interface = self.interface(kind)
                 raise InputError(
@@ -352,101 +342,6 @@ def _import(location: str) -> type:
     module, _, attribute = location.partition(":")
     found: type = getattr(importlib.import_module(module), attribute)
     return found
-
-
-_MODULES: dict[tuple[Path, str], ModuleType] = {}  # resolved path and hash of the content of a file -> its module
-
-
-def _from_file(path: str, attribute: str) -> type:
-    module = load_file(path)
-    found = getattr(module, attribute, None)
-    if not isinstance(found, type):
-        classes = ", ".join(cls.__name__ for cls in _classes_of(module))
-        raise InputError(f"{path} has no class {attribute!r}", f"it has: {classes or 'none'}")
-    return found
-
-
-def load_attribute(location: str) -> Any:
-    """What a Python file of the user holds under a name: ``./file.py:name``."""
-    path, _, name = location.partition(":")
-    if not Path(path).is_file():
-        raise InputError(f"file does not exist: {path}")
-    module = load_file(path)
-    if not hasattr(module, name):
-        raise InputError(f"{path} has no {name!r}", *suggestion(name, vars(module)))
-    return getattr(module, name)
-
-
-def load_file(path: str | Path) -> ModuleType:
-    """The module made by executing a Python file of the user.
-
-    A file is executed once per process for any spelling of its path, and again if its content has changed. Instances
-    of its classes can be pickled, because unpickling loads the file.
-
-    Raises InputError if the file cannot be read or executed.
-    """
-    resolved = Path(path).resolve()
-    try:
-        source = resolved.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    key = resolved, hashlib.sha256(source).hexdigest()
-    if key not in _MODULES:
-        _MODULES[key] = _executed(path, source, *key)
-    return _MODULES[key]
-
-
-def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> ModuleType:
-    """A new module from the source of a file. The module's name is unique for its path and content."""
-    unique = hashlib.sha256(f"{resolved}\0{digest}".encode()).hexdigest()[:12]
-    name = f"mstfilter_user_{resolved.stem}_{unique}"
-    spec = importlib.util.spec_from_file_location(name, resolved)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses and pickle look their module up
-    try:
-        # The loader of `spec` takes stale bytecode for a file that is edited twice in a second.
-        exec(compile(source, str(resolved), "exec"), vars(module))
-    except (Exception, SystemExit) as error:
-        del sys.modules[name]
-        place = place_in_user_file(error)
-        hints = [place] if place else []
-        if isinstance(error, ModuleNotFoundError):
-            missing = str(error.name).partition(".")[0]
-            hints.append(f"if {missing} is a library: {install_hint(missing)}")
-            hints.append("a file beside it is found if its folder is in the environment variable PYTHONPATH")
-        raise InputError(f"{path} cannot be loaded: {type(error).__name__}: {error}", *hints) from error
-    for cls in _classes_of(module):
-        cls.__mst_file__ = f"{resolved}:{cls.__qualname__}"  # type: ignore[attr-defined]
-        cls.__mst_source__ = digest  # type: ignore[attr-defined]
-        if (cls.__reduce_ex__, cls.__reduce__) == (object.__reduce_ex__, object.__reduce__):
-            cls.__reduce_ex__ = _reduce  # type: ignore[method-assign, assignment]
-    return module
-
-
-def _classes_of(module: ModuleType) -> list[type]:
-    """The classes that a module itself defines, without imported classes."""
-    return [v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__]
-
-
-def _reduce(instance: object, protocol: Any) -> Any:
-    """Pickle an instance with the path of the class's file, as other processes cannot import the module by name."""
-    reduced: Any = object.__reduce_ex__(instance, max(int(protocol), 2))
-    how, arguments, *state = reduced
-    cls = type(instance)
-    if how is not copyreg.__newobj__ or "__mst_file__" not in vars(cls):  # type: ignore[attr-defined]
-        return (how, arguments, *state)
-    path, _, name = cls.__mst_file__.rpartition(":")  # type: ignore[attr-defined]
-    return (_new_instance, (path, name, cls.__mst_source__, *arguments[1:]), *state)  # type: ignore[attr-defined]
-
-
-def _new_instance(path: str, name: str, digest: str, *arguments: Any) -> Any:
-    """A new instance, for unpickling. The user's file that defines the class must have the hash `digest`."""
-    module = _MODULES.get((Path(path), digest)) or load_file(path)
-    cls = getattr(module, name)
-    if cls.__mst_source__ != digest:
-        raise InputError(f"{path} has changed since an instance of {name} was pickled", "make the instance again")
-    return cls.__new__(cls, *arguments)
 
 
 def _paired(value: Any, found: Any) -> Iterator[tuple[Any, Any]]:

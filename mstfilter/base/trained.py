@@ -135,6 +135,26 @@ def open_model(name: str, architecture: str | None = None) -> TrainedModel:
     return TrainedModel(folder, description, tensors, hashlib.sha256(text + data).hexdigest()[:16])
 
 
+def weights_file(given: str, name: str, where: str) -> tuple[str, str]:
+    """Absolute path and SHA-256 of a file of weights that the user supplies for a network `name`.
+
+    Raises InputError if the file is not given or does not exist. The hint refers to the address `where`. The hash of
+    an unchanged file is computed once.
+    """
+    path = Path(given)
+    if not given or not path.is_file():
+        problem = f"do not exist: {path}" if given else "are not given"
+        raise InputError(f"the weights of {name} {problem}", f"set the field to the path of a file, see {where}")
+    status = path.stat()
+    return str(path.resolve()), _sha256(str(path.resolve()), status.st_mtime_ns, status.st_size)
+
+
+@functools.lru_cache(maxsize=8)
+def _sha256(path: str, modified: int, size: int) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def layer_size(network: Mapping[str, Any], name: str, at_least: int = 1) -> int:
     """A size in the table ``network`` of a description. Raises InputError unless it is a possible integer."""
     check_integer(f"network.{name}", network[name], at_least=at_least, at_most=_MOST_FEATURES)

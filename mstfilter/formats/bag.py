@@ -9,19 +9,17 @@ has no stamp, all messages have the times of the log. Depth must be registered t
 the same size and ``frame_id``. Transforms (tf) are not read. The camera is assumed not to move, and its pose is
 computed from the table.
 
-Depth with encoding 16UC1 or mono16 is in units of the depth scale (millimetres by convention, REP 118). Depth with
-encoding 32FC1 is in metres. Compressed depth is a PNG. In the transport ``compressedDepth``, a header of 12 bytes
-(quantisation A, B of 32FC1) precedes the PNG. The library rosbags (extra ``bags``) reads the files without ROS.
+`mstfilter.formats.ros_images` describes the encodings. The library rosbags (extra ``bags``) reads the files without
+ROS.
 """
 
 from __future__ import annotations
 
 import contextlib
 import re
-import struct
 import weakref
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,8 +29,8 @@ import numpy as np
 from mstfilter.base.errors import InputError, missing_library, warn_user
 from mstfilter.base.files import reading
 from mstfilter.base.reading import MAX_TEXT, open_regular
+from mstfilter.formats.ros_images import DEPTH, GREY, colour_image, depth_image, image_encoding
 from mstfilter.formats.video import Video, VideoFormat, pair_stamps
-from mstfilter.scene import check_depth, decode_image
 
 
 @dataclass(frozen=True)
@@ -129,106 +127,6 @@ def _close(reader: Any) -> None:
         reader.close()
 
 
-#: Channels of a colour image and OpenCV's conversion to RGB -> encodings.
-_CONVERSIONS = {
-    (3, ""): ("rgb8",),
-    (3, "BGR2RGB"): ("bgr8", "8UC3"),
-    (4, "RGBA2RGB"): ("rgba8",),
-    (4, "BGRA2RGB"): ("bgra8", "8UC4"),
-    (1, "GRAY2RGB"): ("mono8", "8UC1"),
-    (2, "YUV2RGB_UYVY"): ("yuv422", "uyvy"),
-    (2, "YUV2RGB_YUY2"): ("yuv422_yuy2", "yuyv"),
-}
-_COLOUR = {encoding: conversion for conversion, names in _CONVERSIONS.items() for encoding in names}
-_GREY = ("mono8", "8UC1")
-_DEPTH = ("16UC1", "mono16", "32FC1")
-_PNG = b"\x89PNG\r\n\x1a\n"
-
-
-def image_encoding(message: Any, compressed: bool) -> str:
-    """The encoding of an image message; ``16UC1``, ``32FC1`` or ``compressed colour`` for a compressed image."""
-    if not compressed:
-        return str(message.encoding)
-    named = str(message.format)
-    return next((e for e in _DEPTH if named.startswith(e) or ("compressedDepth" in named and e in named)), "") or (
-        "16UC1" if "compressedDepth" in named else "compressed colour"
-    )
-
-
-def colour_image(message: Any, compressed: bool, where: str) -> np.ndarray:
-    """Colour image (H, W, 3) uint8, RGB."""
-    import cv2
-
-    if compressed:
-        problem = f"{where} cannot be decoded: {message.format!r}, {len(message.data)} bytes"
-        image = decode_image(bytes(message.data), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, problem)
-        return np.ascontiguousarray(image[..., ::-1])
-    encoding = str(message.encoding)
-    _check_encoding(encoding, _COLOUR, f"{where}: colour")
-    channels, conversion = _COLOUR[encoding]
-    pixels = _pixels(message, np.dtype(np.uint8), channels, where)
-    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))) if conversion else pixels
-
-
-def _check_encoding(encoding: str, known: Iterable[str], what: str) -> None:
-    if encoding not in known:
-        text = f"{what} has encoding {encoding!r}, which is not supported"
-        raise InputError(text, f"supported: {', '.join(known)}")
-
-
-def depth_image(message: Any, compressed: bool, depth_scale: float, where: str) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN without a reading."""
-    encoding = image_encoding(message, compressed)
-    _check_encoding(encoding, _DEPTH, f"{where}: depth")
-    if compressed:
-        metres = _compressed_depth(bytes(message.data), encoding, depth_scale, where)
-    elif encoding == "32FC1":
-        metres = _pixels(message, np.dtype(np.float32), 1, where)[..., 0].astype(np.float32)
-        check_depth(metres, where)
-    else:
-        metres = _metres(_pixels(message, np.dtype(np.uint16), 1, where)[..., 0], depth_scale)
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(np.nan)).astype(np.float32)
-
-
-def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> np.ndarray:
-    """Pixels (H, W, channels) of an uncompressed image. The rows of the image may be padded."""
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.asarray(message.data, dtype=np.uint8)
-    if min(height, width) < 1 or step < width * channels * kind.itemsize or data.size < height * step:
-        raise InputError(
-            f"{where} has {data.size} bytes for {width} x {height} of {message.encoding} in rows of {step} bytes"
-        )
-    rows = data[: height * step].reshape(height, step)[:, : width * channels * kind.itemsize]
-    order = kind.newbyteorder(">" if message.is_bigendian else "<")
-    return np.ascontiguousarray(rows).view(order).reshape(height, width, channels).astype(kind)
-
-
-def _metres(units: np.ndarray, depth_scale: float) -> np.ndarray:
-    """Depth in metres of an image (H, W) uint16; NaN for the value 65535, which means that there is no reading."""
-    return np.where(units < 65535, units * np.float32(depth_scale), np.float32(np.nan))
-
-
-def _compressed_depth(data: bytes, encoding: str, depth_scale: float, where: str) -> np.ndarray:
-    import cv2
-
-    start = data.find(_PNG, 0, 64)
-    problem, hint = (
-        f"{where} is not a 16-bit PNG ({len(data)} bytes)",
-        "compressed depth must be PNG, not RVL or JPEG",
-    )
-    image = decode_image(data[start:] if start >= 0 else b"", cv2.IMREAD_UNCHANGED, problem, hint)
-    if image.ndim != 2 or image.dtype != np.uint16:
-        raise InputError(problem, hint)
-    if encoding != "32FC1":
-        return _metres(image, depth_scale)
-    if start != 12:
-        raise InputError(f"{where} is compressed 32FC1 without its header of 12 bytes")
-    a, b = struct.unpack("<ff", data[4:12])
-    with np.errstate(divide="ignore"):
-        return np.where(image > 0, a / (image.astype(np.float64) - b), np.nan).astype(np.float32)
-
-
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO = "sensor_msgs/msg/CameraInfo"
 _REGISTERED = "record the aligned depth; or, if it is registered: registered=true"
@@ -315,9 +213,9 @@ class Bag(VideoFormat):
         bag = BagFile(path)
         kinds = ((_IMAGE, False), (_COMPRESSED, True))
         streams = [_stream(bag, name, n, packed) for kind, packed in kinds for name, n in bag.topics(kind).items()]
-        pictures = [s for s in streams if s.encoding not in _DEPTH]
+        pictures = [s for s in streams if s.encoding not in DEPTH]
         # Grey images may be those of an infrared camera.
-        pictures = [s for s in pictures if s.encoding not in _GREY] or pictures
+        pictures = [s for s in pictures if s.encoding not in GREY] or pictures
         colour = _choose(path, "colour", self.colour, pictures, streams)
         depth = self._depth(path, colour, streams)
         K, distortion = self._intrinsics(bag, colour, depth)
@@ -362,7 +260,7 @@ class Bag(VideoFormat):
         return logged if any(missing) else listed
 
     def _depth(self, path: Path, colour: _Stream, streams: list[_Stream]) -> _Stream:
-        found = [s for s in streams if s.encoding in _DEPTH]
+        found = [s for s in streams if s.encoding in DEPTH]
         fitting = [s for s in found if s.size == colour.size and (self.registered or s.frame_id == colour.frame_id)]
         depth = _choose(path, "depth", self.depth, fitting if fitting and not self.depth else found, streams)
         if depth.recorded_raw and not (self.registered and depth.size == colour.size):
@@ -449,7 +347,7 @@ def _stream(bag: BagFile, name: str, count: int, compressed: bool) -> _Stream:
     if not compressed:
         size = int(message.width), int(message.height)
     else:
-        read = depth_image(message, True, 1.0, where) if encoding in _DEPTH else colour_image(message, True, where)
+        read = depth_image(message, True, 1.0, where) if encoding in DEPTH else colour_image(message, True, where)
         size = read.shape[1], read.shape[0]
     return _Stream(name, count, compressed, encoding, str(message.header.frame_id).lstrip("/"), size)
 
@@ -461,7 +359,7 @@ def _choose(path: Path, what: str, name: str, candidates: list[_Stream], streams
         chosen = next((s for s in streams if s.name == name), None)
         if chosen is None:
             raise InputError(f"{path}: no image topic {name!r} for {what}", "image topics are:", *listed)
-        if (chosen.encoding in _DEPTH) != (what == "depth"):
+        if (chosen.encoding in DEPTH) != (what == "depth"):
             raise InputError(f"{path}: {chosen} has no {what} images", "image topics are:", *listed)
         return chosen
     if not candidates:

@@ -19,15 +19,16 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from mstfilter.base.errors import InputError, check_choice, check_number, naming
 from mstfilter.base.files import atomic_folder, check_output, locked, reading, write_sums, writing
 from mstfilter.base.reading import read_arrays, read_json, read_model
-from mstfilter.formats.video import RecordingFormat, check_images, read_optional, warn_of_unread
+from mstfilter.formats.images import read_depth, read_optional, read_rgb, write_image
+from mstfilter.formats.video import RecordingFormat, check_images, warn_of_unread
 from mstfilter.scene import (
     Camera,
     Frame,
@@ -38,27 +39,20 @@ from mstfilter.scene import (
     as_labels,
     examine,
     find_world,
-    read_depth,
-    read_rgb,
     report_findings,
     rigid_from_matrix,
     truth_reader,
-    world_shift,
-    write_image,
 )
 
 VERSION = 1  #: Version of the layout
-_Model = TypeVar("_Model", bound=BaseModel)
-
-
+_SCALE = "camera.json holds depth_scale in metres per unit, without a default: 0.001 for millimetres, 0.0002 for TUM"
 _HINTS = (
     "a recording folder holds manifest.json, camera.json, rgb/, depth/",
     "other layouts: mstfilter.open_recording(path), or `mstfilter convert`",
 )
 
 
-class _Workspace(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class _Workspace(BaseModel, extra="forbid"):
     min: tuple[float, float, float]
     max: tuple[float, float, float]
     voxel: float
@@ -226,9 +220,7 @@ def save_recording(
     Depth is stored in units of the recording's `depth_scale`. `progress` is called with the number of frames written
     and the number of all frames. Further keyword arguments, such as the generator, are stored in manifest.json.
     """
-    report_findings(
-        examine(recording.frames, recording.pauses, recording.grid, recording.times), f"recording {recording.name}"
-    )
+    report_findings(examine(recording.frames, recording.pauses, recording.grid), f"recording {recording.name}")
     camera, total = recording.frames[recording.pauses[0]].camera, len(recording)
     manifest = {"name": recording.name, "depth_scale": recording.depth_scale, **manifest}
     with RecordingWriter(path, camera, recording.grid, **manifest) as writer:
@@ -297,8 +289,7 @@ class _FrameEntry(BaseModel):
     T_world_camera: Any = None
 
 
-class _Manifest(BaseModel):
-    model_config = ConfigDict(extra="allow")
+class _Manifest(BaseModel, extra="allow"):
     version: Literal[1]
     frames: Annotated[list[_FrameEntry], Field(min_length=1)]
 
@@ -307,15 +298,6 @@ class _Manifest(BaseModel):
         if [entry.index for entry in self.frames] != list(range(len(self.frames))):
             raise ValueError("frame indices are not 0, 1, 2, ...")
         return self
-
-
-def _load(path: Path, model: type[_Model]) -> tuple[_Model, dict[str, Any]]:
-    try:
-        return read_model(path, model, "a recording", *_HINTS)
-    except InputError as error:
-        if "depth_scale" in error.message:
-            error.hints = ("metres per unit: 0.001 for millimetres, 0.0002 for TUM images; it has no default",)
-        raise
 
 
 @dataclass(frozen=True)
@@ -337,8 +319,8 @@ class RecordingFolder(RecordingFormat):
             raise InputError(f"recording folder does not exist: {path}")
         if not any(path.iterdir()):
             raise InputError(f"recording folder is empty: {path}", *_HINTS)
-        manifest, manifest_data = _load(path / "manifest.json", _Manifest)
-        camera_file, stored = _load(path / "camera.json", _CameraFile)
+        manifest, manifest_data = read_model(path / "manifest.json", _Manifest, "a recording", *_HINTS)
+        camera_file, stored = read_model(path / "camera.json", _CameraFile, "a recording", _SCALE, *_HINTS)
         warn_of_unread(path / "camera.json", stored, _CameraFile.model_fields)
         keys = {key for entry in manifest_data["frames"] for key in entry}
         notes = (key for key in keys if "cam" not in key.lower() and key.lower() != "pose")
@@ -373,8 +355,7 @@ class RecordingFolder(RecordingFormat):
         known = truth.exists() or true_poses.exists()  # the truth is in the world of the files
         if camera.T_world_camera is None or not isinstance(grid, VoxelGrid) or not known:
             given = camera.at(poses[marked[0]]) if marked[0] in poses else camera
-            found, grid = find_world(read(marked[0], given), grid)
-            shift = world_shift(given, found)
+            found, grid, shift = find_world(read(marked[0], given), grid)
             if shift is not None:
                 poses = {index: shift * pose for index, pose in poses.items()}
             if camera.T_world_camera is None:

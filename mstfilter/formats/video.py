@@ -28,6 +28,7 @@ from scipy.spatial.transform import RigidTransform
 
 from mstfilter.base.errors import InputError, warn_user
 from mstfilter.base.fields import Bounded, NonNegativeFloat, NonNegativeInt
+from mstfilter.formats.images import read_depth, read_optional, read_rgb
 from mstfilter.formats.pauses import Still
 from mstfilter.scene import (
     WORKING_PIXELS,
@@ -40,11 +41,7 @@ from mstfilter.scene import (
     check_depth,
     find_world,
     pauses_with_depth,
-    read_depth,
-    read_labels,
-    read_rgb,
     rigid_from_matrix,
-    world_shift,
 )
 
 
@@ -209,9 +206,7 @@ class Video:
         found = pauses_with_depth(found, self.times, has_depth, str(self.path))
         first_pause = found[0]
         camera = camera if world.pose is None else camera.at(world.pose)
-        given = camera
-        camera, grid = find_world(read(first_pause, given), world.grid)
-        world_shift(given, camera)  # notes that the world is not that of the given pose
+        camera, grid, _ = find_world(read(first_pause, camera), world.grid)
         cameras: dict[int, Camera] = {}
 
         def camera_at(index: int) -> Camera:
@@ -251,11 +246,6 @@ class Video:
             raise InputError(f"robot mask of frame {index} of {self.path} has shape {robot.shape}, not {depth.shape}")
         robot = None if robot is None else _undistort(robot, source) > 0
         return Frame(_undistort(rgb, source, smooth=True), _undistort(depth, source, np.nan), camera, robot)
-
-
-def read_optional(path: Path | None = None) -> np.ndarray | None:
-    """A label image or mask (H, W), or None if there is no such file."""
-    return read_labels(path) if path is not None and path.is_file() else None
 
 
 def warn_of_unread(file: Path, stored: Iterable[str], read: Iterable[str], notes: Iterable[str] = ()) -> None:

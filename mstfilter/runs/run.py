@@ -30,7 +30,7 @@ from mstfilter.base.registry import nested_components
 from mstfilter.lab.oracles import bind_truth, uses_truth
 from mstfilter.runs.presets import REGISTRY, build_filter, describe_filter
 from mstfilter.runs.run_folder import RunFolder, as_json
-from mstfilter.scene import Finding, Recording, UsesFiles, examine_hypotheses, report_findings, scene_cache
+from mstfilter.scene import Recording, UsesFiles, scene_cache
 from mstfilter.scoring import ask
 from mstfilter.smc import ParticleFilter
 
@@ -109,7 +109,6 @@ def filter_recording(
         folder = _existing_folder(path, description, replace)
         done = 0 if folder is None else folder.n_pauses
         state = folder.state(done - 1) if folder is not None and done else bound.start(int(seed))
-        doubts: list[Finding] = []
         with progress_of(progress, "filter") as advance, parallel(n_threads):
             try:
                 clips = recording.clips()
@@ -123,9 +122,6 @@ def filter_recording(
                         folder = first_pause(path, description, replace, *step)
                     else:
                         folder.write_pause(*step)
-                    if not doubts and state.population is not None:  # said once
-                        doubts = examine_hypotheses(tuple(state.population.particles), clip.after)
-                        report_findings(doubts, f"pause {clip.index} of recording {recording.name}")
                     scene_cache.forget()
                     seconds = sum(info.seconds.values())
                     _LOGGER.info("%s: pause %d filtered in %.2f s", recording.name, clip.index, seconds)

@@ -39,19 +39,9 @@ from mstfilter.base.files import (
     write_text,
 )
 from mstfilter.base.reading import MAX_FILE, read_arrays, read_model
+from mstfilter.formats import read_labels, read_rgb, write_image
 from mstfilter.formats.folder import CameraFile
-from mstfilter.scene import (
-    Camera,
-    Clip,
-    Hypothesis,
-    as_labels,
-    decode_hypotheses,
-    encode_hypotheses,
-    memo,
-    read_labels,
-    read_rgb,
-    write_image,
-)
+from mstfilter.scene import Camera, Clip, Hypothesis, as_labels, decode_hypotheses, encode_hypotheses, memo
 from mstfilter.scoring import FORMS, PauseEstimate, Questions, weighted_coverage
 from mstfilter.smc import Codec, Info, State, load_state, save_state
 

@@ -28,20 +28,17 @@ from mstfilter.scene.evidence import (
 from mstfilter.scene.frame import (
     Clip as Clip,
     Frame as Frame,
+    areas_of_colours as areas_of_colours,
     check_depth as check_depth,
-    decode_image as decode_image,
     depth_sigma as depth_sigma,
     grey_blocks as grey_blocks,
-    read_depth as read_depth,
-    read_labels as read_labels,
-    read_rgb as read_rgb,
-    write_image as write_image,
 )
 from mstfilter.scene.geometry import (
     BASELINE as BASELINE,
     TABLE_TOLERANCE as TABLE_TOLERANCE,
     fit_support_plane as fit_support_plane,
     frame_geometry as frame_geometry,
+    frame_points as frame_points,
     table_residual as table_residual,
 )
 from mstfilter.scene.occupancy import Occupancy as Occupancy
@@ -50,23 +47,20 @@ from mstfilter.scene.partitions import (
     canonical as canonical,
     common_refinement as common_refinement,
 )
+from mstfilter.scene.pauses import PauseRule as PauseRule, pauses_with_depth as pauses_with_depth
 from mstfilter.scene.plausibility import (
     Finding as Finding,
     Look as Look,
     examine as examine,
-    examine_hypotheses as examine_hypotheses,
     examine_next as examine_next,
     report_findings as report_findings,
 )
 from mstfilter.scene.recording import (
     LazyFrames as LazyFrames,
-    PauseRule as PauseRule,
     Recording as Recording,
     UsesFiles as UsesFiles,
     find_world as find_world,
-    pauses_with_depth as pauses_with_depth,
     truth_reader as truth_reader,
-    world_shift as world_shift,
 )
 from mstfilter.scene.rendering import (
     Rendering as Rendering,

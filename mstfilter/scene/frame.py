@@ -1,4 +1,4 @@
-"""RGB-D images: frames, clips, image files and depth noise.
+"""RGB-D images: frames, clips, depth noise, and colours of parts of an image.
 
 >>> frame = Frame(rgb, depth, camera)          # rgb (H, W, 3) uint8, depth (H, W) metres, NaN = no reading
 >>> frame.points                               # (H, W, 3) world points in metres
@@ -13,26 +13,20 @@ others help to see what is free. Their simultaneous frames are the `views` of th
 
 from __future__ import annotations
 
-import contextlib
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.files import reading
 from mstfilter.base.lazy import late
-from mstfilter.base.reading import read_arrays, read_bytes
 from mstfilter.scene.arrays import content_key, frozen, read_only
 from mstfilter.scene.camera import Camera
 from mstfilter.scene.voxels import VoxelGrid
 
 _SIGMA_AT_ONE_METRE = 0.00185
-MAX_PIXELS = 2**25  #: Largest image that is decoded; 8K video has fewer pixels
 
 
 def depth_sigma(z: ArrayLike) -> np.ndarray:
@@ -46,85 +40,6 @@ def depth_sigma(z: ArrayLike) -> np.ndarray:
     return _SIGMA_AT_ONE_METRE * z * z
 
 
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_PNG_END = b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
-
-
-def _decode(path: Path, flags: int) -> np.ndarray:
-    with reading(path, "an image"):
-        if not path.exists():
-            raise InputError(f"image is missing: {path}", "copy or record it again, or leave the frame out")
-    data = read_bytes(path, "an image")
-    if data.startswith(_PNG_START) and not data.endswith(_PNG_END):
-        # The decoder would fill the missing rows with zeros without an error.
-        raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of PNG)", "copy the file again")
-    if data.startswith(_JPEG_START) and data.rfind(_JPEG_END) < len(data) // 2:  # the header may hold a small JPEG
-        raise InputError(f"image is truncated: {path} ({len(data)} bytes, no end of JPEG)", "copy the file again")
-    return decode_image(data, flags, f"image cannot be decoded: {path} ({len(data)} bytes)")
-
-
-def decode_image(data: bytes, flags: int, problem: str, *hints: str) -> np.ndarray:
-    """Decode the bytes of a PNG, JPEG or TIFF file. `flags` are those of ``cv2.imdecode``.
-
-    Raises InputError with the message `problem` if the bytes are not an image. An image of more than `MAX_PIXELS`
-    pixels is not decoded and also raises InputError.
-    """
-    import cv2
-
-    size = image_size(data)
-    if size is None:
-        raise InputError(problem, *(hints or ("expected a PNG or JPEG file",)))
-    if size[0] * size[1] > MAX_PIXELS:
-        raise InputError(f"{problem}: it is {size[0]} x {size[1]}, at most {MAX_PIXELS} pixels are read", *hints)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise InputError(f"{problem}: {str(error).splitlines()[0]}", *hints) from error
-    if image is None or image.shape[:2] not in (size[::-1], size):  # turned, if its orientation is used
-        raise InputError(problem, *(hints or ("expected a PNG or JPEG file",)))
-    return image
-
-
-def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of a PNG, JPEG or TIFF file; None for other files."""
-    if data.startswith(_PNG_START) and len(data) >= 24:
-        return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
-    with contextlib.suppress(struct.error):
-        if data.startswith(b"\xff\xd8"):
-            return _jpeg_size(data)
-        if data[:4] in (b"II*\0", b"MM\0*"):
-            return _tiff_size(data, "<" if data[:1] == b"I" else ">")
-    return None
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the first frame header of a JPEG file. Raises struct.error if no header is found."""
-    at = 2
-    while True:
-        mark, kind, length = struct.unpack_from(">BBH", data, at)
-        if mark != 0xFF:
-            return None
-        if kind == 0xFF:  # a fill byte
-            at += 1
-        elif 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        else:
-            at += 2 + length
-
-
-def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
-    """Width and height in the first directory of a TIFF file. Raises struct.error for an incomplete directory."""
-    (at,) = struct.unpack_from(f"{order}I", data, 4)
-    (n,) = struct.unpack_from(f"{order}H", data, at)
-    found = {}
-    for k in range(n):
-        tag, kind = struct.unpack_from(f"{order}HH", data, at + 2 + 12 * k)
-        (found[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, at + 10 + 12 * k)
-    return (found[256], found[257]) if {256, 257} <= set(found) else None
-
-
 _IN_METRES = "floating-point depth is read in metres, whatever the depth scale is: multiply millimetres by 0.001"
 
 
@@ -135,66 +50,6 @@ def check_depth(depth: np.ndarray, where: str, hint: str = _IN_METRES) -> None:
     median = float(np.median(metres)) if metres.size else 1.0
     if not 0.05 < median < 30:
         raise InputError(f"{where} has a median of {median:g} m, expected between 0.05 and 30 m", hint)
-
-
-def read_rgb(path: Path) -> np.ndarray:
-    """Colour image (H, W, 3) uint8, RGB."""
-    import cv2
-
-    # The orientation is ignored, as in the depth image. The bits are kept, so that depth is not taken for colour.
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image.dtype != np.uint8:
-        raise InputError(f"colour image {path} has type {image.dtype}, expected 8 bits", "is it a depth image?")
-    return np.ascontiguousarray(image[..., ::-1])
-
-
-def read_depth(path: Path, scale: float) -> np.ndarray:
-    """Depth image (H, W) float32 in metres, NaN for no reading: the values 0 and (of 16 bits) 65535 in the file.
-
-    16-bit integers are multiplied by `scale` (metres per unit). Floating-point values (.npy, .tif) must be in metres.
-    """
-    import cv2
-
-    if path.suffix.lower() == ".npy":
-        image = read_arrays(path, "an image", "expected .npy with an array (H, W)").get("", np.zeros(0))
-    else:
-        image = _decode(path, cv2.IMREAD_UNCHANGED)
-    image = image.astype(image.dtype.newbyteorder("="), copy=False)
-    if image.ndim != 2 or not (image.dtype in (np.uint16, np.int16) or np.issubdtype(image.dtype, np.floating)):
-        raise InputError(
-            f"depth image {path} has shape {image.shape} and type {image.dtype}, expected one channel of 16 bits or "
-            "float"
-        )
-    unit = scale
-    if np.issubdtype(image.dtype, np.floating):
-        unit = 1
-        check_depth(image, f"depth image {path}")
-        image = image.astype(np.float32)
-    read = (image > 0) & (image != 65535)
-    return np.where(read, image * np.float32(unit), np.float32(np.nan)).astype(np.float32)
-
-
-def read_labels(path: Path) -> np.ndarray:
-    """Label image (H, W) uint8 or uint16."""
-    import cv2
-
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"label image {path} has shape {image.shape} and type {image.dtype}, expected one channel")
-    return image
-
-
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 RGB, or (H, W) uint8 or uint16, as a PNG file."""
-    import cv2
-
-    if image.dtype not in (np.uint8, np.uint16):  # OpenCV would clip the values to 8 bits
-        raise InputError(f"image cannot be written: {path}, type {image.dtype}, expected uint8 or uint16")
-    data = image[..., ::-1] if image.ndim == 3 else image
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(data), [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    if not done:
-        raise InputError(f"image cannot be written: {path}, shape {image.shape}, type {image.dtype}")
-    path.write_bytes(encoded.tobytes())
 
 
 def without_alpha(rgb: np.ndarray) -> np.ndarray:
@@ -389,3 +244,27 @@ class Clip:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+
+_BINS, _LOWEST, _WIDTH = (4, 6, 6), (0.0, -48.0, -48.0), (25.0, 16.0, 16.0)  # of Lab colours
+
+
+def areas_of_colours(frame: Frame, mask: np.ndarray) -> np.ndarray:
+    """Visible area (144,) float32 in square metres of each colour in a mask (H, W) bool of a frame.
+
+    The colours are 4 x 6 x 6 bins of Lab colours. A pixel is divided between the nearest bins. The area is that of a
+    surface that faces the camera.
+    """
+    import cv2
+
+    areas = np.zeros(_BINS)
+    rgb, depth = frame.rgb[mask], frame.depth[mask & frame.valid]
+    if not len(depth):
+        return areas.ravel().astype(np.float32)
+    lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
+    at = np.clip((lab - _LOWEST) / _WIDTH - 0.5, 0, np.array(_BINS) - 1)
+    low = np.minimum(at.astype(np.int64), np.array(_BINS) - 2)
+    for corner in np.ndindex(2, 2, 2):
+        np.add.at(areas, tuple((low + corner).T), np.where(corner, at - low, 1 - (at - low)).prod(axis=1))
+    pixel = float(np.median(depth)) ** 2 / (frame.camera.K[0, 0] * frame.camera.K[1, 1])
+    return (pixel * areas.ravel()).astype(np.float32)

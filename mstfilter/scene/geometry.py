@@ -1,10 +1,10 @@
-"""Geometry of a depth image: voxels in the image, the support plane, the workspace, edges of depth and colour.
+"""Geometry of a depth image: voxels in the image, the support plane, the workspace.
 
 >>> frame_geometry(frame, grid).known_free(0.005)         # voxels observed as free
 >>> plane = fit_support_plane(frame)                      # if the camera pose is not known
 >>> camera = frame.camera.at(plane.T_world_camera)        # z up, table at z = 0
 >>> grid = workspace(frame_with_that_camera)              # voxels around the objects on the table
->>> edge_agreement([Edges(frame)])                        # whether depth is registered to colour
+>>> plane_of(frame)                                       # against the pose of the frame
 
 On a plane, disparity D = 8 f b / z (f focal length, b baseline, z depth) is an affine function of the pixel (u, v).
 The noise of disparity does not depend on depth, so the support plane is found by a least-squares fit of an affine
@@ -13,7 +13,6 @@ function to disparity. Its unit is 1/8 pixel of a Kinect (f = 525 pixels, b = 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +64,17 @@ def _projected(camera: Camera, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray,
     u, v, z, inside = camera.pixels_of(grid.centres())
     pixel = np.where(inside & (z > 1e-6), v * camera.width + u, -1).astype(np.int32)
     return read_only(pixel), read_only(z.astype(np.float32)), read_only(z)
+
+
+def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices (k,) of the pixels with a reading inside the grid, and the voxels (k, 3) of these readings."""
+
+    def compute() -> tuple[np.ndarray, np.ndarray]:
+        index = grid.index_of(frame.points)
+        pixels = np.flatnonzero(frame.valid & grid.contains(index))
+        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
+
+    return memo("frame_points", (frame.key, grid.key), compute)
 
 
 BASELINE = 0.075  # metres between projector and camera of a Kinect v1; sets the unit of disparity
@@ -162,6 +172,72 @@ def _pose(camera: Camera, plane: np.ndarray, pixels: np.ndarray) -> RigidTransfo
     return RigidTransform.from_matrix(matrix)
 
 
+_NEAR_TABLE = 0.1  # metres from z = 0, where the table of a given pose is searched
+_OTHER_PLANE = 30.0  # degrees: a plane that is tilted by more is a wall or the side of a box, not the table
+_LEVEL = 2.5  # degrees: tilt of a table in the world of a pose of which only the height differs
+_LEAST_SHIFT = 0.01  # metres: a table that is farther from z = 0 is shifted there
+ON_TABLE = 0.025  #: metres from z = 0 within which a reading is on the table
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane that was fitted to a depth image, compared with the pose of the frame."""
+
+    tilt: float  #: degrees between its normal and z of the world
+    height: float  #: metres above z = 0 where it is nearest to the camera
+    normal: np.ndarray  #: (3,) in camera axes
+
+
+def plane_of(frame: Frame, chosen: np.ndarray | None = None) -> Plane | None:
+    """The largest plane of a frame, or of its `chosen` readings (n,) bool; None if no plane is found."""
+    given = frame.camera.pose
+    try:
+        if chosen is not None:
+            valid = np.zeros_like(frame.valid)
+            valid[frame.valid] = chosen
+            frame = Frame(frame.rgb, np.where(valid, frame.depth, np.nan), frame.camera)
+        fitted = fit_support_plane(frame).T_world_camera.inv()
+    except InputError:  # too few readings, or most are beyond 30 m
+        return None
+    normal = fitted.rotation.apply([0.0, 0.0, 1.0])
+    tilt = np.degrees(np.arccos(np.clip(given.rotation.apply(normal)[2], -1, 1)))
+    return Plane(float(tilt), float((given * fitted).apply(np.zeros(3))[2]), normal)
+
+
+def table_of(frame: Frame) -> Plane | None:
+    """The plane of the table; None if no plane is found near z = 0."""
+    near = np.abs(frame.points[frame.valid][:, 2]) < _NEAR_TABLE
+    plane = plane_of(frame, near) if near.sum() > 0.03 * near.size else None
+    return None if plane is None or plane.tilt > _OTHER_PLANE else plane
+
+
+def table_height(frame: Frame) -> float:
+    """Height (m) of the table in a world in which it is not at z = 0, as in the world of a robot's base; else 0.
+
+    The table is the largest level plane near z = 0 or, if none is there, the largest plane of the image. It is at
+    z = 0 if at least half as many readings are there as on the plane.
+    """
+    frame = sampled(frame, 160)
+    plane = table_of(frame) or plane_of(frame)
+    if plane is None or plane.tilt > _LEVEL or abs(plane.height) < _LEAST_SHIFT:
+        return 0.0
+    heights, reach = frame.points[frame.valid][:, 2], min(abs(plane.height) / 2, ON_TABLE)
+    there, here = ((np.abs(heights - z) < reach).sum() for z in (plane.height, 0.0))
+    return plane.height if here < there / 2 else 0.0
+
+
+def sampled(frame: Frame, width: int) -> Frame:
+    """The frame reduced to every k-th pixel, with about `width` columns."""
+    step = max(1, round(frame.camera.width / width))
+    part = slice(step // 2, None, step)
+    rgb, depth = frame.rgb[part, part], frame.depth[part, part]
+    K = frame.camera.K.copy()
+    K[:2, 2] -= step // 2
+    K[:2] /= step
+    mask = None if frame.robot_mask is None else frame.robot_mask[part, part]
+    return Frame(rgb, depth, Camera(K, depth.shape[1], depth.shape[0], frame.camera.T_world_camera), mask)
+
+
 def table_residual(frame: Frame) -> np.ndarray:
     """Measured disparity minus the disparity of the table, (H, W) float32 in 1/8 pixels. The result is cached.
 
@@ -185,20 +261,6 @@ def in_columns(grid: VoxelGrid, points: np.ndarray) -> np.ndarray:
     """(...) bool: whether x and y of points (..., 3) are inside the grid."""
     index = grid.index_of(points)[..., :2]
     return np.asarray(((index >= 0) & (index < np.array(grid.shape[:2]))).all(axis=-1))
-
-
-def shares_with_depth(frame: Frame, grid: VoxelGrid) -> tuple[float, float]:
-    """Share of the pixels with a depth reading: of the image, and of the part that shows the table of the workspace.
-
-    Pixels of the robot are not counted.
-    """
-    camera, known = frame.camera, np.isfinite(frame.depth)
-    down = camera.rays() @ camera.pose.as_matrix()[2, :3]
-    with np.errstate(divide="ignore"):
-        table = camera.unproject(np.where(down < 0, -camera.position[2] / down, np.nan))
-    image = np.ones_like(known) if frame.robot_mask is None else ~frame.robot_mask
-    shown = image & in_columns(grid, table)
-    return float(known[image].mean()), float(known[shown].mean()) if shown.any() else 1.0
 
 
 _MIN_HEIGHT = 0.01  # metres above the table beyond which a reading may show an object
@@ -263,77 +325,3 @@ def _without_strips(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
     keep = (n >= 3) & (across > np.maximum(_STRIP, noise) ** 2)
     keep[n.argmax()] = True
     return near[keep[group]]
-
-
-_SHIFTS = 16  # pixels of an image of 320 columns
-_MIN_EDGES = 120  # pixels of depth edges; fewer are taken for noise
-_BOX = np.ones((3, 3), np.uint8)
-
-
-class Edges:
-    """Image of depth edges (H, W) float32, 0 or 1, and ranks (H, W) of the colour gradients of all pixels, 0 to 1."""
-
-    def __init__(self, frame: Frame) -> None:
-        import cv2
-
-        depth = np.where(frame.valid, frame.depth, np.nan)
-        near, far = cv2.erode(np.nan_to_num(depth, nan=9.0), _BOX), cv2.dilate(np.nan_to_num(depth, nan=0.0), _BOX)
-        known = cv2.erode(frame.valid.astype(np.uint8), _BOX) > 0
-        self.depth = (known & (far - near > 0.03 + 0.02 * near)).astype(np.float32)
-        margin = np.zeros_like(self.depth)
-        inner = slice(_SHIFTS, -_SHIFTS)
-        margin[inner, inner] = self.depth[inner, inner]
-        self.depth = margin
-        self.rgb = frame.rgb
-        self.rank = _gradient_ranks(cv2.GaussianBlur(frame.rgb, (3, 3), 0).astype(np.float32))
-
-    def smoothed_rank(self, sigma: float) -> np.ndarray:
-        """(H, W): ranks of the gradients of the colour image, smoothed by `sigma` pixels; 0 gives `rank`."""
-        import cv2
-
-        return _gradient_ranks(cv2.GaussianBlur(self.rgb.astype(np.float32), (0, 0), sigma)) if sigma else self.rank
-
-    def under(self, rank: np.ndarray) -> np.ndarray:
-        """(33, 33): sum of colour ranks (H, W) at the depth edges, for each shift of -16 to 16 pixels."""
-        import cv2
-
-        inner = slice(_SHIFTS, -_SHIFTS)
-        return np.asarray(cv2.matchTemplate(rank, self.depth[inner, inner], cv2.TM_CCORR))
-
-
-def _gradient_ranks(rgb: np.ndarray) -> np.ndarray:
-    """Ranks (H, W) float32 of the gradients of a colour image (H, W, 3), 0 to 1."""
-    across, down = np.abs(np.diff(rgb, axis=1, append=rgb[:, -1:])), np.abs(np.diff(rgb, axis=0, append=rgb[-1:]))
-    gradient = np.maximum(across, down).max(axis=2)
-    levels = np.sort(gradient, axis=None)
-    return (np.searchsorted(levels, gradient) / gradient.size).astype(np.float32)
-
-
-def edge_agreement(edges: Sequence[Edges], sigma: float = 0.0) -> tuple[float, float, tuple[int, int], float]:
-    """Agreement of depth edges and colour edges at all pauses, for different shifts of the colour images.
-
-    The first two values are the best agreement minus the median over all shifts, and its relative loss without a
-    shift. The third is the best shift (rows, columns) in pixels of an image with 320 columns. The fourth is the
-    increase of the agreement if the depth images of different pauses are exchanged. If `sigma` is not 0, the colour
-    images are smoothed with this standard deviation in pixels, so that finer texture has no effect.
-    """
-    edges = [edge for edge in edges if min(edge.depth.shape) >= 4 * _SHIFTS]
-    count = sum(float(edge.depth.sum()) for edge in edges)
-    if count < _MIN_EDGES:
-        return 0.0, 0.0, (0, 0), 0.0
-
-    def agreement(order: Sequence[int]) -> np.ndarray:
-        return np.sum([edges[i].under(ranks[j]) for i, j in enumerate(order)], axis=0) / count
-
-    def unshifted(scores: np.ndarray) -> float:
-        return float(scores[_SHIFTS - 1 : _SHIFTS + 2, _SHIFTS - 1 : _SHIFTS + 2].max())
-
-    ranks = [edge.smoothed_rank(sigma) for edge in edges]
-    n, scores = len(edges), agreement(range(len(edges)))
-    row, column = np.unravel_index(scores.argmax(), scores.shape)
-    base, top = float(np.median(scores)), float(scores.max())
-    lost = (top - unshifted(scores)) / max(top - base, 1e-9)
-    orders = [range(n - 1, -1, -1), [*range(1, n), 0], [n - 1, *range(n - 1)]] if n > 1 else []
-    best = max((unshifted(agreement(order)) for order in orders), default=0.0)
-    top = max(top, best)
-    return top - base, lost, (int(row) - _SHIFTS, int(column) - _SHIFTS), best - unshifted(scores)

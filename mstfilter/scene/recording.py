@@ -17,39 +17,22 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from mstfilter.base.errors import InputError, check_integer, warn_user
-from mstfilter.base.fields import Bounded
+from mstfilter.base.errors import InputError, warn_user
 from mstfilter.base.lazy import late
 from mstfilter.scene.arrays import content_key
-from mstfilter.scene.camera import Camera, rigid_from_matrix
-from mstfilter.scene.frame import Clip, Frame, check_depth, without_alpha
-from mstfilter.scene.geometry import fit_support_plane, workspace
-from mstfilter.scene.plausibility import examine, report_findings, table_height, unreadable
+from mstfilter.scene.camera import Camera
+from mstfilter.scene.frame import Clip, Frame
+from mstfilter.scene.from_arrays import cameras_of, images_of, masks_of, seconds_of
+from mstfilter.scene.geometry import fit_support_plane, table_height, workspace
+from mstfilter.scene.pauses import PauseRule, indices_of, pauses_with_depth, rule_for
+from mstfilter.scene.plausibility import examine, report_findings, unreadable
 from mstfilter.scene.voxels import VoxelGrid, as_labels
-
-_NEAR_S = 0.25  # half of the time that the rule `still` demands of a pause
-_LONG = 20  # frames; more are probably not one clip
-
-
-class PauseRule(Bounded, ABC):
-    """Finds the pauses of a video. The package `mstfilter.formats` contains pause rules."""
-
-    @abstractmethod
-    def find(self, times: tuple[float, ...], read_rgb: Callable[[int], np.ndarray]) -> tuple[int, ...]:
-        """Ascending frame indices of the pauses.
-
-        `times` are the times of all frames in seconds. ``read_rgb(index)`` returns a colour image (H, W, 3) uint8.
-        """
-
-
-_rule_of_text = late("mstfilter.formats.sources:pause_rule", "The rule of a text.")
 
 
 class LazyFrames(Sequence[Frame]):
@@ -121,12 +104,12 @@ class Recording:
 
     def __post_init__(self) -> None:
         n, pauses = len(self.frames), tuple(int(p) for p in self.pauses)
-        object.__setattr__(self, "times", _in_seconds(self.times, self.name))
+        object.__setattr__(self, "times", seconds_of(self.times, n, self.name))
         if n == 0 or not pauses:
             raise InputError(f"recording {self.name} has {n} frames and {len(pauses)} pauses, expected at least 1")
         if list(pauses) != sorted(set(pauses)) or pauses[0] < 0 or pauses[-1] >= n:
             raise InputError(f"pauses of recording {self.name} are {pauses}, expected ascending indices below {n}")
-        if len(self.times) != n or not np.isfinite(self.times).all():
+        if not np.isfinite(self.times).all():
             raise InputError(f"times of recording {self.name} are not {n} ascending numbers")
         for k, (a, b) in enumerate(pairwise(self.times)):
             if b <= a:
@@ -189,68 +172,20 @@ class Recording:
         InputError
             If the arrays are invalid, or `examine` finds that no hypothesis can be correct.
         """
-        if depth is None:
-            raise InputError(
-                "depth is None: hypotheses in 3-D need a depth image for every colour image",
-                "record with an RGB-D camera, or estimate depth in metres with a program of your choice",
-            )
-        depth = [np.ma.filled(d, 0) for d in depth] if isinstance(depth, list | tuple) else np.ma.filled(depth, 0)
-        rgb, depth = _stacked(rgb, f"colour images of {name}"), _stacked(depth, f"depth images of {name}")
-        rgb = without_alpha(rgb)
-        if rgb.ndim == 3 and depth.ndim == 2:
-            rgb, depth = rgb[None], depth[None]
-            robot_masks = None if robot_masks is None else np.asarray(robot_masks)[None]
-        if rgb.ndim != 4 or rgb.shape[-1] != 3 or depth.shape != rgb.shape[:3]:
-            raise InputError(
-                f"rgb has shape {rgb.shape} and depth {depth.shape}, expected (T, H, W, 3) and (T, H, W)",
-                "one image is (H, W, 3) and (H, W); depth must be registered to the colour image",
-            )
-        if np.issubdtype(depth.dtype, np.integer):
-            raise InputError(
-                f"depth has type {depth.dtype}, expected metres as float",
-                "multiply raw readings by the depth scale: depth * 0.001 for millimetres",
-            )
+        rgb, depth = images_of(rgb, depth, name)
         n, height, width = depth.shape
-        if n == 0:
-            raise InputError(f"{name} has no frame")
-        for index, image in enumerate(depth):
-            check_depth(image, f"depth image of frame {index} of {name}")
-        cameras = _cameras(Camera(K, width, height), T_world_camera, n)
-        stamps = _in_seconds(times if times is not None else range(n), name)
-        if len(stamps) != n:
-            raise InputError(f"there are {len(stamps)} times for {n} frames of {name}")
-        if pauses is None and times is None and n > _LONG:
-            warn_user(
-                f"the {n} frames of {name} are one clip from the first to the last, since no pauses are given",
-                "give pauses=(0, 40, 85), or times in seconds: pauses are then found where nothing moves",
-            )
-        if pauses is None:
-            pauses = "still" if times is not None and n > 2 else "ends"
-        if isinstance(pauses, str):
-            pauses = _rule_of_text(pauses)
-        if isinstance(pauses, PauseRule):
-            pauses = pauses.find(stamps, lambda index: rgb[index])
-        listed = (pauses,) if isinstance(pauses, Integral) else pauses
-        for pause in listed:
-            hint = "a frame, counted from 0; from the end or in seconds as text: pauses='0,-1' or '0s,4.2s'"
-            check_integer(f"a pause of {name}", pause, hint, at_least=0)
-        chosen = tuple(int(p) for p in listed)
-        if not chosen or max(chosen) >= n:
-            raise InputError(f"pauses are {chosen}, expected indices of the {n} frames")
-        chosen = pauses_with_depth(
-            chosen, stamps, lambda k: bool(np.any(np.isfinite(depth[k]) & (depth[k] > 0))), name
-        )
-        some: Any = [None] * n if robot_masks is None else robot_masks
-        if len(some) != n:
-            shape = getattr(robot_masks, "shape", (len(some),))
-            raise InputError(f"robot_masks has shape {shape}, expected {depth.shape} of {name}")
-        masks = [None if mask is None else np.asarray(mask, dtype=bool) for mask in some]
+        masks = masks_of(robot_masks, depth, name)
+        cameras = cameras_of(Camera(K, width, height), T_world_camera, n)
+        stamps = seconds_of(times, n, name)
+        rule = rule_for(pauses, n, times is not None, name)
+        chosen = rule.find(stamps, lambda k: rgb[k]) if isinstance(rule, PauseRule) else indices_of(rule, n, name)
+        readings = lambda k: bool(np.any(np.isfinite(depth[k]) & (depth[k] > 0)))  # noqa: E731
+        chosen = pauses_with_depth(chosen, stamps, readings, name)
         frames = [Frame(*images) for images in zip(rgb, depth, cameras, masks, strict=True)]
-        first = frames[chosen[0]]
-        posed, grid = find_world(first, grid)
+        posed, grid, shift = find_world(frames[chosen[0]], grid)
         if T_world_camera is None:
             frames = [replace(frame, camera=posed) for frame in frames]
-        elif (shift := world_shift(first.camera, posed)) is not None:
+        elif shift is not None:
             frames = [replace(frame, camera=frame.camera.at(shift * frame.camera.pose)) for frame in frames]
         made = cls(frames, grid, chosen, stamps, name)
         made._examined  # noqa: B018
@@ -313,7 +248,7 @@ class Recording:
     @cached_property
     def _examined(self) -> None:
         """Check the frames at the pauses (`examine`), and warn or raise InputError. The checks run once."""
-        report_findings(examine(self.frames, self.pauses, self.grid, self.times), f"recording {self.name}")
+        report_findings(examine(self.frames, self.pauses, self.grid), f"recording {self.name}")
 
 
 class UsesFiles(ABC):
@@ -327,98 +262,31 @@ class UsesFiles(ABC):
         """Raise InputError before a run if a file is missing or cannot be used for a recording."""
 
 
-def _in_seconds(times: Sequence[Any], name: str) -> tuple[float, ...]:
-    """Times as numbers. Dates of NumPy become the seconds since the first date."""
-    stamps = np.asarray(times)
-    if stamps.size and stamps.dtype.kind in "mM":
-        stamps = (stamps - stamps[0]) / np.timedelta64(1, "s")
-    try:
-        return tuple(float(t) for t in stamps)
-    except (TypeError, ValueError) as error:
-        hint = "for datetime objects: [(t - times[0]).total_seconds() for t in times]"
-        raise InputError(f"times of {name} begin with {stamps.flat[0]!r}, expected seconds", hint) from error
-
-
-def _cameras(camera: Camera, poses: Any, n: int) -> list[Camera]:
-    """The camera of each of `n` frames, from one pose, no pose, or one pose for each frame."""
-    if poses is None:
-        return [camera] * n
-    listed = list(poses) if _stacked(poses, "the parts of T_world_camera").ndim in (1, 3) else [poses]
-    if len(listed) not in (1, n):
-        raise InputError(
-            f"T_world_camera has {len(listed)} poses for {n} frames",
-            "give one pose (4, 4), or one for each frame (T, 4, 4)",
-        )
-    rigid = [
-        pose if isinstance(pose, RigidTransform) else rigid_from_matrix(pose, f"T_world_camera of frame {k}")
-        for k, pose in enumerate(listed)
-    ]
-    return [camera.at(rigid[0])] * n if len(rigid) == 1 else [camera.at(pose) for pose in rigid]
-
-
-def _stacked(images: Any, what: str) -> np.ndarray:
-    """Stack images into one array. Raises InputError if the images have different shapes."""
-    try:
-        return np.asarray(images)
-    except ValueError as error:
-        shapes = sorted({np.shape(image) for image in images})
-        raise InputError(f"{what} have different shapes: {', '.join(map(str, shapes))}") from error
-
-
-def pauses_with_depth(
-    pauses: tuple[int, ...], times: Sequence[float], has_depth: Callable[[int], bool], name: str
-) -> tuple[int, ...]:
-    """The pauses, with frames that have depth readings at most a quarter of a second away instead of those without.
-
-    Cameras miss single depth images. A pause without such a frame remains, and is refused when it is examined.
-    """
-    chosen = list(pauses)
-    for k, pause in enumerate(pauses):
-        near = [i for i, t in enumerate(times) if abs(t - times[pause]) <= _NEAR_S and i not in chosen]
-        if near and not has_depth(pause):
-            near = [i for i in sorted(near, key=lambda i: round(abs(times[i] - times[pause]), 6)) if has_depth(i)]
-            if near:
-                chosen[k] = near[0]
-                text = f"frame {pause} of {name} has no depth reading: the pause is at frame {near[0]} instead"
-                warn_user(text, "the two are at most 0.25 s apart; list other pauses if the scene moves there")
-    return tuple(sorted(chosen))
-
-
-def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid]:
+def find_world(first: Frame, grid: VoxelGrid | float | None) -> tuple[Camera, VoxelGrid, RigidTransform | None]:
     """The camera with a pose, and the workspace. What is missing is computed from the `first` frame.
 
     The table of the returned world is at z = 0. If it is not in the world of the given pose, as in the world of a
-    robot's base, the world is shifted along z (`world_shift`).
+    robot's base, the world is shifted along z. The third value is the motion from the given world to the returned
+    one, or None if they are the same.
     """
     report_findings((finding for finding in unreadable(first, "the first pause") if finding.stop), "recording")
-    camera = first.camera
+    camera, shift = first.camera, None
     if camera.T_world_camera is None:
         camera = camera.at(fit_support_plane(first).T_world_camera)
     elif height := table_height(first):
-        shift = np.array([0.0, 0.0, -height])
-        camera = camera.at(RigidTransform.from_translation(shift) * camera.pose)
+        down = np.array([0.0, 0.0, -height])
+        camera = camera.at(RigidTransform.from_translation(down) * camera.pose)
+        shift = camera.pose * first.camera.pose.inv()
         if isinstance(grid, VoxelGrid) and abs(grid.origin[2]) > abs(grid.origin[2] - height):  # not yet on the table
-            grid = VoxelGrid(grid.origin + shift, grid.voxel_size, grid.shape)
+            grid = VoxelGrid(grid.origin + down, grid.voxel_size, grid.shape)
+        warn_user(
+            f"the table is at z = {height:.3f} m in the world of the given pose: the world is shifted, so it is at 0",
+            f"results are in the shifted world: add {height:.3f} m to z for the world of the given pose",
+            "if the table is at z = 0 in the world of the pose: check the pose, and the depth scale",
+        )
     if not isinstance(grid, VoxelGrid):
         grid = workspace(Frame(first.rgb, first.depth, camera, first.robot_mask), 0.01 if grid is None else grid)
-    return camera, grid
-
-
-def world_shift(given: Camera, found: Camera) -> RigidTransform | None:
-    """The motion from the world of a `given` camera to the world of the camera that `find_world` returns.
-
-    None if the world did not move, or the given camera has no pose. A warning notes a motion.
-    """
-    if given.T_world_camera is None or np.array_equal(given.position, found.position):
-        return None
-    shift = found.pose * given.pose.inv()
-    height = -shift.translation[2]
-    warn_user(
-        f"the table is at z = {height:.3f} m in the world of the given pose: the world is shifted, so z = 0 there",
-        f"results are in the shifted world: add {height:.3f} m to z for the world of the given pose",
-        "if the table is at z = 0 in the world of the pose: check the pose, and the depth scale",
-    )
-    return shift
+    return camera, grid, shift
 
 
 def truth_reader(

@@ -215,7 +215,7 @@ class ObjectView:
     key: str  #: key of the contents
     #: Rigid motion of the object in world metres since the frame.
     motion: RigidTransform = field(default_factory=lambda: _NO_MOTION)
-    #: (n,) float32, visible area of each colour (`mstfilter.mst.completion.observed.areas_of_colours`); may be empty.
+    #: (n,) float32, visible area of each colour (`mstfilter.scene.areas_of_colours`); may be empty.
     colours: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def moved(self, T: RigidTransform) -> ObjectView:

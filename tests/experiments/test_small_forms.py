@@ -11,8 +11,8 @@ import pytest
 from mstfilter.base.files import read_csv
 from mstfilter.base.resources import models_folder
 from mstfilter.base.trained import open_model
+from mstfilter.formats import read_rgb
 from mstfilter.mst.segmentation import FEATURES, LearnedTree, PairNetwork
-from mstfilter.scene import read_rgb
 from tests.conftest import find_shared
 from tests.experiments.scripts import EXPERIMENTS, run_script
 

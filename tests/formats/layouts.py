@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from mstfilter.scene import write_image
+from mstfilter.formats import write_image
 from tests.scene.scenes import CAMERA, table_scene
 
 K = (131.0, 131.0, 79.5, 59.5)

@@ -12,9 +12,10 @@ import pytest
 
 from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.formats import open_recording
-from mstfilter.formats.bag import Bag, colour_image, depth_image
+from mstfilter.formats.bag import Bag
 from mstfilter.formats.folder import save_recording
 from mstfilter.formats.pauses import Ends
+from mstfilter.formats.ros_images import colour_image, depth_image
 from tests.formats.bags import COLOUR, DEPTH, KINDS, Messages, png, scene_messages, topic_info, write
 from tests.formats.layouts import FPS, PAUSES, SHIFTS, K, units, video
 from tests.formats.test_layouts import WORLD, same_frames

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats.image_folders import PairedImages, Redwood
+from mstfilter.formats import PairedImages, Redwood, write_image
 from mstfilter.formats.sources import detect_format, format_settings, open_recording
 from mstfilter.runs.presets import REGISTRY
-from mstfilter.scene import render, write_image
+from mstfilter.scene import render
 from tests.formats import layouts
 from tests.scene.scenes import CAMERA, GRID, table_scene
 from tests.scene.test_recording import write

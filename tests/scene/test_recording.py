@@ -13,18 +13,16 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats import PairedImages, RecordingWriter, open_recording, save_recording
-from mstfilter.scene import (
-    TABLE_TOLERANCE,
-    Frame,
-    Hypothesis,
-    check_grid,
-    find_world,
+from mstfilter.formats import (
+    PairedImages,
+    RecordingWriter,
+    open_recording,
     read_depth,
     read_rgb,
-    render,
+    save_recording,
     write_image,
 )
+from mstfilter.scene import TABLE_TOLERANCE, Frame, Hypothesis, check_grid, find_world, render
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.geometry import fit_support_plane, table_residual, workspace
 from mstfilter.scene.recording import Recording
@@ -494,7 +492,7 @@ def test_the_floor_and_a_tray_do_not_shift_the_world():
     tray = depth * (CAMERA.position[2] - 0.06) / CAMERA.position[2]
     for other, inside in ((floor, np.abs(points[..., :2]).max(axis=-1) < 0.25), (tray, points[..., 1] > 0.05)):
         changed = np.where(inside | (points[..., 2] > 0.02), depth, other).astype(np.float32)
-        camera, _ = find_world(Frame(rgb, changed, CAMERA), GRID)
+        camera, _, _ = find_world(Frame(rgb, changed, CAMERA), GRID)
         assert camera is CAMERA
 
 

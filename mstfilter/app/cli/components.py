@@ -75,7 +75,7 @@ def check(
 
 def _subject(name: str, overrides: list[str]) -> Any:
     """What `check` tests: the component with the given fields, or the model of a file."""
-    from mstfilter.base.registry import load_attribute
+    from mstfilter.base.user_files import load_attribute
     from mstfilter.mst.testing import is_model
     from mstfilter.runs.presets import REGISTRY, settings
 
@@ -99,7 +99,7 @@ def _subject(name: str, overrides: list[str]) -> Any:
 
 def _observations(name: str) -> list[Any]:
     """The observations of a run, from an .npy file or a sequence in a Python file."""
-    from mstfilter.base.registry import load_attribute
+    from mstfilter.base.user_files import load_attribute
     from mstfilter.smc.inputs import check_observations
 
     if ".py:" in name:

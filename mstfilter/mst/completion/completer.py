@@ -32,14 +32,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.results import Checked, check_list, check_probabilities, check_type, returns, warn_once
-from mstfilter.mst.completion.observed import ObservedBox, areas_of_colours, enclosing_box, encode_box, observed_again
+from mstfilter.base.results import check_list, check_probabilities, check_type, returns, warn_once
+from mstfilter.mst.completion.observed import ObservedBox, SurfaceRule, encode_box, observed_again
 from mstfilter.scene import (
     Clip,
     Frame,
     ObjectView,
     Occupancy,
     VoxelGrid,
+    areas_of_colours,
     component_key,
     content_key,
     memo_many,
@@ -96,28 +97,9 @@ def _check_completions(
 
 
 @dataclass(frozen=True)
-class Completer(Checked, ABC):
-    """Estimates the hidden part of objects.
+class Completer(SurfaceRule, ABC):
+    """Estimates the hidden part of objects. Parameters: `SurfaceRule`, which says what a frame shows of an object."""
 
-    Parameters
-    ----------
-    in_front, depth : float
-        A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
-        less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
-        would be half a voxel larger on all sides. On rendered boxes, the volume would be 1.41 instead of 1.13 times
-        the true volume, and the quality .71 instead of .82. The defaults were chosen on rendered boxes.
-    free_margin, free_sigmas : float
-        A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
-        of the depth reading, in front of the measured surface.
-    """
-
-    in_front: float = 0.2
-    depth: float = 1.5
-    free_margin: float = 0.5
-    free_sigmas: float = 3.0
-
-    #: Voxels around the visible part that `fill` may use, besides all those below it.
-    padding: ClassVar[int] = 0
     #: Whether `fill` draws random numbers. The result is then not reused for the next hypothesis.
     stochastic: ClassVar[bool] = False
 
@@ -155,11 +137,6 @@ class Completer(Checked, ABC):
     def at(self, clip: Clip) -> Completer:
         """The completer of the clip's last frame: the completer itself, unless it is a `ClipCompleter`."""
         return self
-
-    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the voxel after the box."""
-        # The surface may reach `depth` voxels behind the readings.
-        return enclosing_box(voxels, grid, max(self.padding, int(np.ceil(self.depth))))
 
     def complete(
         self, rng: np.random.Generator, frame: Frame, masks: Sequence[np.ndarray], grid: VoxelGrid

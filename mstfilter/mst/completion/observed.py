@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from mstfilter.base.results import Checked
 from mstfilter.scene import (
     Frame,
     ObjectView,
@@ -26,13 +27,11 @@ from mstfilter.scene import (
     VoxelGrid,
     depth_sigma,
     frame_geometry,
+    frame_points,
     memo,
     read_only,
     scaled_area,
 )
-
-if TYPE_CHECKING:
-    from mstfilter.mst.completion.completer import Completer
 
 _REACH = 4.0  # voxels, distance from the surface at which `signed` saturates
 _SHAPE = Seen.SURFACE | Seen.FREE | Seen.BEHIND  # what is evidence about the object's shape
@@ -41,6 +40,36 @@ _SHAPE = Seen.SURFACE | Seen.FREE | Seen.BEHIND  # what is evidence about the ob
 # free in it, and of its surface that is seen now.
 _CLEARED, _PIERCED, _SEEN = 0.2, 0.15, 0.05
 _CLEAR = 1.0  # voxels: space of an earlier frame is free if it lay this far in front of the surface
+
+
+@dataclass(frozen=True)
+class SurfaceRule(Checked):
+    """Which voxels of a mask are visible surface, which voxels are free, and which box surrounds the mask.
+
+    Parameters
+    ----------
+    in_front, depth : float
+        A voxel is visible surface if its centre is at most `in_front` voxels in front of the measured surface, and
+        less than `depth` voxels behind it, along the optical axis. If all voxels with readings were surface, objects
+        would be half a voxel larger on all sides. On rendered boxes, the volume would be 1.41 instead of 1.13 times
+        the true volume, and the quality .71 instead of .82. The defaults were chosen on rendered boxes.
+    free_margin, free_sigmas : float
+        A voxel is free if its centre is at least `free_margin` voxels, and at least `free_sigmas` standard deviations
+        of the depth reading, in front of the measured surface.
+    """
+
+    in_front: float = 0.2
+    depth: float = 1.5
+    free_margin: float = 0.5
+    free_sigmas: float = 3.0
+
+    #: Voxels around the visible part that belong to the box, besides all those below it.
+    padding: ClassVar[int] = 0
+
+    def box(self, voxels: np.ndarray, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+        """First voxel (3,) of the box of a mask with readings in `voxels` (k, 3), and the voxel after the box."""
+        # The surface may reach `depth` voxels behind the readings.
+        return enclosing_box(voxels, grid, max(self.padding, int(np.ceil(self.depth))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +95,9 @@ class ObservedBox:
             object.__setattr__(self, f.name, read_only(getattr(self, f.name)))
 
 
-def observed_box(frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer) -> tuple[np.ndarray, ObservedBox]:
+def observed_box(
+    frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: SurfaceRule
+) -> tuple[np.ndarray, ObservedBox]:
     """The box of a mask: its offset (3,) in the grid, and the observation of the box by the frame.
 
     `rule` defines the size of the box, and which voxels are visible surface and free space.
@@ -82,7 +113,7 @@ def mask_voxels(frame: Frame, mask: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 
 
 def observed_in(
-    frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: Completer, low: np.ndarray, high: np.ndarray
+    frame: Frame, mask: np.ndarray, grid: VoxelGrid, rule: SurfaceRule, low: np.ndarray, high: np.ndarray
 ) -> ObservedBox:
     """What a frame shows of the object of a mask, in the box from voxel `low` to `high`. The mask may be empty."""
     box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
@@ -107,17 +138,6 @@ def observed_in(
     other = surface & ~inside & ~in_mask
     distance = signed / np.float32(grid.voxel_size)
     return ObservedBox(points, in_mask, other, free, behind & inside, behind & ~inside, distance, height)
-
-
-def frame_points(frame: Frame, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices (k,) of the pixels with a reading inside the grid, and the voxels (k, 3) of these readings."""
-
-    def compute() -> tuple[np.ndarray, np.ndarray]:
-        index = grid.index_of(frame.points)
-        pixels = np.flatnonzero(frame.valid & grid.contains(index))
-        return read_only(pixels), read_only(index.reshape(-1, 3)[pixels].astype(np.int32))
-
-    return memo("frame_points", (frame.key, grid.key), compute)
 
 
 def _free(frame: Frame, grid: VoxelGrid, margin: float, sigmas: float) -> np.ndarray:
@@ -150,32 +170,13 @@ def decode_signed(signed: np.ndarray) -> np.ndarray:
     return np.asarray(signed, np.float32) * np.float32(_REACH / 127)
 
 
-_BINS, _LOWEST, _WIDTH = (4, 6, 6), (0.0, -48.0, -48.0), (25.0, 16.0, 16.0)  # of Lab colours
-
-
-def areas_of_colours(frame: Frame, mask: np.ndarray) -> np.ndarray:
-    """Visible area (144,) float32 in square metres of each colour in a mask (H, W) bool of a frame.
-
-    The colours are 4 x 6 x 6 bins of Lab colours. A pixel is divided between the nearest bins. The area is that of a
-    surface that faces the camera.
-    """
-    import cv2
-
-    areas = np.zeros(_BINS)
-    rgb, depth = frame.rgb[mask], frame.depth[mask & frame.valid]
-    if not len(depth):
-        return areas.ravel().astype(np.float32)
-    lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
-    at = np.clip((lab - _LOWEST) / _WIDTH - 0.5, 0, np.array(_BINS) - 1)
-    low = np.minimum(at.astype(np.int64), np.array(_BINS) - 2)
-    for corner in np.ndindex(2, 2, 2):
-        np.add.at(areas, tuple((low + corner).T), np.where(corner, at - low, 1 - (at - low)).prod(axis=1))
-    pixel = float(np.median(depth)) ** 2 / (frame.camera.K[0, 0] * frame.camera.K[1, 1])
-    return (pixel * areas.ravel()).astype(np.float32)
-
-
 def observed_again(
-    frame: Frame, mask: np.ndarray, views: Sequence[ObjectView], grid: VoxelGrid, rule: Completer, refute: bool = True
+    frame: Frame,
+    mask: np.ndarray,
+    views: Sequence[ObjectView],
+    grid: VoxelGrid,
+    rule: SurfaceRule,
+    refute: bool = True,
 ) -> tuple[np.ndarray, ObservedBox, ObservedBox, tuple[ObjectView, ...]]:
     """The box of a mask and of earlier views of the object. The mask may be empty.
 

@@ -21,7 +21,6 @@ from mstfilter.base.files import reading
 from mstfilter.base.lazy import import_open3d
 from mstfilter.base.reading import MAX_FILE, read_bytes, unpack_arrays
 from mstfilter.mst.completion import ClipCompleter, Completer, Completion, SurfaceOnly, observed_box
-from mstfilter.mst.completion.observed import frame_points
 from mstfilter.mst.frontends.mask_files import read_label_image, read_weights
 from mstfilter.scene import (
     Camera,
@@ -33,6 +32,7 @@ from mstfilter.scene import (
     VoxelGrid,
     component_key,
     content_key,
+    frame_points,
     memo,
     occupied_box,
 )

@@ -22,9 +22,10 @@ import numpy as np
 from mstfilter.base.errors import InputError, naming
 from mstfilter.base.files import atomic_folder, locked, reading, write_text
 from mstfilter.base.reading import MAX_FILE, read_bytes, read_json, unpack_arrays
+from mstfilter.formats import read_labels
 from mstfilter.mst.frontends.mask_trees import label_tree, mask_tree
 from mstfilter.mst.segmentation import Tree
-from mstfilter.scene import content_key, memo, read_labels
+from mstfilter.scene import content_key, memo
 
 MAX_MASKS = 65535  #: Largest label, and largest number of masks in a file
 _SUFFIXES = (".png", ".npz")

@@ -44,8 +44,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from mstfilter.base.results import Checked, check_array, returns
-from mstfilter.mst.completion.observed import frame_points
-from mstfilter.scene import Clip, Frame, VoxelGrid, canonical, common_refinement, scaled_area
+from mstfilter.scene import Clip, Frame, VoxelGrid, canonical, common_refinement, frame_points, scaled_area
 
 _LEAST_READINGS = 60  # of a region in an image of 640 x 480 pixels, as `ObjectRule.min_points`
 _SOFT = 0.02  # shares of samples and predictions are softened by as much

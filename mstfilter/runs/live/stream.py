@@ -37,21 +37,18 @@ from mstfilter.scene import (
     WORKING_PIXELS,
     Camera,
     Clip,
-    Finding,
     Frame,
     Hypothesis,
     Look,
     VoxelGrid,
     check_depth,
     examine,
-    examine_hypotheses,
     examine_next,
     find_world,
     render_hypothesis,
     report_findings,
     rigid_from_matrix,
     scene_cache,
-    world_shift,
 )
 from mstfilter.smc import Info, ParticleFilter, State
 
@@ -153,7 +150,6 @@ class Stream:
         self._shift: RigidTransform | None = None  # of the world of given poses, so that its table is at z = 0
         self._first: Look | None = None  # what the first pause shows
         self._reported: set[tuple[str, ...]] = set()
-        self._doubts: list[Finding] = []  # about the hypotheses
         self._clip: list[_Item] = []
         self._trackers: list[Any] = []
         self._n_pauses = 0
@@ -372,32 +368,31 @@ class Stream:
                 if self._step is None:
                     self._step = self._pool.submit(self._load, item.frame, self._state)
                 return
-            self._world, self._grid = find_world(item.frame, self._grid)
-            self._shift = world_shift(item.frame.camera, self._world)
+            self._world, self._grid, self._shift = find_world(item.frame, self._grid)
         camera = item.frame.camera
         if camera.T_world_camera is None:
             item = replace(item, frame=replace(item.frame, camera=self._world))
         elif self._shift is not None:
             item = replace(item, frame=replace(item.frame, camera=camera.at(self._shift * camera.pose)))
         if rests and not self._clip:
-            self._examine(item, [item.time])  # an error ends the stream before the first step
+            self._examine(item)  # an error ends the stream before the first step
         self._clip.append(item)
         for tracker in self._trackers:
             tracker.add(item.frame)
         if rests:
-            times = [one.time for one in self._clip]
+            first = len(self._clip) == 1
             self._end_clip()
-            if len(times) > 1:
-                self._examine(item, times)
+            if not first:
+                self._examine(item)
         elif len(self._clip) >= self._max:
             self._thin()
 
-    def _examine(self, item: _Item, times: list[float]) -> None:
+    def _examine(self, item: _Item) -> None:
         """Compare the frame of a pause with the first pause. A fault gives one warning, not one at every pause."""
         grid = self._grid
         assert isinstance(grid, VoxelGrid)
         look, first = Look(item.frame, grid, item.number), self._first
-        found = examine([item.frame], [0], grid) if first is None else examine_next(first, look, times)
+        found = examine([item.frame], [0], grid) if first is None else examine_next(first, look)
         self._first = first or look
         found = [one for one in found if one.stop or one.hints not in self._reported]
         self._reported.update(one.hints for one in found)
@@ -439,7 +434,7 @@ class Stream:
     def _load(self, frame: Frame, state: State) -> None:
         """Filter a frame before the first pause to load libraries and networks, and discard the result."""
         with contextlib.suppress(Exception):  # the frame need not show the scene at rest
-            camera, grid = find_world(frame, self._grid)
+            camera, grid, _ = find_world(frame, self._grid)
             self._filter.step(state, Clip([replace(frame, camera=camera)], grid))
 
     def _filter_clip(self, clip: Clip, items: tuple[_Item, ...], trackers: tuple[Any, ...]) -> None:
@@ -453,9 +448,6 @@ class Stream:
             self.last = Pause(clip.index, clip, numbers, self._state, info, latency, dict(self.counts))
             if self._on_pause is not None:
                 self._on_pause(self.last)
-            if not self._doubts and self._state.population is not None:  # said once
-                self._doubts = examine_hypotheses(self.hypotheses, clip.after)
-                report_findings(self._doubts, f"pause {clip.index} of the stream")
             if self._flows:
                 for hypothesis in self.hypotheses:  # cached, since the next step tracks what is visible now
                     render_hypothesis(hypothesis, clip.after.camera)

@@ -15,8 +15,8 @@ import pytest
 
 from mstfilter.app.report import recording_page, run_page, viewer, write_report
 from mstfilter.base.errors import InputError
-from mstfilter.formats import save_recording
-from mstfilter.scene import Hypothesis, VoxelGrid, read_rgb
+from mstfilter.formats import read_rgb, save_recording
+from mstfilter.scene import Hypothesis, VoxelGrid
 from tests.app.report.pages import check_html
 from tests.app.report.runs import GRID, make_run, recording, truth_at
 from tests.app.test_cli import call

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mstfilter.base.registry import load_file
 from mstfilter.base.resources import models_folder
+from mstfilter.base.user_files import load_file
 from mstfilter.mst.testing import scene_example
 from mstfilter.runs.presets import preset
 from mstfilter.scene import Clip, Frame, Hypothesis, render

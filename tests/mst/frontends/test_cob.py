@@ -13,8 +13,8 @@ import pytest
 from scipy import ndimage
 
 from mstfilter.base.errors import InputError
-from mstfilter.base.registry import load_file
 from mstfilter.base.resources import models_folder
+from mstfilter.base.user_files import load_file
 from mstfilter.mst.segmentation import OptimalCut, SceneCutObjectness, TreeCutProposal
 from tests.mst.segmentation.scenes import TWO, clip_of, frame_of
 

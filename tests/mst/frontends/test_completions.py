@@ -10,10 +10,11 @@ import pytest
 
 from mstfilter.base.errors import InputError, MissingLibraryError
 from mstfilter.base.lazy import import_open3d
+from mstfilter.formats import write_image
 from mstfilter.mst.completion import Extrude
 from mstfilter.mst.frontends import ExternalCompletion, MaskProposal, write_masks
 from mstfilter.mst.frontends.completions import place_shape
-from mstfilter.scene import render, write_image
+from mstfilter.scene import render
 from tests.mst.segmentation.scenes import GRID, boxes, clip_of
 
 SCENE = boxes(((8, 20, 0), (20, 34, 12)), ((34, 22, 0), (46, 36, 8)))

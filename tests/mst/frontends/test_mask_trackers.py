@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from mstfilter.base.errors import InputError, MissingLibraryError
-from mstfilter.base.registry import load_file
 from mstfilter.base.resources import models_folder
+from mstfilter.base.user_files import load_file
+from mstfilter.formats import read_rgb
 from mstfilter.mst.testing import scene_example
 from mstfilter.mst.testing.scenes import _labels
 from mstfilter.mst.tracking import MaskTracker, PaperRule, StaticTest, TrackingTransition
-from mstfilter.scene import Camera, Clip, Frame, Hypothesis, read_rgb, render
+from mstfilter.scene import Camera, Clip, Frame, Hypothesis, render
 from mstfilter.smc import Population
 from tests.mst.segmentation.scenes import GRID
 

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import chisquare
 
 from mstfilter.base.errors import InputError, InputWarning
+from mstfilter.formats import write_image
 from mstfilter.mst.completion import Extrude
 from mstfilter.mst.frontends import (
     MaskProposal,
@@ -28,7 +29,7 @@ from mstfilter.mst.segmentation import ExactCuts, ObjectRule
 from mstfilter.mst.testing import scene_example
 from mstfilter.mst.testing.scenes import _labels
 from mstfilter.runs.presets import preset
-from mstfilter.scene import Recording, project, render, scene_cache, write_image
+from mstfilter.scene import Recording, project, render, scene_cache
 from mstfilter.smc.testing import ProposalContract
 from tests.mst.segmentation.scenes import GRID, boxes, clip_of
 

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mstfilter.mst.completion.observed import areas_of_colours
 from mstfilter.mst.partition import Overlaps
 from mstfilter.mst.partition.association import recognised
-from mstfilter.scene import Camera, Frame, ObjectRecord, ObjectView
+from mstfilter.scene import Camera, Frame, ObjectRecord, ObjectView, areas_of_colours
 
 
 def overlaps_of(segments, objects, least):

@@ -18,11 +18,11 @@ from scipy.spatial.transform import RigidTransform
 import mstfilter
 from mstfilter.app.report import write_report
 from mstfilter.base.errors import InputError, InputWarning
-from mstfilter.formats import Redwood, Settled, Still, open_format
+from mstfilter.formats import Redwood, Settled, Still, open_format, write_image
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.runs.live import filter_folder
 from mstfilter.runs.presets import load_config
-from mstfilter.scene import Finding, Recording, encode_hypotheses, scene_cache, write_image
+from mstfilter.scene import Recording, encode_hypotheses, scene_cache
 from mstfilter.smc import Proposal
 from tests.formats.layouts import FPS, SHIFTS, video, write_redwood
 from tests.scene.scenes import CAMERA, GRID
@@ -255,7 +255,7 @@ def test_a_live_folder_has_the_robot_masks(tmp_path):
 
 
 def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
+    monkeypatch.setattr("mstfilter.formats.redwood._PARTNER_S", 0.6)
     path = write_redwood(tmp_path / "data", (0, 1, 2, 3, 4))
     late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
     (path / "depth" / "00003.png").write_bytes(b"no image")
@@ -272,7 +272,7 @@ def test_a_live_folder_waits_for_late_images_and_skips_what_it_cannot_read(tmp_p
 @pytest.mark.parametrize("hours", [-5, 5])
 def test_a_live_folder_does_not_trust_the_times_of_files(tmp_path, monkeypatch, hours):
     """Files of a computer whose clock differs: without the depth image of frame 1, the others are read."""
-    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 0.6)
+    monkeypatch.setattr("mstfilter.formats.redwood._PARTNER_S", 0.6)
     path = write_redwood(tmp_path / "data", (0, 1, 2, 3))
     late = (path / "depth" / "00001.png").rename(tmp_path / "late.png")
     when = time.time() + 3600 * hours
@@ -281,7 +281,7 @@ def test_a_live_folder_does_not_trust_the_times_of_files(tmp_path, monkeypatch, 
     times = [when for when, _ in Redwood(fps=10).arriving(path, idle_s=5)]
     assert times == pytest.approx([0, 0.1, 0.2])
     threading.Timer(0.1, lambda: late.rename(path / "depth" / "00001.png")).start()
-    monkeypatch.setattr("mstfilter.formats.image_folders._PARTNER_S", 60)
+    monkeypatch.setattr("mstfilter.formats.redwood._PARTNER_S", 60)
     assert len(list(Redwood(fps=10).arriving(path, idle_s=5))) == 4
 
 
@@ -317,18 +317,6 @@ def test_all_frames_have_poses_or_none():
             with pytest.raises(InputError, match=f"frame 1 has {'no' if second is None else 'a'} pose"):
                 stream.push(RGB[1], DEPTH[1], 1.0, pose=second)
             assert stream.push(RGB[1], DEPTH[1], 2.0, pose=first)
-
-
-def test_doubts_about_the_hypotheses_are_said_once(monkeypatch):
-    doubt = Finding(False, "an object is the table", ())
-    monkeypatch.setattr("mstfilter.runs.live.stream.examine_hypotheses", lambda hypotheses, frame: [doubt])
-    with warnings.catch_warnings(record=True) as caught, mstfilter.Stream(CAMERA.K, FAST, pauses=None) as stream:
-        warnings.simplefilter("always")
-        for k in range(2):
-            stream.push(RGB[k], DEPTH[k], float(k), pause=True)
-        stream.wait()
-    said = [str(one.message) for one in caught if one.category is InputWarning]
-    assert [text for text in said if "the table" in text] == ["pause 0 of the stream: an object is the table"]
 
 
 def test_an_error_while_libraries_are_loaded_is_no_error_of_the_stream():
