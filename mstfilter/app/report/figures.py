@@ -268,7 +268,7 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
 def differences_figure(
     differences: Sequence[tuple[str, str, Difference]], arms: Sequence[str], reference: str, measure: str, side: str
 ) -> str:
-    """Differences of a measure between compared methods and the reference, with t intervals, by family.
+    """Differences of a measure between compared methods and the reference, with their intervals, by family.
 
     An entry of `differences` is (family, arm, arm minus reference). `arms` lists all compared methods, in the order
     of the colours. `side` is the side of zero on which the reference is better, "left" or "right".
