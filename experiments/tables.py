@@ -10,9 +10,9 @@ these files of all families, in the folder `rows` beside the TOML file.
 
 The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
 scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
-minus the reference in the primary endpoints: unadjusted bootstrap interval, p value of sign flips, p after Holm over
-endpoints, families and arms, and the conclusion (see `mstfilter.scoring.statistics`). The differences are also printed
-as tables for the README, with a warning if an arm has fewer scenes than the reference. NAME_cases.csv has the quality
+minus the reference in the primary endpoints: bootstrap interval, p value of sign flips, p after Holm over endpoints,
+families and arms, and the conclusion (see `mstfilter.scoring.statistics`). The differences are also printed as tables
+for the README, with a warning if an arm has fewer scenes than the reference. NAME_cases.csv has the quality
 of visible, hidden and never seen objects, averaged over cases (one object at one pause t >= 1). NAME_time.csv has the
 core seconds of steps t >= 1. They differ between the first filter seed, in which an arm may be the first to process a
 recording, and later seeds, which find shared results in the memory of the worker. With --pooled,

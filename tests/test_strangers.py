@@ -205,10 +205,12 @@ def start(what: str) -> None:
         model = linear_gaussian(*[[[1.0]]] * 4, m0=[0.0], P0=[[1.0]])
         run_many({"a": bootstrap(model, n=10)}, [[0.0], [1.0]], seeds=[0, 1], workers=2)
     else:
-        from mstfilter.runs.study import Local
+        from mstfilter.runs.study.worker import Worker
 
-        outcomes = Local(workers=1).run([{"kind": "none"}], print)
-        assert outcomes[0].status == "failed" and "kind" not in outcomes[0].error, outcomes
+        worker = Worker(Path(sys.argv[0]).with_suffix(".log"))
+        outcome = worker.perform({"code": "none", "tries": 1, "timeout_s": 0, "cwd": os.getcwd()})
+        worker.close()
+        assert outcome.error.startswith("this process has other code"), outcome
 
 
 @pytest.mark.parametrize("what", ["run_many", "study"])

@@ -20,7 +20,7 @@ instead, so look at them before you trust a small p value: `experiments/comparis
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -51,6 +51,8 @@ class Difference:
         Number of units for which both methods have a value.
     p_holm : float
         `p` adjusted for all comparisons of the table. For a single comparison it is `p`.
+    values : tuple of float
+        The difference of each unit.
     """
 
     mean: float
@@ -59,6 +61,7 @@ class Difference:
     p: float
     n: int
     p_holm: float = float("nan")
+    values: tuple[float, ...] = field(default=(), repr=False)
 
     @property
     def is_claim(self) -> bool:
@@ -96,7 +99,7 @@ def compare(first: Values, second: Values) -> Difference:
         d = a - b
     d = d[np.isfinite(d)]
     mean, p = float(d.mean()) if len(d) else float("nan"), sign_flip(d)
-    return Difference(mean, *interval(d), p, len(d), p)
+    return Difference(mean, *interval(d), p, len(d), p, tuple(d.tolist()))
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
