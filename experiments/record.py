@@ -29,8 +29,6 @@ rare case, needs the study.
 from __future__ import annotations
 
 import argparse
-import ast
-import hashlib
 import os
 import re
 import shutil
@@ -41,17 +39,17 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
-from functools import cache
 from pathlib import Path
 from typing import Any
 
+from mstfilter.base.code import hash_of_files
 from mstfilter.base.processes import machine
 from mstfilter.base.reading import read_json
-from mstfilter.runs import library_versions, write_json
+from mstfilter.runs import WITHOUT_RESULTS, library_versions, write_json
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PROGRAM = ("mstfilter", "models")
-NO_RESULTS = tuple(f"mstfilter/{name}/" for name in ("app", "runs/live", "mst/testing", "smc/testing"))
+NO_RESULTS = tuple(f"mstfilter/{name}" for name in WITHOUT_RESULTS)
 
 
 @dataclass(frozen=True)
@@ -183,10 +181,7 @@ def _head() -> str:
 
 def _hash(root: Path, *places: str) -> str:
     """A hash of the files of some places that change results."""
-    digest = hashlib.sha256()
-    for name in sorted({name for place in places for name in _files(root, place)}):
-        digest.update(name.encode() + b"\0" + _content(root / name))
-    return digest.hexdigest()[:16]
+    return hash_of_files(root, {name for place in places for name in _files(root, place)})
 
 
 def _files(root: Path, place: str) -> Iterator[str]:
@@ -196,26 +191,6 @@ def _files(root: Path, place: str) -> Iterator[str]:
         is_code = file.suffix in (".py", ".toml", ".safetensors") or file.name == "weights.json"
         if is_code and not name.startswith(NO_RESULTS):
             yield name
-
-
-def _content(path: Path) -> bytes:
-    """The bytes of a file; of Python code, the syntax tree without docstrings and version number."""
-    return _syntax(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
-
-
-@cache  # most studies depend on the same files
-def _syntax(code: bytes) -> bytes:
-    tree = ast.parse(code)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-            del node.body[0]
-    tree.body = [node for node in tree.body if not _is_version(node)]
-    return ast.dump(tree).encode()
-
-
-def _is_version(node: ast.stmt) -> bool:
-    """Whether a statement sets the version number: a release alone makes no result older."""
-    return isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__version__"
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -10,12 +10,12 @@ these files of all families, in the folder `rows` beside the TOML file.
 
 The names of the files start with the name of the study. NAME.csv has one row per family and arm, with means over
 scenes and pauses t >= 1. NAME_scenes.csv has the primary endpoints of each scene. NAME_differences.csv has the arm
-minus the reference in the primary endpoints: unadjusted t interval, studentised bootstrap, both p values, skewness, p
-after Holm over endpoints, families and arms, and the conclusion (see `mstfilter.scoring.statistics`). The differences
-are also printed as tables for the README, with a warning if an arm has fewer scenes than the reference.
-NAME_cases.csv has the quality of visible, hidden and never seen objects, averaged over cases (one object at one pause
-t >= 1). NAME_time.csv has the core seconds of steps t >= 1. They differ between the first filter seed, in which an
-arm may be the first to process a recording, and later seeds, which use shared results on disk. With --pooled,
+minus the reference in the primary endpoints: bootstrap interval, p value of sign flips, p after Holm over endpoints,
+families and arms, and the conclusion (see `mstfilter.scoring.statistics`). The differences are also printed as tables
+for the README, with a warning if an arm has fewer scenes than the reference. NAME_cases.csv has the quality
+of visible, hidden and never seen objects, averaged over cases (one object at one pause t >= 1). NAME_time.csv has the
+core seconds of steps t >= 1. They differ between the first filter seed, in which an arm may be the first to process a
+recording, and later seeds, which find shared results in the memory of the worker. With --pooled,
 NAME_pooled_differences.csv has the differences over the scenes of all families together, and
 NAME_pooled_described.csv has these differences in further metrics. NAME_pooled_pauses.csv has the means by pause, and
 the change from pause 1 to the last pause with its 95 % interval over scenes.
@@ -110,8 +110,7 @@ def differences(found: Summary, metrics: Iterable[str] = ENDPOINTS) -> list[dict
                 "n": str(d.n),
                 "mean": f"{d.mean:.4f}",
             }
-            row |= {name: f"{getattr(d, name):.4f}" for name in ("low", "high", "low_bootstrap", "high_bootstrap")}
-            row |= {name: f"{getattr(d, name):.4g}" for name in ("p", "p_bootstrap", "skewness", "p_holm")}
+            row |= {"low": f"{d.low:.4f}", "high": f"{d.high:.4f}", "p": f"{d.p:.4g}", "p_holm": f"{d.p_holm:.4g}"}
             lines.append(row | {"conclusion": c.words if c.adjusted else ""})
     return lines
 

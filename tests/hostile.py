@@ -36,7 +36,6 @@ from mstfilter.mst.frontends.completions import place_shape, read_shapes
 from mstfilter.runs import RunFolder
 from mstfilter.runs.presets import build_filter, load_config
 from mstfilter.runs.study import StudyFolder, check_arm_names, load_study
-from mstfilter.scene import DiskCache
 from mstfilter.scoring import NO_COUNTS
 from mstfilter.smc import Key, Population, State, load_state, save_state
 from tests.app.report.runs import make_run
@@ -189,21 +188,6 @@ def _read_checkpoint(path: Path) -> None:
     load_state(path / "state.npz")
 
 
-def _write_cache(path: Path) -> None:
-    cache = DiskCache(path, 10**8, "1")
-    cache.store("small", 1, np.zeros(10))
-    cache.store("large", 2, np.zeros(10**5))
-    cache.close()
-
-
-def _read_cache(path: Path) -> None:
-    cache = DiskCache(path, 10**8, "1")
-    for name, key in (("small", 1), ("large", 2)):
-        cache.find(name, key, np.ndarray)
-        cache.store(name, key, np.ones(10**5))
-    cache.close()
-
-
 #: Every kind of input, by name.
 KINDS = {
     "recording": Kind(_write_recording, _reader("")),
@@ -216,7 +200,6 @@ KINDS = {
     "masks": Kind(_write_masks, _read_masks),
     "shapes": Kind(_write_shapes, _read_shapes),
     "checkpoint": Kind(_write_checkpoint, _read_checkpoint),
-    "cache": Kind(_write_cache, _read_cache),
     "tum": Kind(_layout("tum"), _reader("tum", "K=131,131,79.5,59.5", "pauses=every")),
     "redwood": Kind(_layout("redwood"), _reader("redwood", "pauses=every")),
     "bag": Kind(_bag("bag"), _read_bag),

@@ -8,10 +8,8 @@ import json
 import os
 import resource
 import signal
-import sqlite3
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -22,11 +20,10 @@ from mstfilter.app.cli import main
 from mstfilter.app.report import write_report
 from mstfilter.base.errors import InputError, InputWarning
 from mstfilter.base.files import damaged_files
-from mstfilter.base.reading import read_arrays
+from mstfilter.base.reading import check_private, read_arrays
 from mstfilter.base.trained import open_model, write_model
 from mstfilter.formats import open_recording, read_rgb
 from mstfilter.lab.simulation import cached_recording
-from mstfilter.scene import DiskCache
 from mstfilter.smc import run_many
 from tests import hostile
 from tests.conftest import REPOSITORY
@@ -207,10 +204,12 @@ def start(what: str) -> None:
         model = linear_gaussian(*[[[1.0]]] * 4, m0=[0.0], P0=[[1.0]])
         run_many({"a": bootstrap(model, n=10)}, [[0.0], [1.0]], seeds=[0, 1], workers=2)
     else:
-        from mstfilter.runs.study import Local
+        from mstfilter.runs.study.worker import Worker
 
-        outcomes = Local(workers=1).run([{"kind": "none"}], print)
-        assert outcomes[0].status == "failed" and "kind" not in outcomes[0].error, outcomes
+        worker = Worker(Path(sys.argv[0]).with_suffix(".log"))
+        outcome = worker.perform({"code": "none", "tries": 1, "timeout_s": 0, "cwd": os.getcwd()})
+        worker.close()
+        assert outcome.error.startswith("this process has other code"), outcome
 
 
 @pytest.mark.parametrize("what", ["run_many", "study"])
@@ -229,37 +228,18 @@ def test_modules_in_the_working_folder_are_not_imported(tmp_path, what):
 # Caches
 
 
-def _filled(folder):
-    cache = DiskCache(folder, 10**8, "1")
-    cache.store("x", 1, np.zeros(10**5))
-    cache.close()
-    return folder / "cache.db"
-
-
-def test_a_cache_removes_and_reads_files_of_its_own_only(tmp_path):
-    outside = tmp_path / "precious"
-    outside.write_text("mine")
-    for name in (str(outside), "../precious"):
-        with sqlite3.connect(_filled(tmp_path / "cache")) as data:
-            data.execute("UPDATE Cache SET filename = ?", (name,))
-        cache = DiskCache(tmp_path / "cache", 10**8, "1")
-        assert cache.find("x", 1, np.ndarray) is None
-        cache.store("x", 1, np.ones(10**5))  # removes the file of the earlier entry
-        cache.close()
-        assert outside.read_text() == "mine"
-
-
 def test_a_cache_is_private(tmp_path, monkeypatch):
-    folder = _filled(tmp_path / "cache").parent
-    assert folder.stat().st_mode & 0o077 == 0
+    folder = tmp_path / "cache"
+    folder.mkdir(mode=0o700)
+    check_private(folder)
     for mode in (0o770, 0o707):
         folder.chmod(mode)
         with pytest.raises(InputError, match=f"its mode is {mode:o}"):
-            DiskCache(folder, 10**8, "1")
+            check_private(folder)
     folder.chmod(0o700)
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
     with pytest.raises(InputError, match="belongs to another user"):
-        DiskCache(folder, 10**8, "1")
+        check_private(folder)
 
 
 def test_a_cache_of_recordings_is_private_with_any_umask(tmp_path):
@@ -274,23 +254,6 @@ def test_a_cache_of_recordings_is_private_with_any_umask(tmp_path):
     assert len(paths) == 1
     for folder in ("cache", "cache/recordings"):
         assert (tmp_path / folder).stat().st_mode & 0o077 == 0
-
-
-@pytest.mark.parametrize("begun", [False, True])
-def test_a_locked_cache_does_not_stop_a_run(tmp_path, monkeypatch, begun):
-    monkeypatch.setattr("mstfilter.scene.disk_cache._LOCK_S", 0.2)
-    file = _filled(tmp_path / "cache")
-    cache = DiskCache(tmp_path / "cache", 10**8, "1") if begun else None
-    with contextlib.closing(sqlite3.connect(file, isolation_level=None)) as other:
-        other.execute("BEGIN EXCLUSIVE")
-        began = time.monotonic()
-        with pytest.warns(InputWarning, match="is locked by another process"):
-            cache = cache or DiskCache(tmp_path / "cache", 10**8, "1")
-            for key in range(50):
-                assert cache.find("x", key, np.ndarray) is None
-                cache.store("x", key, np.zeros(3))
-        assert time.monotonic() - began < 10  # 50 entries that wait would need 20 s
-    cache.close()
 
 
 def test_a_cached_recording_that_was_edited_is_simulated_again(tmp_path):

@@ -14,7 +14,7 @@ There are two scores, averaged over the pauses t >= 1. `quality` is the mean `ob
 other scenes of the family. Mean quality rewards a filter that becomes certain by processing one image several times;
 the log loss does not.
 
-Writes past.csv: the mean of each score and arm, the arm minus `samples`, and `mst` minus the arm, with t intervals.
+Writes past.csv: the mean of each score and arm, the arm minus `samples`, and `mst` minus the arm, with intervals.
 Finished scenes are not run again.
 """
 

@@ -131,7 +131,7 @@ def run(scene: tuple[str, int], recording: Recording) -> dict[str, object]:
 
 
 def summary(rows: list[dict[str, str]]) -> Iterator[dict[str, object]]:
-    """Means over scenes with 95 % t intervals."""
+    """Means over scenes with 95 % intervals."""
     column = {name: np.array([float(r[name]) if r[name] != "" else np.nan for r in rows]) for name in FIELDS[1:]}
 
     def minus(a: str, b: str) -> tuple[str, np.ndarray]:

@@ -30,7 +30,7 @@ import mstfilter
 from mstfilter.base.resources import preset_names
 from mstfilter.runs import filter_recording
 from mstfilter.runs.presets import REGISTRY, load_config
-from mstfilter.runs.study.jobs import write_measures
+from mstfilter.runs.study import write_measures
 from mstfilter.smc import Population, Proposal, Transition, Update
 
 #: Scene families and seeds. Three small scenes: 5 objects, 9 objects, and the demo.

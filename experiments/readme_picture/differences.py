@@ -3,7 +3,7 @@
     python experiments/readme_picture/differences.py [--out docs/images/differences.png]
 
 The scenes are the ninety scenes of `experiments/main/study.toml`, which were not used for tuning. Differences are
-paired by scene over all families, with t intervals that are not adjusted for multiple comparisons.
+paired by scene over all families, with intervals that are not adjusted for multiple comparisons.
 """
 
 from __future__ import annotations

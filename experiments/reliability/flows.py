@@ -21,8 +21,7 @@ from mstfilter.lab.simulation import cached_recording
 from mstfilter.mst.frontends import write_masks
 from mstfilter.runs import RunFolder, filter_recording
 from mstfilter.runs.presets import load_config
-from mstfilter.runs.study import Executor, run_study, study_of
-from mstfilter.runs.study.jobs import perform
+from mstfilter.runs.study import run_study, study_of, worker
 from mstfilter.scene import Recording
 
 #: Changes to a family: a recording that is made in a second
@@ -55,11 +54,14 @@ class Flow:
     leaves: bool = False  #: whether temporaries of a killed process may be left to a later sweep
 
 
-class InProcess(Executor):
-    """Runs the jobs of a study one after another, without processes."""
+class InProcess(worker.Worker):
+    """Runs the jobs of a study in this process."""
 
-    def run(self, jobs, tell):
-        return [perform(job) for job in jobs]
+    def perform(self, job: worker.Job, died: object = None) -> worker.JobOutcome:
+        return worker.perform(job)
+
+    def close(self) -> int:
+        return 0
 
 
 def flows(recording: Recording) -> list[Flow]:
@@ -79,7 +81,8 @@ def flows(recording: Recording) -> list[Flow]:
     def study(root: Path) -> None:
         data = {"scenes": [{"recordings": str(recording.path)}], "seeds": [0], "cache_gb": 0, "name": "small"}
         arms = [{"name": "a", "preset": PRESET}]
-        run_study(study_of({**data, "arms": arms}), root / "studies" / "one", InProcess(), cache=root / "cache")
+        with mock.patch("mstfilter.runs.study.study.Worker", InProcess):
+            run_study(study_of({**data, "arms": arms}), root / "studies" / "one", workers=1, cache=root / "cache")
 
     def masks(root: Path, value: int = 1) -> None:
         write_masks(root / "masks", 0, [np.full((60, 80), value, np.uint8)])

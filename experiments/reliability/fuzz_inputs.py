@@ -34,7 +34,7 @@ def resident() -> float:
 
 def trial(name: str, seed: int, example: str, folder: str) -> dict[str, object]:
     """Modify a copy of an example in one or two ways, and read it."""
-    from mstfilter.runs.study.jobs import peak_megabytes, reset_peak
+    from mstfilter.runs.study import peak_megabytes, reset_peak
     from tests.hostile import KINDS, copy, outcome, spoil
 
     rng = np.random.default_rng([seed, *name.encode()])

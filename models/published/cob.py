@@ -68,7 +68,7 @@ class CobBoundary(BoundaryModel, UsesFiles):
 
         The angle is in radians from x (right) to y (down), 0 to pi; NaN where no orientation is confident.
         """
-        return memo("cob", (frame.key, self.bound_key), lambda: self._run(frame), stored_as=(np.ndarray,) * 3)
+        return memo("cob", (frame.key, self.bound_key), lambda: self._run(frame), shared=True)
 
     def _run(self, frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         network = self._network()

@@ -211,6 +211,7 @@ _PACKAGES = {
     "rosbags": "'mstfilter[bags]'",
     "onnxruntime": "'mstfilter[onnx]'",
     "xarray": "'mstfilter[xarray]'",
+    "distributed": "'mstfilter[cluster]'",
 }
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from mstfilter.base.code import code_of
 from mstfilter.base.errors import InputError, install_hint, place_in_user_file, suggestion
 
 
@@ -79,6 +80,7 @@ def _executed(path: str | Path, source: bytes, resolved: Path, digest: str) -> M
     for cls in _classes_of(module):
         cls.__mst_file__ = f"{resolved}:{cls.__qualname__}"  # type: ignore[attr-defined]
         cls.__mst_source__ = digest  # type: ignore[attr-defined]
+        cls.__mst_code__ = hashlib.sha256(code_of(source)).hexdigest()  # type: ignore[attr-defined]
         if (cls.__reduce_ex__, cls.__reduce__) == (object.__reduce_ex__, object.__reduce__):
             cls.__reduce_ex__ = _reduce  # type: ignore[method-assign, assignment]
     return module

@@ -1,4 +1,5 @@
 from mstfilter.runs.run import (
+    WITHOUT_RESULTS as WITHOUT_RESULTS,
     check_run_folder as check_run_folder,
     code_version as code_version,
     compared_configs as compared_configs,

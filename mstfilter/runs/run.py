@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import mstfilter
+from mstfilter.base.code import hash_of_files
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import atomic_folder, check_output, locked
 from mstfilter.base.lazy import progress_of
@@ -35,6 +36,8 @@ from mstfilter.scoring import ask
 from mstfilter.smc import ParticleFilter
 
 _LOGGER = logging.getLogger(__name__)
+#: Rooms of mstfilter whose code changes no result of a run.
+WITHOUT_RESULTS = ("app/", "runs/live/", "mst/testing/", "smc/testing/")
 _LIBRARIES = ("numpy", "scipy", "networkx", "opencv-python-headless", "higra", "small_gicp", "torch")
 
 
@@ -206,12 +209,15 @@ def _first_difference(found: Any, wanted: Any, where: str = "") -> str:
 
 
 def component_files(component: Any) -> dict[str, str]:
-    """Hashes of the files that a component and its parts use: source files of the user, weights, other files."""
+    """Hashes of the files that a component and its parts use: source files of the user, weights, other files.
+
+    Comments and docstrings of a source file do not change its hash.
+    """
     found: defaultdict[str, str] = defaultdict(str)
     for part in nested_components(component):
         name, source = type(part).__name__, type(part).__dict__
         if "__mst_file__" in source:
-            found[REGISTRY.name_of(type(part))] = source["__mst_source__"]
+            found[REGISTRY.name_of(type(part))] = source["__mst_code__"]
         if key := str(getattr(part, "weights_key", "")):
             found[f"weights of {name}"] += key
         elif isinstance(part, UsesFiles):
@@ -233,15 +239,17 @@ def library_versions() -> dict[str, str]:
 
 
 def code_version() -> str:
-    """A hash of the Python files of mstfilter."""
-    return _hash_of(Path(mstfilter.__file__).parent, "*.py")
+    """A hash of the code of mstfilter on which results depend, without comments and docstrings."""
+    root = Path(mstfilter.__file__).parent
+    names = [path.relative_to(root).as_posix() for path in root.rglob("*.py")]
+    return hash_of_files(root, [name for name in names if not name.startswith(WITHOUT_RESULTS)])
 
 
-def _hash_of(path: Path, pattern: str = "*") -> str:
-    """A hash of a file, or of the names and contents of the files below a folder that match a pattern."""
+def _hash_of(path: Path) -> str:
+    """A hash of a file, or of the names and contents of the files below a folder."""
     digest = hashlib.sha256()
     for file in sorted(_files_below(path)) if path.is_dir() else [path]:
-        if file.is_file() and (file.match(pattern) or file == path):
+        if file.is_file():
             digest.update(file.relative_to(path).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -20,7 +20,7 @@ z of the world points up, and the table is at z = 0. This room depends neither o
 `rendering`, `evidence`                hypotheses seen by a camera; free space, scores
 `plausibility`                         faults of the input, found before a run
 `encoding`, `arrays`                   hypotheses as arrays; content keys
-`cache`, `disk_cache`                  results that depend on the images alone, computed once
+`cache`                                results that depend on the images alone, computed once
 =====================================  ===============================================================
 """
 

@@ -13,7 +13,6 @@ from mstfilter.scene.camera import (
     scaled_area as scaled_area,
     scaled_length as scaled_length,
 )
-from mstfilter.scene.disk_cache import DiskCache as DiskCache
 from mstfilter.scene.encoding import decode_hypotheses as decode_hypotheses, encode_hypotheses as encode_hypotheses
 from mstfilter.scene.evidence import (
     Evidence as Evidence,

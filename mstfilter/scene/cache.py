@@ -11,24 +11,22 @@ the stored results.
 9
 >>> scene_cache.clear()
 
+A worker of a study runs all filters on a recording one after another. It sets `keeps_shared`, so the values that are
+worth it, such as the optical flow, are kept from one run to the next.
+
 `scene_cache` is the only global state of the package. The cache changes the duration of a run but never its results.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import threading
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import fields, is_dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from mstfilter.scene.disk_cache import DiskCache
 
 _Value = TypeVar("_Value")
 
@@ -36,12 +34,14 @@ _Value = TypeVar("_Value")
 class Cache:
     """Values in memory, identified by name and key. The cache can be used from several threads.
 
-    If the total size exceeds `limit_bytes`, the least recently used values are dropped. For each name, `hits` counts
-    the values found in memory or on disk.
+    If the total size exceeds `limit_bytes`, the least recently used values are dropped. If `keeps_shared` is True,
+    `forget` keeps the values that runs share. For each name, `hits` counts the values that were found.
     """
 
     def __init__(self, limit_bytes: int = 768 * 2**20) -> None:
         self.limit_bytes = limit_bytes
+        self.keeps_shared = False
+        self._shared: set[tuple[str, Hashable]] = set()
         self._used: dict[tuple[str, Hashable], int] = {}  # calls of `forget` before the last use
         self._n_forgotten = 0
         self.hits: Counter[str] = Counter()
@@ -49,27 +49,24 @@ class Cache:
         self._pending: dict[tuple[str, Hashable], threading.Event] = {}  # values that a thread computes now
         self._n_bytes = 0
         self._lock = threading.RLock()
-        self._disk: DiskCache | None = None
 
-    def get(self, name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
+    def get(self, name: str, key: Hashable, compute: Callable[[], _Value], shared: bool = False) -> _Value:
         """The cached value of ``compute()``. `compute` is called only if the value is not cached.
 
         `name` is the name of the computation. `key` contains content keys (`Frame.key`, `Camera.key`,
         `VoxelGrid.key`) and every parameter that affects the value. Name and key together determine the value
         completely, so `compute` must not draw random numbers. The caller must not modify the returned value.
 
-        If `stored_as` is a type, the value is also stored on disk (see `on_disk`). Supported types are arrays,
-        dataclasses (with fields that are arrays, strings or None), and tuples of arrays and dataclasses. Use
-        `stored_as` only if computing the value takes much longer than reading the value.
+        `shared` marks values that other runs on the recording need too, and that are small for the time they take.
         """
-        return self.get_many(name, [key], lambda _: [compute()], stored_as)[0]
+        return self.get_many(name, [key], lambda _: [compute()], shared)[0]
 
     def get_many(
         self,
         name: str,
         keys: Sequence[Hashable],
         compute: Callable[[Sequence[int]], Sequence[_Value]],
-        stored_as: Any = None,
+        shared: bool = False,
     ) -> list[_Value]:
         """The values of several keys. One call ``compute(indices)`` computes all missing values.
 
@@ -95,7 +92,10 @@ class Cache:
                         self._pending[entry] = threading.Event()
                         missing[key] = k
             try:
-                found |= self._missing(name, missing, compute, stored_as)
+                new = compute(tuple(missing.values())) if missing else ()
+                for key, value in zip(missing, new, strict=True):
+                    found[key] = value
+                    self._keep((name, key), value, shared)
             finally:
                 for key in missing:
                     self._pending.pop((name, key)).set()
@@ -104,29 +104,7 @@ class Cache:
             left = {key: k for key, k in left.items() if key not in found}
         return [found[key] for key in keys]
 
-    def _missing(
-        self,
-        name: str,
-        missing: dict[Hashable, int],
-        compute: Callable[[Sequence[int]], Sequence[_Value]],
-        stored_as: Any,
-    ) -> dict[Hashable, _Value]:
-        """The values of keys that are not in memory, read from the disk or computed."""
-        disk = self._disk if stored_as is not None else None
-        found = {} if disk is None else {key: disk.find(name, key, stored_as) for key in missing}
-        found = {key: value for key, value in found.items() if value is not None}
-        if found:
-            self.hits[name] += len(found)
-        if new := {key: k for key, k in missing.items() if key not in found}:
-            for key, value in zip(new, compute(tuple(new.values())), strict=True):
-                if disk is not None:
-                    disk.store(name, key, value)
-                found[key] = value
-        for key, value in found.items():
-            self._keep((name, key), value)
-        return found
-
-    def _keep(self, entry: tuple[str, Hashable], value: Any) -> None:
+    def _keep(self, entry: tuple[str, Hashable], value: Any, shared: bool) -> None:
         size = _size_of(value)
         if size > self.limit_bytes:
             return
@@ -135,12 +113,15 @@ class Cache:
                 self._entries[entry] = (value, size)
                 self._n_bytes += size
             self._used[entry] = self._n_forgotten
+            if shared:
+                self._shared.add(entry)
             while self._n_bytes > self.limit_bytes:
                 self._drop(next(iter(self._entries)))
 
     def _drop(self, entry: tuple[str, Hashable]) -> None:
         self._n_bytes -= self._entries.pop(entry)[1]
         del self._used[entry]
+        self._shared.discard(entry)
 
     @property
     def n_bytes(self) -> int:
@@ -150,11 +131,14 @@ class Cache:
     def forget(self) -> None:
         """Drop the values that were last used before the two previous calls of `forget`.
 
-        A loop over pauses that calls `forget` after each step keeps the values of the last two steps.
+        A loop over pauses that calls `forget` after each step keeps the values of the last two steps. With
+        `keeps_shared`, shared values are kept until the limit is reached.
         """
         with self._lock:
+            kept = self._shared if self.keeps_shared else frozenset()
             for entry in [entry for entry, used in self._used.items() if used < self._n_forgotten - 1]:
-                self._drop(entry)
+                if entry not in kept:
+                    self._drop(entry)
             self._n_forgotten += 1
 
     def clear(self) -> None:
@@ -162,23 +146,9 @@ class Cache:
         with self._lock:
             self._entries.clear()
             self._used.clear()
+            self._shared.clear()
             self.hits.clear()
             self._n_bytes = 0
-
-    @contextlib.contextmanager
-    def on_disk(self, folder: str | Path, limit_bytes: int, version: str) -> Iterator[DiskCache]:
-        """Also store values with `stored_as` (see `get`) on disk. Several processes can share the folder.
-
-        `limit_bytes` is the maximum size of the folder. Values stored by another `version` of the code are not used.
-        """
-        from mstfilter.scene.disk_cache import DiskCache
-
-        before, self._disk = self._disk, DiskCache(folder, limit_bytes, version)
-        try:
-            yield self._disk
-        finally:
-            self._disk.close()
-            self._disk = before
 
     def after_fork(self) -> None:
         """Make the copy in a forked process usable, where no thread computes the values that are being computed."""
@@ -195,16 +165,16 @@ if hasattr(os, "register_at_fork"):
     )
 
 
-def memo(name: str, key: Hashable, compute: Callable[[], _Value], stored_as: Any = None) -> _Value:
+def memo(name: str, key: Hashable, compute: Callable[[], _Value], shared: bool = False) -> _Value:
     """The value of ``compute()``, computed once in this process: `Cache.get` of `scene_cache`."""
-    return scene_cache.get(name, key, compute, stored_as)
+    return scene_cache.get(name, key, compute, shared)
 
 
 def memo_many(
-    name: str, keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Sequence[_Value]], stored_as: Any = None
+    name: str, keys: Sequence[Hashable], compute: Callable[[Sequence[int]], Sequence[_Value]], shared: bool = False
 ) -> list[_Value]:
     """The values of several keys, each computed once in this process: `Cache.get_many` of `scene_cache`."""
-    return scene_cache.get_many(name, keys, compute, stored_as)
+    return scene_cache.get_many(name, keys, compute, shared)
 
 
 def _size_of(value: Any) -> int:

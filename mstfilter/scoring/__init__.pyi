@@ -13,6 +13,7 @@ from mstfilter.scoring.metrics import (
     pairwise_quality as pairwise_quality,
     pause_metrics as pause_metrics,
 )
+from mstfilter.scoring.own import Metric as Metric, measure_own as measure_own
 from mstfilter.scoring.pauses import (
     PauseEstimate as PauseEstimate,
     PauseScore as PauseScore,

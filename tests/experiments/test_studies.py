@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from unittest import mock
-
 import pytest
 
 from mstfilter.app.cli import main
@@ -11,7 +9,7 @@ from mstfilter.base.files import read_csv
 from mstfilter.runs.study import load_study, make_plan
 from mstfilter.scoring import LOG_LOSS
 from tests.experiments.scripts import EXPERIMENTS, import_script, run_script
-from tests.runs.study.scenes import InProcess
+from tests.runs.study.scenes import in_process
 
 MAIN = EXPERIMENTS / "main/study.toml"
 pytestmark = pytest.mark.nightly
@@ -20,9 +18,9 @@ pytestmark = pytest.mark.nightly
 def run_small(tmp_path, config, *overrides):
     """The folder of a study in its small form."""
     out = tmp_path / config.stem
-    with mock.patch("mstfilter.runs.study.Local", lambda workers, logs: InProcess()):
+    with in_process():
         try:
-            main(["study", str(config), *overrides, "--smoke", "--out", str(out)])
+            main(["study", str(config), *overrides, "--smoke", "--no-report", "--workers", "1", "--out", str(out)])
         except SystemExit as end:
             assert not end.code
     return out
@@ -93,11 +91,8 @@ def test_a_study_by_families_has_the_tables_of_the_whole_study(tmp_path, capsys)
     )
 
     def study(folder, *options):
-        with (
-            mock.patch("mstfilter.runs.study.Local", lambda workers, logs: InProcess()),
-            pytest.raises(SystemExit) as end,
-        ):
-            main(["study", str(config), *options, "--out", str(tmp_path / folder)])
+        with in_process(), pytest.raises(SystemExit) as end:
+            main(["study", str(config), *options, "--no-report", "--workers", "1", "--out", str(tmp_path / folder)])
         return end.value.code
 
     assert study("none", "--family", "s1")

@@ -194,7 +194,9 @@ def test_a_changed_component_file_or_recording_is_another_run(recording, tmp_pat
     config = load_config("mst", [f"resampler={source}:Mine"])
     filter_recording(recording, config, tmp_path / "run", allow_files=True)
     filter_recording(recording, config, tmp_path / "run", allow_files=True)  # the same: nothing to do
-    source.write_text(text + "# another\n")
+    source.write_text(f'"""My file."""\n{text}# the end\n')
+    filter_recording(recording, config, tmp_path / "run", allow_files=True)  # only comments differ
+    source.write_text(text + "another = 1\n")
     with pytest.raises(InputError, match="its files differs"):
         filter_recording(recording, config, tmp_path / "run", allow_files=True)
     changed = tmp_path / "changed"

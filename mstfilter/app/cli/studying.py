@@ -22,16 +22,23 @@ def study(
     config: Annotated[Path, typer.Argument(help="TOML file of the study.")],
     overrides: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[PATH=VALUE]...", help="Changes to every arm; a comma makes a grid: n=3,5"),
+        typer.Argument(
+            metavar="[PATH=VALUE]...",
+            help="Changes to every arm; a comma makes a grid: n=3,5; or metric=./file.py:Class",
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Study folder. Default: studies/NAME.")] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,
+    workers: Annotated[int, typer.Option(min=0, help="Worker processes; 0 is one per core.")] = 0,
     family: Annotated[
         list[str] | None, typer.Option(help="Only the scenes of this family, by its name in the tables; repeatable.")
     ] = None,
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the small form that the table `smoke` of the file describes.")
     ] = False,
+    cluster: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Run on a cluster: address of a scheduler of dask.")
+    ] = "",
+    no_report: Annotated[bool, typer.Option("--no-report", help="Do not write report.html at the end.")] = False,
 ) -> None:
     """Compare filters on many scenes, or resume a study that was stopped."""
     from mstfilter.runs.study import check_arm_names, load_study
@@ -43,13 +50,17 @@ def study(
             raise InputError(f"the study has no family {unknown[0]!r}", f"its families are {', '.join(names)}")
         wanted = wanted.model_copy(update={"scenes": tuple(s for s in wanted.scenes if s.group_name in family)})
     check_arm_names(wanted, overrides or ())  # before any large library is imported
-    from mstfilter.runs.study import Local, run_study
+    from mstfilter.runs.study import run_study
 
     folder = out or Path("studies") / f"{wanted.name}{'-smoke' if smoke else ''}"
     check_output(folder, folder=True, empty=False)
     with study_bars() as progress:
-        result = run_study(wanted, folder, Local(workers, folder / "logs"), overrides or (), progress=progress)
+        result = run_study(wanted, folder, overrides or (), workers=workers, cluster=cluster, progress=progress)
     print(f"study       {folder}")
+    if not no_report:
+        from mstfilter.app.report import write_study_report
+
+        print(f"report      {write_study_report(folder)}")
     print(f"runs        {result.done} done, {result.repeated} of them earlier; table {folder / 'runs.csv'}")
     _print_tables(result.folder)
     _print_failures(result.failed)

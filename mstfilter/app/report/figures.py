@@ -268,17 +268,18 @@ def reliability_figure(tables: Mapping[str, ForecastTable], arms: Sequence[str] 
 def differences_figure(
     differences: Sequence[tuple[str, str, Difference]], arms: Sequence[str], reference: str, measure: str, side: str
 ) -> str:
-    """Differences of a measure between compared methods and the reference, with t intervals, by family.
+    """Differences of a measure between compared methods and the reference, with intervals and a dot for each unit.
 
     An entry of `differences` is (family, arm, arm minus reference). `arms` lists all compared methods, in the order
-    of the colours. `side` is the side of zero on which the reference is better, "left" or "right".
+    of the colours. `side` is the side of zero on which the reference is better, "left" or "right", or empty.
     """
     colours = _arm_colours(arms)
     rows = [(family, arm, (d.mean, d.low, d.high), colours[arm]) for family, arm, d in differences]
     with _style("study differences"):
         figure, (axes,) = _new_figure(6.6, 1.0 + 0.26 * forest_height(rows))
-        draw_forest(axes, rows)
-        parts = f"{measure} of the method minus that of {reference};", f"{reference} is better on the {side}"
+        draw_forest(axes, rows, [d.values for *_, d in differences])
+        parts = [f"{measure} of the method minus that of {reference}"]
+        parts += [f"{reference} is better on the {side}"] if side else []
         label = "\n".join(line for part in parts for line in textwrap.wrap(part, 76))
         figure.supxlabel(label, fontsize=10, color=_MUTED)
         return _svg_text(figure, f"Paired differences of {measure} with 95 % intervals")
@@ -293,8 +294,11 @@ def forest_height(rows: Sequence[ForestRow]) -> float:
     return len(rows) + 1.8 * len({group for group, *_ in rows})
 
 
-def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
-    """Draw each row as a point with its interval. The name of a group, if not empty, is above its rows."""
+def draw_forest(axes: Axes, rows: Sequence[ForestRow], dots: Sequence[Sequence[float]] = ()) -> None:
+    """Draw each row as a point with its interval, and below it small dots, if there are any for the row.
+
+    The name of a group, if not empty, is above its rows.
+    """
     axes.grid(axis="y", visible=False)
     axes.grid(axis="x")
     axes.axvline(0, color=_MUTED, lw=1.0)
@@ -307,6 +311,8 @@ def draw_forest(axes: Axes, rows: Sequence[ForestRow]) -> None:
         if np.isfinite(low):
             axes.plot([low, high], [y, y], color=mark, lw=2.4, solid_capstyle="butt")
         axes.plot([mean], [y], marker="o", ms=6, color=mark)
+        if dots:
+            axes.plot(dots[k], [y + 0.32] * len(dots[k]), ".", ms=3, alpha=0.6, color=mark)
         ticks.append((y, name, False))
         y += 1.0
     axes.set_yticks([at for at, *_ in ticks], [text for _, text, _ in ticks])

@@ -53,9 +53,9 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
 
 @contextlib.contextmanager
 def study_bars() -> Iterator[Callable[[Any], None]]:
-    """Progress bars for a study. Yields a function of a `StudyProgress`. Failed jobs are printed above the bars.
+    """A progress bar for a study. Yields a function of a `StudyProgress`. Failed runs are printed above the bar.
 
-    If standard error is not a terminal, or if messages are shown, each finished job is a line of the log instead.
+    If standard error is not a terminal, or if messages are shown, each finished run is a line of the log instead.
     """
     from rich import get_console
 
@@ -64,15 +64,13 @@ def study_bars() -> Iterator[Callable[[Any], None]]:
         with contextlib.nullcontext() if shown else log_lines():
             yield lambda p: None
         return
-    tasks: dict[str, Any] = {}
     with _bars() as bars:
+        task = bars.add_task("runs", total=None)
 
         def update(p: Any) -> None:
             bars.start()
-            if p.what not in tasks:
-                tasks[p.what] = bars.add_task(p.what, total=p.total)
             failed = f", {p.failed} failed" if p.failed else ""
-            bars.update(tasks[p.what], completed=p.done + p.failed, description=f"{p.what}{failed}")
+            bars.update(task, total=p.total, completed=p.done + p.failed, description=f"runs{failed}")
             if p.name and p.outcome is None:
                 bars.console.print(f"a worker died in {p.name}", markup=False)
             elif p.name and p.outcome.status != "done":

@@ -49,6 +49,7 @@ def _page(study: StudyFolder) -> str:
     }
     records, failures = study.records(), study.failures()
     summary = study.summary(records)
+    names = summary.compared_first
     scenes: dict[str, list[str]] = defaultdict(list)
     for scene in study.description["scenes"]:
         scenes[scene["group"]].append(scene["name"])
@@ -62,8 +63,9 @@ def _page(study: StudyFolder) -> str:
         scenes=scenes,
         claim=CLAIM,
         endpoints=ENDPOINTS,
-        compared=[one for name in ENDPOINTS for one in summary.compared(name) if one.difference.n],
-        values={(one.family, one.arm, one.name): one.by_scene for one in summary.metrics if one.name in ENDPOINTS},
+        own=[(name, title_of(name)) for name in study.own_columns],
+        compared=[one for name in names for one in summary.compared(name) if one.difference.n],
+        values={(one.family, one.arm, one.name): one.by_scene for one in summary.metrics if one.name in names},
         extremes=(extremes := _extremes(study, records, summary)),
         pictures=_pictures(study, extremes),
         figures=_drawn(records, summary, study.reported_only),
@@ -142,7 +144,7 @@ def _drawn(
     drawn: dict[str, list[Any]] = defaultdict(list)
     compared = [arm for arm in summary.arms if arm not in reported_only]
     ends = [summary.reference, *(arm for arm in summary.arms if arm in reported_only)]
-    for name, sign in ENDPOINTS.items():
+    for name in summary.compared_first:
         values = _over_time(records, name)
         for section, arms in (("time", compared), ("ends", ends)):
             if values and (section == "time" or len(ends) > 1):
@@ -150,7 +152,7 @@ def _drawn(
                     drawn[section].append(Markup(time_figure(values, group, title_of(name), summary.arms)))
         differences = [(one.family, one.arm, one.difference) for one in summary.compared(name) if one.difference.n]
         if differences:
-            side = "left" if sign > 0 else "right"
+            side = {1: "left", -1: "right"}.get(ENDPOINTS.get(name, 0), "")
             figure = differences_figure(differences, summary.arms, summary.reference, title_of(name), side)
             drawn["differences"].append(Markup(figure))
     return dict(drawn)

@@ -203,8 +203,8 @@ class Completer(SurfaceRule, ABC):
 
         if self.stochastic:
             return compute(range(len(masks)))
-        # Views are not stored on disk: an object is rarely seen again with the same motions.
-        return memo_many("completion", names, compute, Completion if views is None else None)
+        # An object is rarely seen again with the same motions, so other runs seldom need its completion from views.
+        return memo_many("completion", names, compute, shared=views is None)
 
     @property
     def _version(self) -> tuple[str, ...]:

@@ -171,7 +171,7 @@ class TreeCutProposal(Proposal):
 
         parts = component_key((self.boundary, self.tree, self.value, self.objects))
         key = (frame.key, None if grid is None else grid.key, parts)
-        return memo("segmentation_tree", key, compute, stored_as=(Tree, np.ndarray))
+        return memo("segmentation_tree", key, compute, shared=True)
 
     def of_clip(self, clip: Clip) -> TreeCutProposal:
         """The same proposal with the boundary model for a clip, if the model depends on the clip."""

@@ -127,7 +127,7 @@ class SiftMatching(Bounded):
     def match(self, before: Frame, after: Frame) -> Matches:
         """Matches of two frames. Cached by content."""
         key = (before.key, after.key, astuple(self))
-        return memo("sift matches", key, lambda: _match(before, after, self), stored_as=Matches)
+        return memo("sift matches", key, lambda: _match(before, after, self), shared=True)
 
 
 def _features(frame: Frame) -> tuple[np.ndarray, np.ndarray]:

@@ -100,7 +100,7 @@ class DenseFlow(Bounded):
                 tracker.add(frame)
             return tracker.finish()
 
-        return memo("clip tracks", (tuple(keys), astuple(self)), compute, ClipTracks)
+        return memo("clip tracks", (tuple(keys), astuple(self)), compute, shared=True)
 
     def begin(self, first: Frame) -> FlowTracker:
         """A tracker for frames that arrive one by one. `track` uses it as long as the caller keeps a reference."""

@@ -1,13 +1,13 @@
 """Studies: several filters on many scenes, compared scene by scene.
 
->>> from mstfilter.runs.study import Local, load_study, run_study
+>>> from mstfilter.runs.study import load_study, run_study
 >>> study = load_study("experiments/main/study.toml", smoke=True)
->>> result = run_study(study, Path("studies/main"), Local(workers=2))
+>>> result = run_study(study, Path("studies/main"), workers=2)
 >>> result.folder.summary().compared()[0].words
 
-`run_study` plans the runs, which are every arm (configuration of the filter) on every scene with every seed. An
-executor (`Local`, or one of yours) makes those that are missing, each as a `mstfilter.runs.RunFolder`, and the tables
-of the study folder are written from them.
+`run_study` plans the runs, which are every arm (configuration of the filter) on every scene with every seed. Worker
+processes make those that are missing, all runs of one recording in one worker, each as a `mstfilter.runs.RunFolder`.
+Then the tables of the study folder are written from them.
 """
 
 from mstfilter.base.lazy import attach

@@ -5,23 +5,19 @@ from mstfilter.runs.study.config import (
     load_study as load_study,
     study_of as study_of,
 )
-from mstfilter.runs.study.executors import Executor as Executor, Local as Local
-from mstfilter.runs.study.jobs import (
-    open_scene as open_scene,
-    peak_megabytes as peak_megabytes,
-    perform as perform,
-    reset_peak as reset_peak,
-)
 from mstfilter.runs.study.plan import make_plan as make_plan
 from mstfilter.runs.study.results import (
     FORECASTS as FORECASTS,
     RESULT as RESULT,
-    Job as Job,
     JobOutcome as JobOutcome,
     StudyFolder as StudyFolder,
     cost_columns as cost_columns,
 )
-from mstfilter.runs.study.study import StudyProgress as StudyProgress, run_study as run_study
+from mstfilter.runs.study.study import (
+    StudyProgress as StudyProgress,
+    StudyResult as StudyResult,
+    run_study as run_study,
+)
 from mstfilter.runs.study.summary import (
     ENDPOINTS as ENDPOINTS,
     SLOPES as SLOPES,
@@ -31,4 +27,10 @@ from mstfilter.runs.study.summary import (
     number_text as number_text,
     summarise as summarise,
     title_of as title_of,
+)
+from mstfilter.runs.study.worker import (
+    open_scene as open_scene,
+    peak_megabytes as peak_megabytes,
+    reset_peak as reset_peak,
+    write_measures as write_measures,
 )

@@ -47,8 +47,15 @@ def _seeds(value: Any) -> Any:
 
 
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], BeforeValidator(_seeds)]
+
+
+def _several(value: Any) -> Any:
+    """A tuple of one text or table."""
+    return (value,) if isinstance(value, str | dict) else value
+
+
 #: A text stands for a tuple of this text.
-Texts = Annotated[tuple[str, ...], BeforeValidator(lambda given: (given,) if isinstance(given, str) else given)]
+Texts = Annotated[tuple[str, ...], BeforeValidator(_several)]
 
 
 class _Entry(BaseModel):
@@ -108,8 +115,10 @@ class StudyConfig(_Entry):
     tries: Annotated[int, Field(ge=1)] = 3  #: how many times a run is started if its worker dies
     #: Time limit of a run in seconds, after which the run is started again, up to `tries` times. 0: no limit.
     timeout_s: Annotated[float, Field(ge=0)] = 0.0
-    #: Maximum size in GB of intermediate results that are kept on disk for other arms and later runs; 0 keeps none.
-    cache_gb: Annotated[float, Field(ge=0)] = 4.0
+    #: Memory of each worker in GB for intermediate results, which the runs of a recording share; 0: they share none.
+    cache_gb: Annotated[float, Field(ge=0)] = 0.8
+    #: Own metrics: ``./file.py:Class``, or tables with this as `component`, and fields.
+    metric: Annotated[tuple[str | dict[str, Any], ...], BeforeValidator(_several)] = ()
     smoke: dict[str, Any] = Field(default_factory=dict)  #: replaces fields of the study under ``--smoke``
     folder: Path = Path()  # relative paths start here
 
@@ -161,8 +170,16 @@ class ArmRequest:
         return load_config(self.preset, self.overrides)
 
 
+def take_metrics(study: StudyConfig, overrides: Sequence[str]) -> tuple[StudyConfig, list[str]]:
+    """The study with the own metrics that overrides ``metric=./file.py:Class`` add, and the other overrides."""
+    own = [text for text in overrides if text.partition("=")[0].strip() == "metric"]
+    added = [one.partition("=")[2] for text in own for one in split_grid(text)]
+    return study.model_copy(update={"metric": (*study.metric, *added)}), [o for o in overrides if o not in own]
+
+
 def check_arm_names(study: StudyConfig, overrides: Sequence[str] = ()) -> None:
     """Raise InputError if an arm names an unknown preset or component. Components are not imported."""
+    study, overrides = take_metrics(study, overrides)
     for request in expand_arms(study, overrides):
         with naming(f"arm {request.name!r}"):
             request.config()

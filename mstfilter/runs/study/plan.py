@@ -3,10 +3,10 @@
 >>> plan = make_plan(load_study("study.toml"))
 >>> [run.name for run in plan.runs]
 
-The identity of a run is a hash of its configuration, its recording, its seed, the files of mstfilter and of the user,
-and the versions of the libraries. For a simulated recording, the family, the seed and the version of the simulator
-are hashed. For other recordings, the content and the ground truth are hashed. A run is not repeated if its identity
-has not changed.
+The identity of a run is a hash of its configuration, its recording, its seed, the code of mstfilter and of the user's
+files, and the versions of the libraries. Comments and docstrings do not count as code. For a simulated recording, the
+family, the seed and the version of the simulator are hashed, for other recordings the content and the ground truth.
+A run is not repeated if its identity has not changed. Own metrics are no part of it: finished runs are measured.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ import hashlib
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mstfilter.base.errors import InputError, naming
-from mstfilter.base.registry import nested_components
 from mstfilter.formats import open_recording
 from mstfilter.lab.oracles import uses_truth
 from mstfilter.runs import as_json, code_version, component_files, library_versions
 from mstfilter.runs.presets import REGISTRY, build_filter, describe_filter
-from mstfilter.runs.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms
+from mstfilter.runs.study.config import ArmRequest, SceneEntry, StudyConfig, expand_arms, take_metrics
 from mstfilter.scene import content_key
+from mstfilter.scoring import Metric
+
+if TYPE_CHECKING:
+    from mstfilter.lab.simulation import SceneFamily
 
 _MOST_RUNS = 1_000_000
 
@@ -40,8 +43,6 @@ class Arm:
     name: str
     config: dict[str, Any]  #: every field of every component
     key: str  #: hash of the configuration, the code and the files of the user
-    #: Whether all components belong to mstfilter. A file of the user may import code that is not part of `key`.
-    known_code: bool
     uses_truth: tuple[str, ...]  #: classes of its components that use the ground truth
     reported_only: bool = False  #: not part of the comparisons whose p values are adjusted together
 
@@ -88,6 +89,7 @@ class Plan:
     arms: tuple[Arm, ...]
     scenes: tuple[StudyScene, ...]
     runs: tuple[StudyRun, ...]
+    metrics: dict[str, dict[str, Any]]  #: own metrics: hash of the configuration and the file -> configuration
 
     @property
     def reference(self) -> str:
@@ -101,8 +103,10 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
     `overrides` apply to every arm after its own changes. Each combination of comma-separated values is an arm. Raises
     InputError if an arm is invalid, two arms are the same, there are no runs, or a recording cannot be read.
     """
+    study, overrides = take_metrics(study, overrides)
+    metrics = dict(_metric(spec) for spec in study.metric)
     code = code_version()
-    versions = library_versions()
+    versions = {name: version for name, version in library_versions().items() if name != "mstfilter"}
     arms = tuple(_arm(request, versions, code) for request in expand_arms(study, overrides))
     for what, found in (("arm", arms), ("scene", study.scenes), ("seed", study.seeds)):
         if not found:
@@ -128,7 +132,7 @@ def make_plan(study: StudyConfig, overrides: Sequence[str] = ()) -> Plan:
         for seed in study.seeds
         for arm in arms
     )
-    return Plan(study, code, arms, scenes, runs)
+    return Plan(study, code, arms, scenes, runs, metrics)
 
 
 def _arm(request: ArmRequest, versions: dict[str, str], code: str) -> Arm:
@@ -136,20 +140,43 @@ def _arm(request: ArmRequest, versions: dict[str, str], code: str) -> Arm:
         filter = build_filter(request.config(), allow_files=True)
         files = component_files(filter)
     config = as_json(describe_filter(filter))
-    known_code = all(type(part).__module__.split(".")[0] == "mstfilter" for part in nested_components(filter))
     key = _hash([config, files, versions, code])
-    return Arm(request.name, config, key, known_code, tuple(uses_truth(filter)), request.reported_only)
+    return Arm(request.name, config, key, tuple(uses_truth(filter)), request.reported_only)
+
+
+def build_metric(spec: str | Mapping[str, Any]) -> Metric:
+    """An own metric from ``./file.py:Class``, or from a table with this as `component`, and fields."""
+    name = spec if isinstance(spec, str) else spec.get("component")
+    if not isinstance(name, str) or ".py:" not in name:
+        raise InputError(f"metric is {spec!r}, expected ./FILE.py:CLASS or a table with it as `component`")
+    metric = REGISTRY.build("metric", spec, allow_files=True)
+    if not isinstance(metric, Metric):
+        raise InputError(f"metric: {name} does not inherit Metric", "from mstfilter.scoring import Metric")
+    return metric
+
+
+def _metric(spec: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    metric = build_metric(spec)
+    config = as_json(REGISTRY.describe(metric))
+    return _hash([config, component_files(metric)]), config
+
+
+def family_of(source: Mapping[str, Any]) -> SceneFamily:
+    """The scene family of a simulated scene, with its changes."""
+    from mstfilter.lab.simulation import scene_family
+
+    family = scene_family(source["family"])
+    found: SceneFamily = REGISTRY.make(type(family), source["set"], f"scene family {source['family']!r}", base=family)
+    return found
 
 
 def _scenes(entry: SceneEntry, folder: Path) -> Iterator[StudyScene]:
     if entry.family:
-        from mstfilter.lab.simulation import recipe_key, scene_family
+        from mstfilter.lab.simulation import recipe_key
 
-        family = scene_family(entry.family)
-        family = REGISTRY.make(type(family), entry.set, f"scene family {entry.family!r}", base=family)
-        changed = {name: getattr(family, name) for name in entry.set}
+        family = family_of({"family": entry.family, "set": entry.set})
         for seed in entry.seeds:
-            source = {"family": entry.family, "seed": seed, "set": changed}
+            source = {"family": entry.family, "seed": seed, "set": entry.set}
             yield StudyScene(f"{entry.group_name}-{seed}", entry.group_name, source, recipe_key(family, seed))
         return
     for pattern in entry.recordings:

@@ -8,11 +8,12 @@ The page "Studies" of the documentation lists the files.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +25,7 @@ from mstfilter.base.errors import InputError
 from mstfilter.base.files import write_csv, write_text
 from mstfilter.base.reading import read_arrays, read_model
 from mstfilter.runs import write_json
-from mstfilter.runs.study.summary import ENDPOINTS, ArmMetric, Summary, interval_text, number_text, summarise
+from mstfilter.runs.study.summary import ArmMetric, Summary, interval_text, number_text, summarise, title_of
 from mstfilter.scoring import LOG_LOSS, NO_COUNTS, forecast_table, leave_one_out
 from mstfilter.scoring.forecasts import ForecastTable
 from mstfilter.scoring.statistics import compare
@@ -34,14 +35,22 @@ RESULT = "result.json"  # in a run's folder
 FORECASTS = "forecasts.npz"  # in a run's folder: counts of its forecasts at each pause
 _SUMMARY_COLUMNS = ("family", "arm", "metric", "n", "mean", "low", "high")
 _DIFFERENCE_COLUMNS = (
-    *("family", "arm", "reference", "metric", "n", "mean", "low", "high"),
-    *("low_bootstrap", "high_bootstrap", "p", "p_bootstrap", "skewness", "p_holm", "conclusion"),
+    "family",
+    "arm",
+    "reference",
+    "metric",
+    "n",
+    "mean",
+    "low",
+    "high",
+    "p",
+    "p_holm",
+    "conclusion",
 )
 _FAILURE_COLUMNS = ("run", "error", "hints", "tries", "folder")
 
 
-#: Plain values: ``kind`` (record or run), ``name``, ``share`` (jobs of one share use the same intermediate results),
-#: ``tries``, ``timeout_s`` and what `mstfilter.runs.study.jobs` needs.
+#: Plain values, which a worker reads as JSON: what one run needs (see `mstfilter.runs.study.study`).
 Job = Mapping[str, Any]
 
 
@@ -76,6 +85,7 @@ class _Result(BaseModel):
     identity: str
     rows: list[_Row] = []
     costs: list[_Cost] = []
+    own_metrics: dict[str, list[dict[str, float | None]]] = {}  # own metrics: key -> values by name at each pause
     error: str = ""
     hints: list[str] = []
     trace: str = ""
@@ -83,8 +93,11 @@ class _Result(BaseModel):
 
     @model_validator(mode="after")
     def _agree(self) -> _Result:
-        if len(self.rows) != len(self.costs) or (self.status == "done" and not self.rows):
-            raise ValueError(f"there are {len(self.rows)} rows and {len(self.costs)} costs")
+        lengths = {len(self.rows), len(self.costs), *map(len, self.own_metrics.values())}
+        if len(lengths) > 1 or (self.status == "done" and not self.rows):
+            raise ValueError(
+                f"there are {len(self.rows)} rows and {len(self.costs)} costs, or other numbers of metrics"
+            )
         return self
 
 
@@ -122,6 +135,7 @@ class _Study(BaseModel):
     scenes: list[_Scene]
     seeds: list[int]
     runs: list[_StudyRun]
+    metrics: dict[str, dict[str, Any]] = {}
 
 
 def read_result(folder: Path) -> dict[str, Any]:
@@ -135,6 +149,15 @@ def read_result(folder: Path) -> dict[str, Any]:
 def write_result(folder: Path, result: Mapping[str, Any]) -> None:
     """Write result.json into a run's folder."""
     write_json(folder / RESULT, result)
+
+
+def write_failure(folder: Path, identity: str, outcome: JobOutcome) -> None:
+    """Record the reason of a failed run, which may have rows without its own metrics. A full disk is no error."""
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        known = read_result(folder)
+        kept = known if known.get("identity") == identity else {"identity": identity}
+        write_result(folder, {**kept, **asdict(outcome)})
 
 
 @dataclass(frozen=True)
@@ -157,6 +180,19 @@ class StudyFolder:
         return read_model(self.path / "study.json", _Study, "a study folder", "`mstfilter study` makes one")[1]
 
     @property
+    def metrics(self) -> dict[str, dict[str, Any]]:
+        """Own metrics of the study: key in result.json -> configuration."""
+        return dict(self.description.get("metrics", {}))
+
+    @property
+    def own_columns(self) -> list[str]:
+        """Names of the columns of own metrics."""
+        values = (
+            v for _, result in self._results() for k, v in result.get("own_metrics", {}).items() if k in self.metrics
+        )
+        return list(dict.fromkeys(name for rows in values for row in rows for name in row))
+
+    @property
     def reported_only(self) -> list[str]:
         """Names of the arms that are not part of the comparisons."""
         return [arm["name"] for arm in self.description["arms"] if arm["reported_only"]]
@@ -170,25 +206,27 @@ class StudyFolder:
         """Path of the folder of a run, from the name of the folder."""
         return self.path / "runs" / folder
 
-    def _results(self, status: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-        """The runs of this study with a status, and their results."""
+    def _results(self) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+        """The runs of this study that have ended, and their results."""
         for run in self.description["runs"]:
             result = read_result(self.run(run["folder"]))
-            if result.get("status") == status and result.get("identity") == run["identity"]:
+            if result.get("identity") == run["identity"]:
                 yield run, result
 
     def failures(self) -> list[dict[str, Any]]:
-        """Runs of this study that failed: name, error, hints, tries, folder, trace."""
+        """Runs of this study that failed, or whose own metrics failed: name, error, hints, tries, folder, trace."""
         names = ("error", "hints", "tries", "trace")
-        return [{**run, **{k: result.get(k) for k in names}} for run, result in self._results("failed")]
+        found = [one for one in self._results() if one[1]["status"] == "failed"]
+        return [{**run, **{k: result.get(k) for k in names}} for run, result in found]
 
     def records(self) -> list[dict[str, Any]]:
         """The rows of `rows`, with additional lists such as ``qualities``, which has one value per hypothesis."""
         rows = []
-        for run, result in self._results("done"):
+        for run, result in self._results():
             named = {"family": run["group"], "scene": run["scene"], "arm": run["arm"], "seed": run["seed"]}
-            for row, cost in zip(result["rows"], result["costs"], strict=True):
-                rows.append({**named, **row, **cost})
+            own = [values for key, values in result.get("own_metrics", {}).items() if key in self.metrics]
+            for parts in zip(result.get("rows", ()), *own, result.get("costs", ()), strict=True):
+                rows.append({k: v for part in (named, *parts) for k, v in part.items()})
         self._add_log_loss(rows)
         return rows
 
@@ -237,7 +275,9 @@ class StudyFolder:
     def summary(self, records: Sequence[Mapping[str, Any]] | None = None) -> Summary:
         """Means of the arms and differences from the reference. By default, `records` are read from the folder."""
         rows = _without_lists(self.records() if records is None else records)
-        return summarise(rows, self.description["reference"], cost_columns(rows), self.reported_only)
+        return summarise(
+            rows, self.description["reference"], cost_columns(rows), self.reported_only, self.own_columns
+        )
 
     def write_tables(self) -> None:
         """Write all tables from the results of the runs."""
@@ -259,31 +299,36 @@ class StudyFolder:
             write_text(self.path / f"{name}.md", f"{caption}\n\n{markdown_table(cells)}")
 
     def main_tables(self, found: Summary | None = None) -> dict[str, tuple[str, list[list[str]]]]:
-        """Caption and cells (first row: head) of the tables of the primary endpoints, "summary" and "differences"."""
+        """Caption and cells (first row: head) of the tables "summary" and "differences"."""
         found = found or self.summary()
-        means = [["family", "method", "n", "quality", "log loss (nats)", "time per step (s)"]]
-        differences = [["family", "method", "n", "quality", "p", "log loss (nats)", "p"]]
+        titles = [
+            f"{title_of(name).partition(' (')[0]}{' (nats)' * (name == LOG_LOSS)}" for name in found.compared_first
+        ]
+        means = [["family", "method", "n", *titles, "time per step (s)"]]
+        differences = [["family", "method", "n", *itertools.chain(*zip(titles, itertools.repeat("p")))]]
         pairs = {(one.family, one.arm, one.metric): one.difference for one in found.differences}
         for family, arm in itertools.product(found.families, found.arms):
             start = [family, f"{arm} *" if arm in self.truth_users else arm]
-            values = [found.metric(family, arm, name) or ArmMetric(family, arm, name, {}) for name in ENDPOINTS]
+            names = found.compared_first
+            values = [found.metric(family, arm, name) or ArmMetric(family, arm, name, {}) for name in names]
             if n := _numbers(len(one.by_scene) for one in values):
                 seconds = found.metric(family, arm, "seconds")
                 texts = [_estimate(one.mean, *one.interval) for one in values]
                 means.append([*start, n, *texts, "–" if seconds is None else f"{seconds.mean:.2f}"])
-            of_arm = [pairs.get((family, arm, name), compare({}, {})) for name in ENDPOINTS]
+            of_arm = [pairs.get((family, arm, name), compare({}, {})) for name in names]
             if n := _numbers(d.n for d in of_arm):
                 p = [number_text(d.p_holm).replace("0.000", "<0.001") for d in of_arm]
                 texts = [_estimate(d.mean, d.low, d.high, "+") for d in of_arm]
                 differences.append([*start, n, *itertools.chain(*zip(texts, p, strict=True))])
-        how = "over pauses (without the first), filter seeds and n scenes, with 95 % t intervals. Quality is from "
-        how += "0 to 1 (higher is better). Log loss is recalibrated (lower is better)."
+        how = "over pauses (without the first), filter seeds and n scenes, with 95 % bootstrap intervals (BCa). "
+        how += "Quality is from 0 to 1 (higher is better). Log loss is recalibrated (lower is better)."
         how += " * uses the ground truth." if self.truth_users else ""
         time = "with a warm cache" if found.warm else "and shared work counts for the first method that needs it"
         pair = f"{found.reference} (method minus {found.reference}), paired by scene: means"
+        p_text = "p is of sign flips, adjusted by Holm's method for all comparisons of this table."
         return {
             "summary": (f"Means {how} Time is wall time, {time}.", means),
-            "differences": (f"Differences from {pair} {how} p is adjusted by Holm's method.", differences),
+            "differences": (f"Differences from {pair} {how} {p_text}", differences),
         }
 
 

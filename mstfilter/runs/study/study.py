@@ -1,32 +1,37 @@
 """Runs a study: `run_study` checks the study and the folder, makes every missing run, and writes the tables.
 
->>> result = run_study(load_study("study.toml"), Path("studies/first"), Local(workers=2))
+>>> result = run_study(load_study("study.toml"), Path("studies/first"), workers=2)
 >>> result.done, result.failed
 
 The same call resumes an interrupted study and repeats failed runs. Finished runs with unchanged identity are not
 repeated. An interruption does not change the metrics.
+
+The runs are a loop over recordings by `joblib.Parallel`. Here, each of its threads waits for one worker process
+(`mstfilter.runs.study.worker`). On a cluster, dask gives the recordings to its machines, whose threads do the same.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from mstfilter.base.errors import InputError
+from mstfilter.base.errors import InputError, missing_library
 from mstfilter.base.files import locked, sweep, writing
 from mstfilter.base.lazy import progress_of
-from mstfilter.base.processes import check_main_guard, machine
+from mstfilter.base.processes import available_cores, machine
 from mstfilter.base.reading import check_private
 from mstfilter.runs import library_versions, write_json
 from mstfilter.runs.study.config import StudyConfig
-from mstfilter.runs.study.executors import Executor, Local, Tell
-from mstfilter.runs.study.plan import Plan, StudyRun, StudyScene, make_plan
-from mstfilter.runs.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result, write_result
+from mstfilter.runs.study.plan import Plan, StudyRun, make_plan
+from mstfilter.runs.study.results import STUDY_FORMAT, Job, JobOutcome, StudyFolder, read_result, write_failure
+from mstfilter.runs.study.worker import Worker, run_recording
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -35,10 +40,9 @@ _LOGGER = logging.getLogger(__name__)
 class StudyProgress:
     """Progress of a study."""
 
-    what: str  #: {"recordings", "runs"}
-    name: str  #: the job that has ended or lost its worker; empty at the beginning of a part
-    outcome: JobOutcome | None  #: how the job ended; None if its worker died
-    done: int  #: finished jobs of this part, including those of earlier calls
+    name: str  #: the run that has ended or lost its worker; empty at the beginning
+    outcome: JobOutcome | None  #: how the run ended; None if its worker died
+    done: int  #: finished runs, including those of earlier calls
     failed: int
     total: int
 
@@ -56,9 +60,10 @@ class StudyResult:
 def run_study(
     study: StudyConfig,
     path: Path,
-    executor: Executor | None = None,
     overrides: Sequence[str] = (),
     *,
+    workers: int = 0,
+    cluster: str = "",
     cache: Path | None = None,
     progress: bool | Callable[[StudyProgress], None] = False,
 ) -> StudyResult:
@@ -68,15 +73,19 @@ def run_study(
     ----------
     path : Path
         The study folder. The folder must be new, empty, or from an earlier call.
-    executor : Executor, optional
-        Runs the jobs. By default, `Local` with one process for each core of this machine.
     overrides : sequence of str
-        Overrides for every arm. Each combination of comma-separated values is an arm.
+        Overrides for every arm. Each combination of comma-separated values is an arm. ``metric=./file.py:Class`` adds
+        an own metric.
+    workers : int
+        Number of worker processes, each with one thread. 0 means one for each core of this machine or of the cluster.
+    cluster : str
+        Address of a scheduler of dask, such as ``tcp://head:8786``. The default is this machine.
     cache : Path, optional
-        Folder of simulated recordings and intermediate results. The default is the user's cache folder.
+        Folder of simulated recordings. The default is the user's cache folder.
     progress : bool or callable
-        True shows progress bars, or lines of the log if standard error is not a terminal. A function is called with
-        a `StudyProgress` when a job ends or loses its worker.
+        True shows a progress bar, or lines of the log if standard error is not a terminal. A function is called with
+        a `StudyProgress` when a run ends or loses its worker, from any thread but never from two at once. If it
+        raises an exception, the study stops. On a cluster, it is called when all runs of a recording have ended.
 
     Raises
     ------
@@ -85,121 +94,128 @@ def run_study(
     """
     from mstfilter.lab.simulation import cache_folder
 
-    executor = executor or Local(logs=path / "logs")
-    if isinstance(executor, Local):
-        check_main_guard("run_study")
     plan = make_plan(study, overrides)
     cache = (cache or cache_folder()).absolute()
-    with _locked(path) as folder, progress_of(progress, bars="study_bars") as report:
-        _prepare(folder, cache, _description(plan))
-        waiting = [run for run in plan.runs if not _is_done(run, folder)]
-        call = _Call(plan, folder, cache, executor, report)
-        failed = call.record_scenes(waiting)
-        failed |= call.filter_scenes([run for run in waiting if run.name not in failed], len(failed))
+    with _locked(path) as folder, progress_of(progress, bars="study_bars") as report, _backend(cluster):
+        check_private(cache / "recordings")
+        with writing(f"study folder {path}", "choose another with --out"):
+            write_json(path / "study.json", _description(plan))
+            for part in ("runs", "logs"):
+                (path / part).mkdir(exist_ok=True)
+        waiting = [run for run in plan.runs if not _is_done(run, plan, folder)]
+        ledger = _Ledger(folder, plan, len(plan.runs) - len(waiting), report)
+        _make(waiting, [_job(run, plan, folder, cache) for run in waiting], ledger, workers, not cluster)
         folder = StudyFolder.open(path)
         with writing(f"the tables of {path}", "free disk space and repeat the command"):
             folder.write_tables()
     n = len(plan.runs)
-    return StudyResult(folder, n - len(failed), n - len(waiting), tuple(failed.items()))
+    return StudyResult(folder, n - len(ledger.failed), n - len(waiting), tuple(ledger.failed.items()))
 
 
-def _prepare(folder: StudyFolder, cache: Path, description: dict[str, Any]) -> None:
-    """Check the folders and write study.json."""
-    for part in ("recordings", "work"):
-        check_private(cache / part)
-    with writing(f"study folder {folder.path}", "choose another with --out"):
-        write_json(folder.path / "study.json", description)
-        for part in ("runs", "logs"):
-            (folder.path / part).mkdir(exist_ok=True)
+@contextlib.contextmanager
+def _backend(cluster: str) -> Iterator[None]:
+    """In the block, `joblib.Parallel` gives its tasks to the machines of a cluster, if there is an address."""
+    if not cluster:
+        yield
+        return
+    try:
+        from distributed import Client, KilledWorker
+        from distributed.comm import CommClosedError
+    except ImportError as error:
+        raise missing_library(error, "a cluster") from error
+    import joblib
+
+    try:
+        client = Client(cluster, timeout=10)
+        client.wait_for_workers(1, timeout=30)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(
+            f"no cluster with workers answers at {cluster}: {error}",
+            "start one: `dask scheduler`, and `dask worker ADDRESS --nthreads 1` for each core",
+        ) from error
+    with client, joblib.parallel_config(backend="dask"):
+        try:
+            yield
+        except (KilledWorker, CommClosedError) as error:
+            raise InputError(f"the cluster at {cluster} broke: {error}", "repeat the command to resume") from error
 
 
-@dataclass(frozen=True)
-class _Call:
-    """One call of `run_study`, which gives jobs to the executor and records failures."""
+def _make(runs: Sequence[StudyRun], jobs: Sequence[Job], ledger: _Ledger, workers: int, here: bool) -> None:
+    """Make the given runs. All runs of a recording go to one worker, or to a few if there are few recordings."""
+    from joblib import Parallel, delayed, effective_n_jobs
 
-    plan: Plan
-    folder: StudyFolder
-    cache: Path
-    executor: Executor
-    report: Callable[[StudyProgress], None]
+    if not runs:
+        return
+    n_workers = workers or (available_cores() if here else effective_n_jobs(-1))
+    recordings = [list(part) for _, part in groupby(jobs, key=lambda job: job["source"])]
+    n_parts = -(-n_workers // len(recordings))
+    groups = [part for of in recordings for k in range(n_parts) if (part := of[k::n_parts])]
+    logs = ledger.folder.path.absolute() / "logs"
+    crew = [Worker(logs / f"worker-{k}.log") for k in range(min(n_workers, len(groups)))] if here else []
+    # On another machine, a task starts a worker of its own, and its outcomes are told when they are back.
+    local = {"workers": crew[::-1], "tell": ledger.tell} if here else {}
+    tasks = (
+        delayed(run_recording)(group, logs / f"{Path(group[0]['folder']).name}.log", **local) for group in groups
+    )
+    backend = "threading" if here else None
+    try:
+        for outcomes in Parallel(n_workers, backend, "generator_unordered", batch_size=1)(tasks):
+            for name, outcome in () if here else outcomes.items():
+                ledger.tell(name, outcome)
+    finally:
+        for worker in crew:
+            worker.stop()
 
-    def record_scenes(self, runs: Sequence[StudyRun]) -> dict[str, JobOutcome]:
-        """Simulate missing recordings. Returns the runs that lack a recording, with the reason."""
-        recordings = self.cache / "recordings"
-        scenes = {run.scene.key: run.scene for run in runs if "family" in run.scene.source}
-        missing = [scene for scene in scenes.values() if not _is_recorded(scene.source, recordings)]
-        jobs = [self._job("record", scene.name, scene, {"recordings": str(recordings)}) for scene in missing]
-        if not jobs:
-            return {}
-        outcomes = self.executor.run(jobs, self._counter("recordings", jobs, 0, len(jobs), 0))
-        why = {scene.key: one for scene, one in zip(missing, outcomes, strict=True) if one.status != "done"}
-        failed = [run for run in runs if run.scene.key in why]
-        for run in failed:
-            _write_failure(self.folder, run, why[run.scene.key])
-        return {run.name: why[run.scene.key] for run in failed}
 
-    def filter_scenes(self, runs: Sequence[StudyRun], n_failed: int) -> dict[str, JobOutcome]:
-        """Make the given runs, after `n_failed` runs have failed. Returns the newly failed runs, with the reasons."""
-        total = len(self.plan.runs)
-        jobs = [self._run_job(run) for run in runs]
-        count = self._counter("runs", jobs, total - len(runs) - n_failed, total, n_failed)
+class _Ledger:
+    """Records the outcomes of runs, which any thread may tell, and reports them with the time left."""
 
-        def tell(k: int, outcome: JobOutcome | None) -> None:
+    def __init__(self, folder: StudyFolder, plan: Plan, done: int, report: Callable[[StudyProgress], None]) -> None:
+        self.folder, self.failed = folder, dict[str, JobOutcome]()
+        self._runs = {run.name: run for run in plan.runs}
+        self._done = self._earlier = done
+        self._report, self._lock, self._begun = report, threading.Lock(), time.monotonic()
+        report(StudyProgress("", None, done, 0, len(self._runs)))
+
+    def tell(self, name: str, outcome: JobOutcome | None) -> None:
+        """A run has ended. None: its worker died or exceeded the time limit."""
+        with self._lock:
             if outcome is None:
-                sweep(self.folder.path / "runs", runs[k].folder)
-            count(k, outcome)
-
-        outcomes = self.executor.run(jobs, tell)
-        failed = [(run, outcome) for run, outcome in zip(runs, outcomes, strict=True) if outcome.status != "done"]
-        for run, outcome in failed:
-            _write_failure(self.folder, run, outcome)
-        return {run.name: outcome for run, outcome in failed}
-
-    def _job(self, kind: str, name: str, scene: StudyScene, more: dict[str, Any]) -> Job:
-        """A job for `mstfilter.runs.study.jobs`, as plain values."""
-        limits = {"tries": self.plan.config.tries, "timeout_s": self.plan.config.timeout_s}
-        return {"kind": kind, "name": name, "share": scene.key, "source": scene.source, **limits, **more}
-
-    def _run_job(self, run: StudyRun) -> Job:
-        plan = self.plan
-        libraries = "".join(f" {name}={version}" for name, version in library_versions().items())
-        work = {
-            "folder": str(self.cache / "work"),
-            "limit_bytes": int(plan.config.cache_gb * 1e9),
-            "version": plan.code + libraries,
-        }
-        more = {
-            "folder": str(self.folder.run(run.folder).absolute()),
-            "identity": run.identity,
-            "code": plan.code,
-            "config": {**run.arm.config, "description": run.arm.name},
-            "seed": run.seed,
-            "keep": plan.config.keep,
-            "recordings": str(self.cache / "recordings"),
-            "work": work if plan.config.cache_gb and run.arm.known_code else None,
-        }
-        return self._job("run", run.name, run.scene, more)
-
-    def _counter(self, what: str, jobs: Sequence[Job], done: int, total: int, failed: int) -> Tell:
-        """A function that reports the outcome of each job as a `StudyProgress` and to the log, with the time left."""
-        begun, earlier = time.monotonic(), done + failed
-
-        def count(k: int, outcome: JobOutcome | None) -> None:
-            nonlocal done, failed
-            if outcome is None:
-                _LOGGER.warning("a worker died in %s", jobs[k]["name"])
+                _LOGGER.warning("a worker died in %s", name)
+            elif outcome.status == "done":
+                self._done += 1
             else:
-                done += outcome.status == "done"
-                failed += outcome.status != "done"
-                n = done + failed
-                seconds = (time.monotonic() - begun) / (n - earlier) * (total - n)
-                left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-                text = f"{n}/{total} {what}{f', {failed} failed' if failed else ''}, {left} left: {jobs[k]['name']}"
-                _LOGGER.info("%s%s", text, f" failed: {outcome.error}" if outcome.status != "done" else "")
-            self.report(StudyProgress(what, jobs[k]["name"], outcome, done, failed, total))
+                run = self._runs[name]
+                write_failure(self.folder.run(run.folder), run.identity, outcome)
+                self.failed[name] = outcome
+            if outcome is not None:
+                self._log(name, outcome)
+            self._report(StudyProgress(name, outcome, self._done, len(self.failed), len(self._runs)))
 
-        self.report(StudyProgress(what, "", None, done, failed, total))
-        return count
+    def _log(self, name: str, outcome: JobOutcome) -> None:
+        n, failed, total = self._done + len(self.failed), len(self.failed), len(self._runs)
+        seconds = (time.monotonic() - self._begun) / (n - self._earlier) * (total - n)
+        left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        text = f"{n}/{total} runs{f', {failed} failed' if failed else ''}, {left} left: {name}"
+        _LOGGER.info("%s%s", text, "" if outcome.status == "done" else f" failed: {outcome.error}")
+
+
+def _job(run: StudyRun, plan: Plan, folder: StudyFolder, cache: Path) -> Job:
+    """What a worker needs to make a run, as plain values."""
+    study = plan.config
+    return {
+        "name": run.name,
+        "source": run.scene.source,
+        "recordings": str(cache / "recordings"),
+        "folder": str(folder.run(run.folder).absolute()),
+        "identity": run.identity,
+        "code": plan.code,
+        "config": {**run.arm.config, "description": run.arm.name},
+        "seed": run.seed,
+        "metrics": plan.metrics,
+        "cwd": str(Path.cwd()),
+        **{name: getattr(study, name) for name in ("keep", "tries", "timeout_s", "cache_gb")},
+    }
 
 
 @contextlib.contextmanager
@@ -237,6 +253,7 @@ def _description(plan: Plan) -> dict[str, Any]:
         ],
         "scenes": [asdict(scene) for scene in plan.scenes],
         "seeds": study.seeds,
+        "metrics": plan.metrics,
         "runs": [
             {name: getattr(run, name) for name in ("name", "folder", "identity", "seed")}
             | {"arm": run.arm.name, "scene": run.scene.name, "group": run.scene.group}
@@ -245,20 +262,7 @@ def _description(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _is_done(run: StudyRun, folder: StudyFolder) -> bool:
+def _is_done(run: StudyRun, plan: Plan, folder: StudyFolder) -> bool:
     result = read_result(folder.run(run.folder))
-    return result.get("identity") == run.identity and result.get("status") == "done"
-
-
-def _write_failure(folder: StudyFolder, run: StudyRun, outcome: JobOutcome) -> None:
-    """Record the reason of a failed run. If the disk is full, nothing is written."""
-    with contextlib.suppress(OSError):
-        folder.run(run.folder).mkdir(parents=True, exist_ok=True)
-        write_result(folder.run(run.folder), {"identity": run.identity, **asdict(outcome)})
-
-
-def _is_recorded(source: dict[str, Any], recordings: Path) -> bool:
-    from mstfilter.lab.simulation import cached_path, scene_family
-
-    family = replace(scene_family(source["family"]), **source["set"])
-    return (cached_path(family, source["seed"], recordings) / "manifest.json").is_file()
+    done = result.get("identity") == run.identity and result.get("status") == "done"
+    return done and plan.metrics.keys() <= result.get("own_metrics", {}).keys()

@@ -7,7 +7,7 @@ The two primary endpoints are means over pauses t >= 1. *Quality* is the unweigh
 (form ``objects``); higher is better. *Log loss (recalibrated)* is the log loss of the forecasts in nats, after
 recalibration on other scenes; lower is better (see `mstfilter.scoring.log_loss`). Other metrics are averaged over the
 same pauses. Values are averaged over filter seeds first, then over scenes. A difference is the value of an arm minus
-the value of the reference. The p values of both endpoints are adjusted together.
+the value of the reference. The p values of both endpoints, and of the study's own metrics, are adjusted together.
 """
 
 from __future__ import annotations
@@ -20,25 +20,17 @@ from typing import Any
 import numpy as np
 
 from mstfilter.scoring import LOG_LOSS
-from mstfilter.scoring.statistics import CLAIM, LEVEL, Difference, compare, conclusion, holm, interval, slope
+from mstfilter.scoring.statistics import Difference, compare, conclusion, holm, interval, slope
 
 ENDPOINTS = {"quality": 1, LOG_LOSS: -1}  # 1: higher is better
 SLOPES = {name: f"{name}_slope" for name in ENDPOINTS}  # change from pause to pause, t = 0 included
 NOT_WORSE = 0.005  # largest loss in the other endpoint if a filter is claimed to be better
 _NAMES = ("family", "scene", "arm", "seed", "pause", "time_s")
-_SHARES = ("quality", "occupancy", "object_f", "diversity", "brier", "calibration_error")
 
 
 def title_of(metric: str) -> str:
     """The name of a metric in texts and figures."""
     return metric.replace(LOG_LOSS, "log loss (recalibrated)").replace("_", " ")
-
-
-def bounds_of(metric: str) -> tuple[float, float]:
-    """The least and the largest possible value of a metric. Slopes are not bounded."""
-    if metric.endswith("_slope"):
-        return -np.inf, np.inf
-    return 0.0, 1.0 if metric.startswith(_SHARES) else np.inf
 
 
 def number_text(value: float | None, sign: str = "") -> str:
@@ -67,10 +59,8 @@ class ArmMetric:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """t interval of the mean over scenes, clipped to the range of possible values of the metric."""
-        low, high = interval(np.array(list(self.by_scene.values())))
-        least, most = bounds_of(self.name)
-        return max(low, least), min(high, most)
+        """BCa bootstrap interval of the mean over scenes."""
+        return interval(np.array(list(self.by_scene.values())))
 
 
 @dataclass(frozen=True)
@@ -81,21 +71,22 @@ class Compared:
     arm: str
     reference: str
     metric: str
-    #: For the primary endpoints, `p_holm` is `p_claim` adjusted over both endpoints, all families and all arms.
-    difference: Difference
+    difference: Difference  #: `p_holm` is adjusted over all differences that are `adjusted`, and NaN for all others
     reported_only: bool = False  #: the arm is left out of the conclusions and of the adjustment of p values
+    is_endpoint: bool = True  #: the metric is a primary endpoint or the study's own
 
     @property
     def adjusted(self) -> bool:
-        """Whether `p_holm` of the difference is adjusted."""
-        return self.metric in ENDPOINTS and not self.reported_only
+        """Whether the difference is part of the conclusions, and its p value is adjusted."""
+        return self.is_endpoint and not self.reported_only
 
     @property
     def words(self) -> str:
         """The conclusion in words."""
-        sign = "higher" if ENDPOINTS.get(self.metric, 1) > 0 else "lower"
-        where = f"{self.family} in {title_of(self.metric)} ({sign} is better)"
-        return conclusion(self.difference, self.arm, self.reference, where)
+        better = {1: " (higher is better)", -1: " (lower is better)"}.get(ENDPOINTS.get(self.metric, 0), "")
+        return conclusion(
+            self.difference, self.arm, self.reference, f"{self.family} in {title_of(self.metric)}{better}"
+        )
 
 
 @dataclass(frozen=True)
@@ -109,7 +100,8 @@ class Summary:
     #: All times are of runs that found shared work in the cache (the first seed of an arm and scene is omitted).
     warm: bool
     metrics: tuple[ArmMetric, ...]
-    differences: tuple[Compared, ...]  #: primary endpoints first, then their slopes, then all other metrics
+    differences: tuple[Compared, ...]  #: `compared_first` first, then the slopes of endpoints, then all other metrics
+    compared_first: tuple[str, ...]  #: the primary endpoints and the study's own metrics
 
     def metric(self, family: str, arm: str, name: str = "quality") -> ArmMetric | None:
         """The value of a metric; None if the arm has no value for this family."""
@@ -125,19 +117,13 @@ class Summary:
     def is_better(self, family: str, arm: str) -> bool:
         """Whether the study shows that the reference is better than an arm on a family.
 
-        One endpoint must be better by its adjusted p value, and the intervals of both endpoints must exclude a loss
-        of 0.005 or more. Each endpoint needs at least 20 scenes.
+        One endpoint must be better, with an adjusted p value below .05 over at least 20 scenes, and the other one not
+        worse by more than .005.
         """
-        found = []
-        for one in self.differences:
-            if one.metric in ENDPOINTS and (one.family, one.arm) == (family, arm) and one.adjusted:
-                d = one.difference
-                limits = [d.low, d.low_bootstrap, d.high, d.high_bootstrap]
-                # The least lead of the reference. It is NaN, and no claim is made, if no interval is known.
-                lead = np.fmin.reduce(-ENDPOINTS[one.metric] * np.array(limits))
-                found.append((lead > 0 and d.p_holm < 1 - LEVEL, lead > -NOT_WORSE and d.n >= CLAIM))
-        better, not_worse = zip(*found, strict=True) if found else ((), ())
-        return len(found) == len(ENDPOINTS) and any(better) and all(not_worse)
+        found = [one for one in self.differences if (one.family, one.arm) == (family, arm) and one.adjusted]
+        leads = [(-ENDPOINTS[d.metric] * d.difference.mean, d.difference) for d in found if d.metric in ENDPOINTS]
+        better = any(lead > 0 and d.is_claim for lead, d in leads)
+        return better and len(leads) == len(ENDPOINTS) and all(lead > -NOT_WORSE for lead, _ in leads)
 
     def metric_rows(self) -> list[dict[str, Any]]:
         """Rows of summary.csv."""
@@ -152,14 +138,18 @@ class Summary:
         rows = []
         for one in self.differences:
             row = {"family": one.family, "arm": one.arm, "reference": one.reference, "metric": one.metric}
-            row |= asdict(one.difference)
             adjusted = {"conclusion": one.words} if one.adjusted else {"conclusion": "", "p_holm": None}
-            rows.append({**row, **adjusted})
+            numbers = {name: value for name, value in asdict(one.difference).items() if name != "values"}
+            rows.append({**row, **numbers, **adjusted})
         return rows
 
 
 def summarise(
-    rows: Sequence[Mapping[str, Any]], reference: str, cost: Sequence[str] = (), reported_only: Collection[str] = ()
+    rows: Sequence[Mapping[str, Any]],
+    reference: str,
+    cost: Sequence[str] = (),
+    reported_only: Collection[str] = (),
+    own: Sequence[str] = (),
 ) -> Summary:
     """Summarise the rows that `StudyFolder.rows` returns.
 
@@ -173,6 +163,8 @@ def summarise(
         missing stage counts as 0 seconds. Of several filter seeds, the first is omitted, because it fills the cache.
     reported_only : collection of str
         Arms that are not part of the comparisons with adjusted p values.
+    own : sequence of str
+        Columns of own metrics, which are compared like the primary endpoints.
     """
     families, arms = (tuple(dict.fromkeys(str(row[k]) for row in rows)) for k in ("family", "arm"))
     named = list(dict.fromkeys(k for row in rows for k in row if k not in _NAMES))
@@ -200,11 +192,12 @@ def summarise(
         for name in names
         if (found := values.get((family, arm, name)))
     )
-    # The primary endpoints first, then their slopes; all other comparisons are exploratory.
-    first = [*ENDPOINTS, *SLOPES.values()]
+    # The endpoints and own metrics first, then the slopes; all other comparisons are exploratory.
+    compared = (*ENDPOINTS, *own)
+    first = [*compared, *SLOPES.values()]
     order = [name for name in first if name in measured] + [name for name in measured if name not in first]
     differences = [
-        Compared(family, arm, reference, name, difference, arm in reported_only)
+        Compared(family, arm, reference, name, compare(*pair), arm in reported_only, name in compared)
         for name in order
         for family in families
         for of_reference in [values.get((family, reference, name), {})]
@@ -212,16 +205,16 @@ def summarise(
         if arm != reference and (of_arm := values.get((family, arm, name), {}))
         # A failed run has no values. Its seed is left out of the scene in both arms.
         for pair in [(_means(of_arm, of_reference), _means(of_reference, of_arm))]
-        for difference in [compare(*pair, name in ENDPOINTS)]
     ]
-    return Summary(families, arms, names, reference, set(seeds) == several, metrics, _adjust(differences))
+    warm_only = set(seeds) == several
+    return Summary(families, arms, names, reference, warm_only, metrics, _adjust(differences), compared)
 
 
 def _adjust(differences: Sequence[Compared]) -> tuple[Compared, ...]:
-    """Adjust the p values of both endpoints together. The p values of arms that are only reported become NaN."""
-    p = holm([one.difference.p_claim if one.adjusted else float("nan") for one in differences])
+    """Adjust the p values of all comparisons together, except those that are not part of the conclusions."""
+    p = holm([one.difference.p if one.adjusted else float("nan") for one in differences])
     return tuple(
-        replace(one, difference=replace(one.difference, p_holm=float(q))) if one.metric in ENDPOINTS else one
+        replace(one, difference=replace(one.difference, p_holm=float(q)))
         for one, q in zip(differences, p, strict=True)
     )
 

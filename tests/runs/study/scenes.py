@@ -1,13 +1,15 @@
-"""Small recordings for studies, and an executor without processes."""
+"""Small recordings for studies, and studies without processes."""
 
 from __future__ import annotations
+
+from contextlib import contextmanager
+from unittest import mock
 
 import numpy as np
 
 from mstfilter.base.files import read_csv
 from mstfilter.formats import RecordingWriter
-from mstfilter.runs.study import Executor
-from mstfilter.runs.study.jobs import perform
+from mstfilter.runs.study import run_study, worker
 from mstfilter.scene import scene_cache
 from tests.scene.scenes import CAMERA, GRID, table_scene
 
@@ -35,17 +37,27 @@ def metrics(path):
     return [{k: v for k, v in row.items() if not k.startswith(cost)} for row in table(path)]
 
 
-class InProcess(Executor):
-    """Runs jobs one after another in this process.
+class InProcess(worker.Worker):
+    """Runs jobs in this process: starting a worker takes longer than a small run."""
 
-    For tests of plans, resuming and tables: starting a worker takes longer than a small run. `Local` has its
-    own tests.
-    """
+    def perform(self, job, died=None):
+        return worker.perform(job)
 
-    def run(self, jobs, tell):
-        scene_cache.clear()  # as in a new worker
-        outcomes = []
-        for k, job in enumerate(jobs):
-            outcomes.append(perform(job))
-            tell(k, outcomes[-1])
-        return outcomes
+    def close(self):
+        return 0
+
+
+@contextmanager
+def in_process():
+    """In the block, studies run in this process, as in one new worker."""
+    worker._recording.cache_clear()
+    kept = scene_cache.keeps_shared, scene_cache.limit_bytes
+    with mock.patch("mstfilter.runs.study.study.Worker", InProcess):
+        yield
+    scene_cache.keeps_shared, scene_cache.limit_bytes = kept
+
+
+def run_here(*arguments, **options):
+    """`run_study` without processes."""
+    with in_process():
+        return run_study(*arguments, workers=1, **options)

@@ -40,8 +40,11 @@ def test_it_prints_where_and_what(config, tmp_path, capsys):
     assert "2 done, 0 of them earlier" in out
     assert "mst transition=identity update.n_views=2" in out and "time per step (s)" in out
     assert "method minus mst transition=identity update.n_views=1), paired by scene" in " ".join(out.split())
-    code, out, _ = call("study", config, "--smoke", "update.n_views=1,2", capsys=capsys)
-    assert "2 done, 2 of them earlier" in out
+    page = tmp_path / "studies" / "mine-smoke" / "report.html"
+    assert "report      studies/mine-smoke/report.html" in out and "2 of 2 runs" in page.read_text()
+    page.unlink()
+    code, out, _ = call("study", config, "--smoke", "update.n_views=1,2", "--no-report", capsys=capsys)
+    assert "2 done, 2 of them earlier" in out and not page.exists()
     code, _, error = call("study", config, "--smoke", "colour=1", capsys=capsys)
     assert code == 2 and error.startswith("error: arm 'mst transition=identity': a filter has no field 'colour'")
 

@@ -7,18 +7,17 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from mstfilter.base.errors import InputError
 from mstfilter.base.files import locked
+from mstfilter.runs.study import study as studies
 from mstfilter.runs.study.config import load_study, study_of
-from mstfilter.runs.study.executors import Executor, Local
 from mstfilter.runs.study.study import run_study
 from tests.conftest import REPOSITORY
-from tests.runs.study.scenes import InProcess, metrics, slide, table
+from tests.runs.study.scenes import metrics, run_here, slide, table
 
 BROKEN = Path(__file__).parent / "broken.py"
 FAST = "floor_components"  # a preset that needs no large library
@@ -46,7 +45,7 @@ def study(folder, *arms, **more):
 def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
     out = tmp_path / "out"
     result = run_study(
-        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=2), out, Local(2), cache=tmp_path
+        study(folder, "good", "raise", "full", "die", "print", seeds=[0], tries=2), out, workers=2, cache=tmp_path
     )
     assert result.done == 2
     errors = {(r["run"], r["tries"]): r["error"] for r in table(out, "failures.csv")}
@@ -65,9 +64,9 @@ def test_failures_are_isolated_listed_and_explained(folder, tmp_path):
 def test_only_failed_runs_are_repeated(folder, tmp_path):
     marker = tmp_path / "once"
     wanted, out = study(folder, "good", f"raise@{marker}", seeds=[0]), tmp_path / "out"
-    first = run_study(wanted, out, InProcess(), cache=tmp_path)
+    first = run_here(wanted, out, cache=tmp_path)
     assert (first.done, len(first.failed)) == (1, 1)
-    again = run_study(wanted, out, InProcess(), cache=tmp_path)
+    again = run_here(wanted, out, cache=tmp_path)
     assert (again.done, again.repeated, again.failed) == (2, 1, ())
     assert table(out, "failures.csv") == []
 
@@ -75,38 +74,41 @@ def test_only_failed_runs_are_repeated(folder, tmp_path):
 def test_a_run_whose_worker_died_is_begun_again(folder, tmp_path):
     seen = []
     wanted = study(folder, f"exit@{tmp_path / 'once'}", seeds=[0])
-    result = run_study(wanted, tmp_path / "out", Local(1), cache=tmp_path, progress=seen.append)
+    result = run_study(wanted, tmp_path / "out", workers=1, cache=tmp_path, progress=seen.append)
     assert result.failed == () and result.done == 1
     assert [p.outcome and p.outcome.tries for p in seen if p.name] == [None, 2]
 
 
-@dataclass(frozen=True)
-class LimitHanging(Executor):
-    """Gives a time limit to the runs that never end, and none to all others."""
+def test_a_run_that_takes_too_long_is_named(folder, tmp_path, monkeypatch):
+    """Only the run that never ends has a time limit, so the test does not depend on the speed of the machine."""
+    job_of = studies._job
 
-    executor: Executor
-    timeout_s: float
+    def limited(run, *others):
+        return {**job_of(run, *others), "timeout_s": 1.0 if run.arm.name == "hang" else 0.0}
 
-    def run(self, jobs, tell):
-        limits = [self.timeout_s if job["name"].startswith("hang") else 0.0 for job in jobs]
-        return self.executor.run([{**job, "timeout_s": limit} for job, limit in zip(jobs, limits, strict=True)], tell)
-
-
-def test_a_run_that_takes_too_long_is_named(folder, tmp_path):
-    """The run hangs until it is killed, so the test does not depend on the speed of the machine."""
-    executor = LimitHanging(Local(1), timeout_s=1)
-    wanted = study(folder, "hang", "good", seeds=[0], tries=1)
-    result = run_study(wanted, tmp_path / "out", executor, cache=tmp_path)
+    monkeypatch.setattr(studies, "_job", limited)
+    wanted = study(folder, "good", "hang", "mst", seeds=[0], tries=1)
+    result = run_study(wanted, tmp_path / "out", workers=1, cache=tmp_path)
     assert [(n, o.error, o.tries) for n, o in result.failed] == [
         ("hang on slide, seed 0", "its worker died 1 time, the last time because it took longer than 1 s", 1)
     ]
-    assert result.done == 1
+    assert result.done == 2
+
+
+def test_an_exception_in_the_progress_function_stops_the_study(folder, tmp_path):
+    def stop(progress):
+        if progress.name:
+            raise ValueError("enough")
+
+    with pytest.raises(ValueError, match="enough"):
+        run_study(study(folder, "good", "hang"), tmp_path / "out", workers=2, cache=tmp_path, progress=stop)
+    assert not list((tmp_path / "out" / "runs").glob(".*"))
 
 
 def test_a_recording_that_cannot_be_made_fails_its_runs_only(folder, tmp_path):
     impossible = {"family": "demo", "seeds": 0, "group": "no", "set": {"workspace_x": 0.1, "workspace_y": 0.1}}
     wanted = study(folder, "good", scenes=[{"recordings": "slide"}, impossible], seeds=[0])
-    result = run_study(wanted, tmp_path / "out", InProcess(), cache=tmp_path)
+    result = run_here(wanted, tmp_path / "out", cache=tmp_path)
     assert result.done == 1
     ((name, outcome),) = result.failed
     assert name == "good on no-0, seed 0" and outcome.error
@@ -148,38 +150,35 @@ def test_killing_the_study_and_resuming_ends_with_the_same_table(folder, tmp_pat
     done = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/result.json")}
     assert len(done) == 1
     assert not (out / "runs.csv").exists()
-    resumed = run_study(load_study(config), out, InProcess(), cache=tmp_path / "cache")
+    resumed = run_here(load_study(config), out, cache=tmp_path / "cache")
     assert resumed.repeated == 1 and resumed.done == 4
     assert {p: p.stat().st_mtime_ns for p in done} == done
-    whole = run_study(load_study(config), tmp_path / "whole", InProcess(), cache=tmp_path / "cache")
+    whole = run_here(load_study(config), tmp_path / "whole", cache=tmp_path / "cache")
     assert whole.repeated == 0
     assert metrics(out) == metrics(tmp_path / "whole")
     assert not list((out / "runs").glob(".*"))
 
 
-def test_a_script_without_a_guard_is_one_clear_error(tmp_path):
-    """New processes import the script. The call is refused before anything is written."""
+def test_a_script_needs_no_guard(folder, tmp_path):
+    """Workers do not import the script."""
     script = tmp_path / "script.py"
     lines = (
-        "from mstfilter.runs.study import Local, StudyConfig, run_study",
-        "run_study(StudyConfig(name='a'), 'out', Local(1))",
+        "from mstfilter.runs.study import run_study, study_of",
+        f"data = {{'name': 'a', 'scenes': [{{'recordings': {str(folder / 'slide')!r}}}], 'seeds': [0]}}",
+        f"print(run_study(study_of({{**data, 'arms': [{{'preset': {FAST!r}}}]}}), 'out', workers=1).done)",
     )
-    script.write_text("\n".join(lines))
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    script.write_text("\n".join(lines).replace("'out'", "__import__('pathlib').Path('out')"))
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "MSTFILTER_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, script]
     found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
-    assert (
-        "script.py, line 2: run_study starts processes" in found.stderr
-        and found.stderr.count("errors.InputError") == 1
-    )
-    assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
+    assert found.stdout == "1\n", found.stderr
 
 
 def test_one_process_a_study(folder, tmp_path):
     out = tmp_path / "out"
-    run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
+    run_here(study(folder, "good", seeds=[0]), out, cache=tmp_path)
     with locked(out), pytest.raises(InputError, match="another process"):
-        run_study(study(folder, "good", seeds=[0]), out, InProcess(), cache=tmp_path)
+        run_here(study(folder, "good", seeds=[0]), out, cache=tmp_path)
 
 
 WRONG = {

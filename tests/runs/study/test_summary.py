@@ -7,12 +7,11 @@ import re
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from mstfilter.runs.study import StudyFolder
 from mstfilter.runs.study.summary import summarise
 from mstfilter.scoring import LOG_LOSS
-from mstfilter.scoring.statistics import compare
+from mstfilter.scoring.statistics import compare, holm, interval
 from tests.app.report.test_study_report import make_study, results
 
 
@@ -92,17 +91,44 @@ def test_a_scene_that_one_arm_lacks_is_left_out_of_the_pairs():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("n_scenes", "better"), [(20, True), (1, False)])
-def test_a_filter_is_better_only_with_enough_scenes(n_scenes, better):
-    """The reference leads by 0.1 to 0.2 in both endpoints. One scene has no interval, and gives no warning."""
+@pytest.mark.parametrize(
+    ("n_scenes", "lag", "better"),
+    [
+        (20, (0.1, 0.1), True),
+        (20, (0.1, -0.001), True),  # the other endpoint is worse by less than .005
+        (20, (0.1, -0.01), False),
+        (20, (0.0, 0.1), True),
+        (19, (0.1, 0.1), False),
+        (1, (0.1, 0.1), False),
+    ],
+)
+def test_a_filter_is_better_by_the_rule_for_claims(n_scenes, lag, better):
+    """`lag` is how far the other arm is behind in quality and in log loss, times 1 to 2."""
     rng = np.random.default_rng(1)
     table = [
         {"family": "f", "scene": str(k), "arm": arm, "seed": 0, "pause": 1,
-         "quality": 0.5 - lag * (1 + rng.random()), LOG_LOSS: 0.5 + lag * (1 + rng.random())}
+         "quality": 0.5 - behind * lag[0] * (1 + rng.random()), LOG_LOSS: 0.5 + behind * lag[1] * (1 + rng.random())}
         for k in range(n_scenes)
-        for arm, lag in (("ours", 0.0), ("theirs", 0.1))
+        for arm, behind in (("ours", 0), ("theirs", 1))
     ]  # fmt: skip
     assert summarise(table, "ours").is_better("f", "theirs") is better
+
+
+def test_own_metrics_are_adjusted_with_the_endpoints():
+    rng = np.random.default_rng(2)
+    table = [
+        {"family": "f", "scene": str(k), "arm": arm, "seed": 0, "pause": 1,
+         "quality": 0.1 * shift + rng.normal(), "height": shift + rng.normal(), "split": rng.normal()}
+        for k in range(8)
+        for arm, shift in (("ours", 0), ("theirs", 1))
+    ]  # fmt: skip
+    found = summarise(table, "ours", own=["height"])
+    p = {one.metric: one.difference for one in found.differences}
+    expected = holm([p["quality"].p, p["height"].p])
+    assert [p["quality"].p_holm, p["height"].p_holm] == expected.tolist()
+    assert np.isnan(p["split"].p_holm) and found.compared_first == ("quality", LOG_LOSS, "height")
+    [words] = [one.words for one in found.differences if one.metric == "height"]
+    assert words.startswith("theirs and ours on f in height: ") and "better" not in words
 
 
 STRANGE = r"50% a_b & c#1 {x}~^\d|<e> $"  # every character that LaTeX or Markdown reads as a command
@@ -138,7 +164,7 @@ def markdown_rows(path):
 
 
 def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
-    """Against means and t intervals that scipy computes from the files of the runs."""
+    """Against means and intervals of values that are read from the files of the runs."""
     study = make_study(tmp_path, n_scenes=5, arms=("ours", STRANGE), groups=("s1",), fail=True)
     StudyFolder.open(study).write_tables()
     runs = {}
@@ -154,7 +180,7 @@ def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
     paired = np.subtract(scene_means(STRANGE, "ours"), scene_means("ours", STRANGE))
 
     def estimate(values, sign=""):
-        low, high = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
+        low, high = interval(np.array(values))
         return f"{np.mean(values):{sign}.3f} [{low:{sign}.3f}, {high:{sign}.3f}]"
 
     head = ["family", "method", "n", "quality", "log loss (nats)", "time per step (s)"]
@@ -166,8 +192,8 @@ def test_tables_for_a_text_have_means_intervals_and_numbers_of_scenes(tmp_path):
         assert read(study / f"summary.{kind}") == [head, *means]
         assert read(study / f"differences.{kind}")[1:] == [difference]
     caption = (study / "summary.md").read_text().split("\n")[0]
-    assert "95 % t intervals" in caption and "n scenes" in caption and "warm cache" in caption
-    assert r"95~\% t intervals" in (study / "summary.tex").read_text()
+    assert "95 % bootstrap intervals" in caption and "n scenes" in caption and "warm cache" in caption
+    assert r"95~\% bootstrap intervals" in (study / "summary.tex").read_text()
 
 
 def test_seeds_that_failed_in_one_arm_are_left_out_of_the_difference():

@@ -1,0 +1,46 @@
+"""What code does, without how it is written: results are known to be of the same program by its hash.
+
+>>> code_of(b"x = 1  # one") == code_of(b"x  =  1")
+True
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+
+@lru_cache(maxsize=2000)
+def code_of(source: bytes) -> bytes:
+    """The syntax tree of Python code without docstrings and version number; of other text, the text itself.
+
+    Comments, docstrings, the format and the number of a release do not change what a program does.
+    """
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):
+        return source
+    for node in ast.walk(tree):
+        match node:
+            case ast.Module() | ast.ClassDef() | ast.FunctionDef() | ast.AsyncFunctionDef() if ast.get_docstring(
+                node
+            ):
+                del node.body[0]
+    tree.body = [node for node in tree.body if not _is_version(node)]
+    return ast.dump(tree).encode()
+
+
+def _is_version(node: ast.stmt) -> bool:
+    return isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__version__"
+
+
+def hash_of_files(root: Path, names: Iterable[str]) -> str:
+    """A hash of files of a folder: their names and contents, of Python files without comments and docstrings."""
+    digest = hashlib.sha256()
+    for name in sorted(names):
+        content = (root / name).read_bytes()
+        digest.update(name.encode() + b"\0" + (code_of(content) if name.endswith(".py") else content))
+    return digest.hexdigest()[:16]
