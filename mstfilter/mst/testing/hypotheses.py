@@ -11,7 +11,8 @@ from mstfilter.mst.testing.scenes import KnownMotion, known_motions, scene_examp
 from mstfilter.scene import Hypothesis
 from mstfilter.smc import Population
 from mstfilter.smc.testing.contract import FALSE_ALARM, close, seeded, skips_errors, statistical
-from mstfilter.smc.testing.moves import ProposalContract, TransitionContract
+from mstfilter.smc.testing.transitions import TransitionContract
+from mstfilter.smc.testing.updates import ProposalContract
 from mstfilter.smc.testing.values import ScoreContract, SimilarityContract
 
 _COPIES, _CALLS = 4, 40

@@ -109,7 +109,7 @@ class Contract:
 
     @cached_property
     def remarks(self) -> list[str]:
-        """What a test says although the property holds."""
+        """What the test that is running says although the property holds."""
         return []
 
     def check_time(self, seconds: float = 0.0, what: str = "") -> None:
@@ -290,9 +290,10 @@ def check_properties(
     stopped = False
     names = (name for cls in reversed(tests.__mro__) for name in vars(cls) if name.startswith("test_"))
     distinct = list(dict.fromkeys(names))  # those of base classes first
+    instance = tests()  # one for all tests, which share draws
     for name in distinct:
-        test, instance = getattr(tests, name), tests()
-        now = time.monotonic()
+        test, now = getattr(tests, name), time.monotonic()
+        instance.remarks = []
         instance.until = end if name == distinct[-1] else now + 0.5 * (end - now)
         outcome = _STOPPED if stopped else _outcome(getattr(instance, name))
         stopped = stopped or (outcome.failure is not None and getattr(test, "prerequisite", False))

@@ -17,7 +17,7 @@ from tests.app.test_cli import call
 from tests.conftest import REPOSITORY
 from tests.scene.test_recording import write
 
-FAULTS_FILE = REPOSITORY / "tests" / "testing" / "faults.py"
+FAULTS_FILE = REPOSITORY / "tests" / "mst" / "testing" / "faults.py"
 
 
 STARTERS = [(kind, "scenes") for kind in starter_kinds("scenes")]
