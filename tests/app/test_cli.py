@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mstfilter.app.cli import _warnings_as_lines, main
+from mstfilter.app.cli import main
 from mstfilter.base.errors import InputError
 from mstfilter.formats import open_recording
 from mstfilter.runs import RunFolder, compared_configs
@@ -52,14 +51,6 @@ def test_run_and_report(two_pauses, tmp_path, capsys):
     code, out, err = call("report", run, "--out", tmp_path / "r.html", capsys=capsys)
     assert code == 0, err
     assert "<html" in (tmp_path / "r.html").read_text()
-
-
-def test_syntax_warnings_of_higra_are_not_shown():
-    """Python 3.12 gives them when it compiles the package, which uv leaves to the first import."""
-    with warnings.catch_warnings(record=True) as caught, _warnings_as_lines():
-        for path in ("/site-packages/higra/algo/tree.py", "/home/me/mine.py"):
-            warnings.warn_explicit("invalid escape sequence", SyntaxWarning, path, 1)
-    assert [one.filename for one in caught] == ["/home/me/mine.py"]
 
 
 PLACES = {
